@@ -16,7 +16,7 @@ def move(
     for _ in range(100):
         place = hands.where(what)
         way = goal[:2] - place[:2]
-        if float(way.norm()) < 0.006 or float(hands.at("right")[2] - place[2]) > 0.09:
+        if float(way.norm()) < 0.01 or float(hands.at("right")[2] - place[2]) > 0.09:
             break
         way *= min(1.0, far / float(way.norm()))
         yield from clamp(hands, middle(hands) + way, height, press=press)

@@ -26,16 +26,17 @@ def stack_in_order(hands: HandController) -> Actions:
         hands.bend(side, 1.57, 0.0)
     yield from _carry(hands, lower, upper, 0.0)
     yield from _carry(hands, upper, lower, 0.075)
-    x, y, _ = hands.frozen("goal1").tolist()
-    yield from hands.lead((x, y + 0.2, _HIGH), (x, y - 0.2, _HIGH), hands.episode_steps)
+    for _ in range(hands.steps_left):
+        yield from hands.lead_each(beside(hands.at(side), 0.0, 0.0, _LOW + 0.05) for side in SIDES)
 
 
 def _carry(hands: HandController, block: str, other: str, lift: float) -> Actions:
     """Takes a block to its target; the inner hand's fingers go between the blocks."""
     goal, place = hands.frozen(f"goal{block[-1]}"), hands.where(f"{block}/position")
-    gap = float((hands.where(f"{other}/position") - place)[1])
+    beyond, gap, _ = (hands.where(f"{other}/position") - place).tolist()
     sides = {1.0: _APART, -1.0: _APART}
-    sides[math.copysign(1.0, gap)] = min(_APART, 0.5 * abs(gap) + _AHEAD)
+    if abs(beyond) < 0.075:
+        sides[math.copysign(1.0, gap)] = max(_TOUCH + 0.003, min(_APART, 0.5 * abs(gap) + _AHEAD))
 
     def beside_it(height: float, steps: int) -> Actions:
         x, y = place[:2].tolist()
@@ -51,11 +52,13 @@ def _carry(hands: HandController, block: str, other: str, lift: float) -> Action
             break
         yield from clamp(hands, place, _LOW + lift, press=_PRESS)
     yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, _PRESS)
-    put = _LOW + float(goal[2]) - 0.625
-    yield from clamp(hands, middle(hands), put, 10, press=_PRESS)
-    where = middle(hands)
-    yield from around(hands, where, 0.0, _TOUCH + 0.014, put, 6)
-    yield from around(hands, where, 0.0, _TOUCH + 0.014, _HIGH + float(goal[2]) - 0.625, 12)
+    if lift:
+        yield from clamp(hands, middle(hands), _LOW + 0.05, 10, press=_PRESS)
+        yield from around(hands, middle(hands), 0.0, 2 * _TOUCH, _LOW + 0.05, 20)
+    else:
+        where = middle(hands)
+        yield from around(hands, where, 0.0, _TOUCH + 0.014, _LOW, 6)
+        yield from around(hands, where, 0.0, _TOUCH + 0.014, _HIGH, 10)
 
 
 def _grip(hands: HandController, place: Tensor) -> Actions:
