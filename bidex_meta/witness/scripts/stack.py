@@ -12,7 +12,7 @@ from bidex_meta.witness.scripts.between import around, clamp, middle, move, reac
 _LOW, _HIGH = 0.690, 0.765
 _APART, _TOUCH, _AHEAD = 0.085, 0.052, 0.017  # from a block to the hands' points: before they close on it, and there; from them to the fingers
 # Distance inside a block to which a hand is led, metres: about 5 N, since more would turn the weak bases.
-_PRESS = 0.004
+_PRESS = 0.003
 
 
 def stack_in_order(hands: HandController) -> Actions:
@@ -51,9 +51,9 @@ def _carry(hands: HandController, block: str, other: str, lift: float) -> Action
         if float(hands.where(f"{block}/position")[2]) > float(goal[2]) + 0.012 or not lift:
             break
         yield from clamp(hands, place, _LOW + lift, press=_PRESS)
-    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, _PRESS)
+    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, 0.6 * _PRESS)
     if lift:
-        yield from clamp(hands, middle(hands), _LOW + 0.05, 10, press=_PRESS)
+        yield from clamp(hands, middle(hands), _LOW + 0.05, 10, press=0.3 * _PRESS)
         yield from around(hands, middle(hands), 0.0, 2 * _TOUCH, _LOW + 0.05, 20)
     else:
         where = middle(hands)
