@@ -57,6 +57,7 @@ def _ahead(hands: HandController) -> Tensor:
     return way / way.norm()
 
 
+_FAR = 0.5  # angle of the left ear from which on the right hand pushes it, rad
 _PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
 _RADIUS, _TOUCH = 0.068, 0.2  # of a peg's circle about the cup, metres; how far it is behind an ear that it pushes, rad
 
@@ -66,7 +67,7 @@ def swing_cup(hands: HandController) -> Actions:
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide. The left hand's thumb stays
     # clear of the lid up to about 130 degrees; the right hand's would not.
     x, y, z = hands.at("right").tolist()
-    away = x + 0.1, y + 0.3, z - 0.1
+    away = x + 0.1, y + 0.15, z - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
     hands.hold("right")
     hands.bend("right", 0.0, 0.0)
@@ -90,10 +91,35 @@ def swing_cup(hands: HandController) -> Actions:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
         if missing < 0.05:
+            # The hand stays: a cup that is bumped on its way back turns on.
+            yield from hands.lead(away, point(hands.at("left")), hands.episode_steps)
+        if _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
             break
         yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
-    # The hand stays: a cup that is bumped on its way back turns on.
-    yield from hands.lead(away, point(hands.at("left")), hands.episode_steps)
+    yield from _push_on(hands, wanted)
+
+
+def _push_on(hands: HandController, wanted: float) -> Actions:
+    """The left hand makes room, and the right one pushes the ear on with straight fingers."""
+    x, y, z = hands.at("left").tolist()
+    back = x + 0.05, y - 0.08, z + 0.0
+    aside = x + 0.05, y - 0.3, z + 0.1
+
+    def tip(behind: float, aside: float = 0.0) -> Point:
+        cup, angle = hands.where("cup/position"), _yaw(hands) + math.pi - behind
+        way = torch.tensor([0.078 * math.cos(angle) + 0.031 + aside, 0.078 * math.sin(angle), 0.0], dtype=cup.dtype)
+        return point(hands.at("right") + cup + way - hands.where("right/mfdistal_position"))
+
+    for _ in range(10):
+        yield from hands.lead(tip(_TOUCH, 0.15), back, speed=0.4)
+    for _ in range(20):
+        yield from hands.lead(tip(_TOUCH, 0.05), aside, speed=0.6)
+    while hands.steps_left:
+        missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
+        if missing < 0.05:
+            break
+        yield from hands.lead(tip(_TOUCH - min(0.3, missing)), aside, speed=0.2)
+    yield from hands.lead(point(hands.at("right")), aside, hands.episode_steps)
 
 
 def _yaw(hands: HandController) -> float:

@@ -63,10 +63,9 @@ def _carry(hands: HandController, block: str, other: str, lift: float) -> Action
 
 def _grip(hands: HandController, place: Tensor) -> Actions:
     """Closes the hands until the block between them stops them."""
-    before, wide = math.inf, 1.0
-    for i in range(30):
-        if i > 4 and before - wide < 0.0006:
+    wide: list[float] = []
+    for _ in range(30):
+        wide.append(float((hands.at("right") - hands.at("left"))[1]))
+        if len(wide) > 8 and wide[-4] - wide[-1] < 0.002:
             break
-        before = wide
         yield from clamp(hands, place, _LOW, press=0.008)
-        wide = float((hands.at("right") - hands.at("left"))[1])
