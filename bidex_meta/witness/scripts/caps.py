@@ -67,7 +67,7 @@ def swing_cup(hands: HandController) -> Actions:
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide. The left hand's thumb stays
     # clear of the lid up to about 130 degrees; the right hand's would not.
     x, y, z = hands.at("right").tolist()
-    away = x + 0.1, y + 0.15, z - 0.1
+    away = 0.23, 0.16, z - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
     hands.hold("right")
     hands.bend("right", 0.0, 0.0)
@@ -91,8 +91,8 @@ def swing_cup(hands: HandController) -> Actions:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
         if missing < 0.05:
-            # The hand stays: a cup that is bumped on its way back turns on.
-            yield from hands.lead(away, point(hands.at("left")), hands.episode_steps)
+            yield from hands.lead(away, peg(_TOUCH + 0.2, _PEG), speed=0.2)
+            continue
         if _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
             break
         yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
@@ -110,10 +110,10 @@ def _push_on(hands: HandController, wanted: float) -> Actions:
         way = torch.tensor([0.078 * math.cos(angle) + 0.031 + aside, 0.078 * math.sin(angle), 0.0], dtype=cup.dtype)
         return point(hands.at("right") + cup + way - hands.where("right/mfdistal_position"))
 
-    for _ in range(10):
-        yield from hands.lead(tip(_TOUCH, 0.15), back, speed=0.4)
-    for _ in range(20):
-        yield from hands.lead(tip(_TOUCH, 0.05), aside, speed=0.6)
+    for _ in range(8):
+        yield from hands.lead(tip(_TOUCH, 0.1), back, speed=0.4)
+    for _ in range(12):
+        yield from hands.lead(tip(_TOUCH, 0.03), aside, speed=0.4)
     while hands.steps_left:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         if missing < 0.05:
