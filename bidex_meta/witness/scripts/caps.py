@@ -90,8 +90,8 @@ def swing_cup(hands: HandController) -> Actions:
     while hands.steps_left:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
-        if missing < 0.05:
-            yield from hands.lead(away, peg(_TOUCH + 0.2, _PEG), speed=0.2)
+        if missing < 0.05 + 0.08 * float(hands.where("cup/angular_velocity")[2]):
+            yield from hands.lead(away, peg(_TOUCH + 0.4, _PEG, 0.1), speed=0.2)
             continue
         if _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
             break
