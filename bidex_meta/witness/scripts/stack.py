@@ -8,10 +8,13 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, beside
 from bidex_meta.witness.scripts.between import around, clamp, middle, move, reach
 
-# Heights of the hands' points whose fingers point down: where the tips are 1 cm above the table, and over all blocks.
+# Heights of the hands' points with fingers that point down: their tips 1 cm above the table, and above the blocks.
 _LOW, _HIGH = 0.690, 0.765
-_APART, _TOUCH, _AHEAD = 0.085, 0.052, 0.017  # from a block to the hands' points: before they close on it, and there; from them to the fingers
-# Distance inside a block to which a hand is led, metres: about 5 N, since more would turn the weak bases.
+# From a block's middle to the hands' points before they close on it, and where they touch it; from these points to the
+# fingers, metres.
+_APART, _TOUCH, _AHEAD = 0.085, 0.052, 0.017
+# Distance inside a block to which a hand is led where it lifts it, metres: about 12 N. Less lets the block slip, more
+# turns the hands, whose torque is weak; then they push the stack over as they let go.
 _PRESS = 0.003
 
 
@@ -26,12 +29,12 @@ def stack_in_order(hands: HandController) -> Actions:
         hands.bend(side, 1.57, 0.0)
     yield from _carry(hands, lower, upper, 0.0)
     yield from _carry(hands, upper, lower, 0.075)
-    for _ in range(hands.steps_left):
+    while hands.steps_left:
         yield from hands.lead_each(beside(hands.at(side), 0.0, 0.0, _LOW + 0.05) for side in SIDES)
 
 
 def _carry(hands: HandController, block: str, other: str, lift: float) -> Actions:
-    """Takes a block to its target; the inner hand's fingers go between the blocks."""
+    """Takes a block to its target, lifted so high; the inner hand's fingers go between the blocks."""
     goal, place = hands.frozen(f"goal{block[-1]}"), hands.where(f"{block}/position")
     beyond, gap, _ = (hands.where(f"{other}/position") - place).tolist()
     sides = {1.0: _APART, -1.0: _APART}
@@ -51,7 +54,7 @@ def _carry(hands: HandController, block: str, other: str, lift: float) -> Action
         if float(hands.where(f"{block}/position")[2]) > float(goal[2]) + 0.012 or not lift:
             break
         yield from clamp(hands, place, _LOW + lift, press=_PRESS)
-    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, 0.6 * _PRESS)
+    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, press=0.6 * _PRESS)
     if lift:
         yield from clamp(hands, middle(hands), _LOW + 0.05, 10, press=0.3 * _PRESS)
         yield from around(hands, middle(hands), 0.0, 2 * _TOUCH, _LOW + 0.05, 20)
