@@ -10,6 +10,7 @@ from bidex_meta.tasks.articulated import Switch
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.catches import HandOver
 from bidex_meta.tasks.cubes import StackBlock
+from bidex_meta.tasks.vessels import LiftUnderarm
 from bidex_meta.utils.maths import conjugate, multiply, xyzw
 from bidex_meta.witness.controller import GAIN, Actions, HandController, point
 from bidex_meta.witness.demonstrators import Scripted
@@ -109,9 +110,13 @@ def test_each_script_solves_its_class(name: str) -> None:
     assert any(success) and len(success) == simulator.episode_steps
 
 
-@pytest.mark.parametrize(
-    "name", ["BottleCap", "DoorCloseInward", "DoorOpenOutward", "OpenPenCap", "OpenScissors", "PushBlock", "Switch"]
-)
+SOLVED = (
+    "BottleCap", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "OpenPenCap", "OpenScissors", "PushBlock",
+    "StackBlock", "SwingCup", "Switch",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SOLVED)
 def test_a_script_of_version_2_brings_things_to_where_a_task_wants_them(name: str) -> None:
     world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
     world.reset(seed=3)
@@ -125,6 +130,7 @@ def test_a_script_of_version_2_brings_things_to_where_a_task_wants_them(name: st
 def test_version_1_has_no_more_scripts_than_it_had() -> None:
     with pytest.raises(BidexError, match="Expected a class with a script"):
         script_of(Switch())
-    wide = StackBlock()
-    wide.adopt(V2)
-    assert script_of(wide) is script_of(StackBlock())
+    wide, wide_lift = StackBlock(), LiftUnderarm()
+    for task in (wide, wide_lift):
+        task.adopt(V2)
+    assert script_of(wide) is not script_of(StackBlock()) and script_of(wide_lift) is script_of(LiftUnderarm())

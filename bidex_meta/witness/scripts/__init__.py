@@ -7,9 +7,11 @@ from bidex_meta.suite import Rules
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
+from bidex_meta.witness.scripts.bucket import place_in_bucket
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.carrying import carry_egg
 from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
+from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
 from bidex_meta.witness.scripts.turning import turn_cubes
@@ -31,10 +33,12 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "CatchUnderarm": carry_egg,
     "DoorCloseInward": push,
     "DoorOpenOutward": push,
+    "GraspAndPlace": place_in_bucket,
     "HandOver": carry_egg,
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
     "PushBlock": push_blocks,
+    "StackBlock": stack_in_order,
     "SwingCup": swing_cup,
     "Switch": press_switches,
 }

@@ -30,29 +30,7 @@ def grasp_and_place(hands: HandController) -> Actions:
     for i in range(90):
         x, y = (x + float(way[0]), y + float(way[1])) if i < 80 else (x, y)
         yield from _clamp(hands, x, y, high)
-    if hands.wide:
-        yield from hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 15, speed=0.3)
-        yield from _drag_bucket(hands, high)
     yield from hands.lead((x, y + 0.11, high), (x, y - 0.11, high), hands.episode_steps, speed=0.2)
-
-
-def _drag_bucket(hands: HandController, high: float) -> Actions:
-    """Clamps the bucket like the block, drags it over the table to its goal, and lets go."""
-    x, y, _ = hands.where("bucket/position").tolist()
-    low = 0.655
-    yield from hands.lead((x, y + 0.17, high), (x, y - 0.17, high), 20)
-    yield from hands.lead((x, y + 0.17, low), (x, y - 0.17, low), 25)
-    for _ in range(45):
-        yield from _clamp(hands, x, y, low)
-    while hands.steps_left > 40:
-        way = hands.frozen("goal")[:2] - hands.where("bucket/position")[:2]
-        if float(way.norm()) < 0.006:
-            break
-        way *= min(1.0, 0.0025 / float(way.norm()))
-        x, y = x + float(way[0]), y + float(way[1])
-        yield from _clamp(hands, x, y, low)
-    right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
-    yield from hands.lead((x, right + 0.06, low), (x, left - 0.06, low), hands.episode_steps, speed=0.1)
 
 
 def _clamp(hands: HandController, x: float, y: float, height: float) -> Actions:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.utils.maths import rotate
-from bidex_meta.witness.controller import Actions, HandController, Point, point
+from bidex_meta.witness.controller import Actions, HandController, Point, beside, point
 
 _TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
 _HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
@@ -58,27 +58,24 @@ def _ahead(hands: HandController) -> Tensor:
 
 
 _PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
-_RADIUS, _TOUCH = 0.068, 0.2  # of a peg's circle about the cup, metres; how far it is behind an ear that it pushes, rad
+# Of a peg's circle about the cup, and of the right fingertips', metres; how far either is behind an ear that it pushes;
+# angle of the left ear from which on the right hand pushes it: the left thumb would meet the lid, rad.
+_RADIUS, _TIP_RADIUS, _TOUCH, _FAR = 0.068, 0.078, 0.2, 0.5
+_FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
 
 
 def swing_cup(hands: HandController) -> Actions:
-    """The left hand turns its palm down, and its little finger, bent to a peg, pulls the ear around to its goal."""
-    # At an ear, friction on the foot lets the cup turn on its place sooner than slide. The left hand's thumb stays
-    # clear of the lid up to about 130 degrees; the right hand's would not.
-    x, y, z = hands.at("right").tolist()
-    away = x + 0.1, y + 0.3, z - 0.1
+    """The left little finger, bent to a peg, pulls the left ear around; the right fingers push it on from behind."""
+    # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
+    away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
     hands.hold("right")
     hands.bend("right", 0.0, 0.0)
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
-    goal = hands.frozen("goal")
-    wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
         """The left hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
-        cup, angle = hands.where("cup/position"), _yaw(hands) + math.pi - behind
-        way = torch.tensor([radius * math.cos(angle), radius * math.sin(angle), height], dtype=cup.dtype)
-        return point(hands.at("left") + cup + way - hands.where("left/lfdistal_position"))
+        return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
     x, y, z = hands.at("left").tolist()
     yield from hands.lead(away, (x, y - 0.05, z + 0.1), 65, speed=0.3)
@@ -87,13 +84,47 @@ def swing_cup(hands: HandController) -> Actions:
     for _ in range(20):
         yield from hands.lead(away, peg(0.8, _PEG, 0.1), speed=0.4)
     while hands.steps_left:
-        missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
+        missing = _missing(hands)
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
-        if missing < 0.05:
-            break
-        yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
+        if missing < 0.05 + 0.08 * float(hands.where("cup/angular_velocity")[2]):
+            yield from hands.lead(away, peg(_TOUCH + 0.4, _PEG, 0.1), speed=0.2)
+        elif _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
+            yield from _push_on(hands)
+        else:
+            yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
+
+
+def _push_on(hands: HandController) -> Actions:
+    """The left hand makes room, and the right one pushes the ear to its goal with straight fingers."""
+    x, y, z = hands.at("left").tolist()
+    back, aside = (x + 0.05, y - 0.08, z), (x + 0.05, y - 0.3, z + 0.1)
+
+    def tip(behind: float, before: float = 0.0) -> Point:
+        """The right hand's point for a fingertip at an angle behind the ear, so far towards the hand."""
+        way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
+        return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
+
+    for _ in range(8):
+        yield from hands.lead(tip(_TOUCH, 0.1), back, speed=0.4)
+    for _ in range(12):
+        yield from hands.lead(tip(_TOUCH, 0.03), aside, speed=0.4)
+    while hands.steps_left and _missing(hands) > 0.05:
+        yield from hands.lead(tip(_TOUCH - min(0.3, _missing(hands))), aside, speed=0.2)
     # The hand stays: a cup that is bumped on its way back turns on.
-    yield from hands.lead(away, point(hands.at("left")), hands.episode_steps)
+    yield from hands.lead(point(hands.at("right")), aside, hands.episode_steps)
+
+
+def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
+    """The place at an angle behind the left ear on a circle about the cup, at a height above its origin."""
+    cup, at = hands.where("cup/position"), _yaw(hands) + math.pi - angle
+    return cup + torch.tensor([radius * math.cos(at), radius * math.sin(at), height], dtype=cup.dtype)
+
+
+def _missing(hands: HandController) -> float:
+    """Angle by which the cup must yet turn, within half a turn, rad."""
+    goal = hands.frozen("goal")
+    wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
+    return (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _yaw(hands: HandController) -> float:
