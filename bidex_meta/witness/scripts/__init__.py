@@ -7,9 +7,9 @@ from bidex_meta.suite import Rules
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
-from bidex_meta.witness.scripts.bucket import place_in_bucket
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.carrying import carry_egg
+from bidex_meta.witness.scripts.placing import place_in_bucket
 from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
 from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
