@@ -97,7 +97,7 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
 
 def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
     """Three tasks of version 2 side by side, (height, 3 * width, 3) uint8: at the end of the script, else the start."""
-    world = make_task_world(f"{name}-v2", num_envs=50, seed=0, autoreset_mode="DISABLED", threads=1)
+    world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
     obs, _ = world.reset(seed=0)
     rows, solved = [0, 1, 2], torch.ones(50, dtype=torch.bool)
     if name in scripts_of(V2):
@@ -105,7 +105,7 @@ def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
         agent.reset(solved)
         for _ in range(int(world.max_episode_steps[0])):
             obs, *_, info = world.step(agent.eval_action(obs))
-        rows = info["so_far"]["success"].nonzero().flatten().tolist()[:3]
+        rows = (~info["so_far"]["success"]).long().argsort(stable=True).tolist()[:3]  # solved ones first
     pictures = [world.render(row=row, width=width, height=height, camera=VIEWS[0]) for row in rows]
     world.close()
     return np.concatenate(pictures, axis=1)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from bidex_meta.errors import BidexError
 
@@ -12,6 +13,7 @@ _SHARES = {
     "zero": "zero",
     "held": "held",
     "witness": "one witness",
+    "solved": "knowing the task",
 }
 
 
@@ -21,12 +23,22 @@ def validity_table(suite: str, data: Path) -> list[str]:
     if not file.is_file():
         raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
     classes = json.loads(file.read_text())["classes"]
-    lines = [f"| class | hidden | {' | '.join(_SHARES.values())} |", "|---|---|" + "---|" * len(_SHARES)]
+    lines = [
+        f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |",
+        "|---|---|" + "---|" * (len(_SHARES) + 2),
+    ]
     for name, row in classes.items():
-        cells = (_percent(row[key]) for key in _SHARES)
-        lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
+        cells = [_percent(row[key]) for key in _SHARES]
+        lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join([*cells, *_aligned(row)])} |")
     means = (_mean([row[key] for row in classes.values()]) for key in _SHARES)
-    return [*lines, f"| mean | | {' | '.join(map(_percent, means))} |"]
+    ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
+    return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
+
+
+def _aligned(row: dict[str, Any]) -> tuple[str, str]:
+    """Rank correlation; mean return of successful episodes beside the most that a policy gets that always fails."""
+    found = row["alignment"]
+    return ("", "") if found is None else (f"{found['rank']:.2f}", f"{found['solved']:.4g} / {found['unsolved']:.4g}")
 
 
 def _mean(values: list[float | None]) -> float | None:
