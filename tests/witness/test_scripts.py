@@ -20,7 +20,9 @@ from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS, script_of
 
 def test_a_class_without_a_script_is_refused() -> None:
     with pytest.raises(BidexError, match="DoorOpenInward, GraspAndPlace, LiftUnderarm"):
-        script_of(HandOver())
+        script_of(HandOver(moving_base=True))
+    with pytest.raises(BidexError, match="fixed"):
+        script_of(HandOver(moving_base=False))
 
 
 def test_a_script_is_led_by_each_rows_state(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ _PLAYED: dict[Kind, str] = {
 }
 _BEST = (
     "success [95 %]",
+    "other tasks",
     "return [95 %]",
     "score",
     "uniform actions: return",
@@ -90,7 +91,7 @@ def classes_table(study: Study) -> Iterator[str]:
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
     """One row per class, in MT20's order: the run with the highest success, ties broken by return.
 
-    The run is not named in the rows when there is only one.
+    The run is not named in the rows when there is only one. Columns without any number are left out.
     """
     found: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
     for run in (run for study in studies for run in study.runs):
@@ -104,17 +105,21 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     for name in sorted(found, key=lambda name: order.index(name) if name in order else len(order)):
         run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
         random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
-        content = run.content
+        others = run.evaluation().get("other_tasks", {"policy": {"classes": {}}})["policy"]["classes"].get(name)
+        content, wide = run.content, str(run.config().suite).endswith("-v2")  # references are of version 1
         which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
         cells = [
             _measure(best, "success").text(100.0, " %", ".4g"),
+            "–" if others is None else _measure(others, "success").text(100.0, " %", ".4g"),
             _measure(best, "return").text(form=".4g"),
             "–" if best["score"] is None or best["return"] == experts.get(name) else f"{best['score']:.0f}",
             "–" if random is None else f"{random['return']:.4g}",
-            *(f"{100 * known[name]['success']:.4g} %" if name in known else "–" for known in references),
+            *(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–" for known in references),
         ]
         rows.append([name, *which, *cells, str(len(found[name]))] if several else [name, *cells])
-    return table(["class", "arm", "seed", "steps", "hours", *_BEST, "runs"] if several else ["class", *_BEST], rows)
+    head = ["class", "arm", "seed", "steps", "hours", *_BEST, "runs"] if several else ["class", *_BEST]
+    kept = [i for i in range(len(head)) if any(row[i] != "–" for row in rows)]
+    return table([head[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
 def references_table() -> Iterator[str]:

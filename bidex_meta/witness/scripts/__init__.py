@@ -51,8 +51,10 @@ def scripts_of(rules: Rules) -> dict[str, Script]:
 
 
 def script_of(task: TaskClass) -> Script:
-    """The script of a class by its rules; raises BidexError where it has none."""
+    """The script of a class by its rules; raises BidexError where it has none, or its bases are fixed."""
     known = scripts_of(task.rules)
+    if not task.moving_base:
+        raise BidexError(f"Expected moving bases for the script of {task.name}, got fixed ones: moving_base=True.")
     if task.name not in known:
         raise BidexError(f"Expected a class with a script ({', '.join(known)}), got {task.name}; leave --script out.")
     return known[task.name]
