@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from tests.goldens import build
-from tests.robust.victims import ADAPTS, FLAGS, OFFLINE
+from tests.robust.victims import ADAPTS, FLAGS, OFFLINE, TAUGHT
 
 ROOT = Path(__file__).parent.parent
 FILE = ROOT / "tests" / "data" / "freeze.json"
@@ -119,7 +119,9 @@ def _data_set(folder: str) -> Path:
 
 def _run(algo: str) -> list[str]:
     fixed = ["--seed", "5", "--threads", "1", "--device", "cpu", "--logger", "none"]
-    return ["run", "--suite", "ML4" if algo in ADAPTS else "MT4", "--algo", algo, *fixed]
+    taught = ["--teacher", "scripts"] if algo in TAUGHT else []
+    suite = "ML4" if algo in ADAPTS else "MT4-v2" if taught else "MT4"
+    return ["run", "--suite", suite, "--algo", algo, *taught, *fixed]
 
 
 def _tensors(value: Any) -> Iterator[str]:
