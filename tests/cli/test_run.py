@@ -100,7 +100,7 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("run --task handove", "Did you mean 'HandOver'?"),
         ("run --resume nowhere", "not a run folder"),
         ("list suits", "Did you mean 'suites'?"),
-        ("list", "suites|tasks|algos|objects"),
+        ("list", "suites|tasks|hidden|algos|objects"),
         ("evaluate nowhere", "not a run folder"),
         ("evaluate nowhere --split tets", "'train', 'test'"),
         ("bench speed", "Unknown bench"),
