@@ -71,7 +71,7 @@ class Scripted:
 
     ``world`` is on C MuJoCo and has moving bases; ``names``: of the slots that play, None for all, others get zero
     actions. A script begins with its row's episode, and reacts to whatever moved the hands: noise (of this standard
-    deviation), or another policy's actions. After its end it repeats its last action. ``misled``: each row's is told
+    deviation), or another policy's actions. After its end it repeats its last action. ``misled``: each row's is given
     the next task of its pool, as one that has to guess. Raises BidexError for a class without a script.
     """
 
@@ -133,8 +133,8 @@ class _Class:
     def _begin(self, row: int) -> Actions:
         """The script of a row; reads nothing before its first action is asked for."""
         place = self._member.world_rows.start + row
-        told = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
-        frozen = self._part.frozen(self._number, told)
+        given = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
+        frozen = self._part.frozen(self._number, given)
         places = self._member.scene.sensors
         hands = HandController(self._task, lambda name: self._sensors[row, places[name]], lambda name: frozen[name][0])
         yield from self._script(hands)

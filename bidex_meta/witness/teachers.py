@@ -24,7 +24,7 @@ class Tutor:
 
 
 class Teachers:
-    """Labels actions of a world's environments; an agent, to be asked in every step and told where episodes begin.
+    """Labels actions of a world's environments; an agent, asked in every step and reset where episodes begin.
 
     ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays those of ``scripted_rows``, bool
     (N,); ``tutors`` have others, each its own.

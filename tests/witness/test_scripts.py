@@ -59,11 +59,11 @@ def test_a_script_is_led_by_each_rows_state(monkeypatch: pytest.MonkeyPatch) -> 
     assert not torch.equal(agent.eval_action(obs), last)
 
 
-def test_a_misled_script_is_told_the_next_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[torch.Tensor] = []
+def test_a_misled_script_is_given_the_next_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[torch.Tensor] = []
 
     def listen(hands: HandController) -> Actions:
-        told.append(hands.frozen("leaves"))
+        given.append(hands.frozen("leaves"))
         yield from ()
 
     monkeypatch.setitem(WIDE_SCRIPTS, "DoorOpenOutward", listen)
@@ -73,7 +73,7 @@ def test_a_misled_script_is_told_the_next_task(monkeypatch: pytest.MonkeyPatch) 
         agent = Scripted(world, misled=misled)
         agent.reset(torch.ones(50, dtype=torch.bool))
         agent.eval_action(torch.zeros(50, 1))
-    assert torch.equal(torch.stack(told[50:]), torch.stack(told[:50]).roll(-1, 0))
+    assert torch.equal(torch.stack(given[50:]), torch.stack(given[:50]).roll(-1, 0))
 
 
 def test_noise_is_added_to_what_a_script_does() -> None:
