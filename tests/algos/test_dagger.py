@@ -23,7 +23,7 @@ CLONED = replace(SMALL, teacher_steps=10**12)  # the teacher always plays
 
 
 class Constant:
-    """Acts alike everywhere; counts what it was asked, and the episodes that it was told of."""
+    """Acts alike everywhere; counts what it was asked, and the episodes that it was reset for."""
 
     def __init__(self, *action: float):
         self.action, self.asked, self.begun = torch.tensor(action), 0, 0
@@ -86,9 +86,13 @@ def test_teachers_play_fewer_and_fewer_episodes_and_label_all() -> None:
 
 def test_a_class_without_a_teacher_is_played_by_the_student_and_not_learned() -> None:
     learner = taught(two_tasks(), CLONED, Constant(0.3, 0.3))
-    told = learner.iterate()
-    assert told["Policy/teacher_share"] == 0.5 and "Loss/imitation/task0" in told
-    assert "Loss/imitation/task1" not in told and learner.data is not None and learner.data.rows.tolist() == [*range(8)]
+    reported = learner.iterate()
+    assert reported["Policy/teacher_share"] == 0.5 and "Loss/imitation/task0" in reported
+    assert (
+        "Loss/imitation/task1" not in reported
+        and learner.data is not None
+        and learner.data.rows.tolist() == [*range(8)]
+    )
 
 
 def test_losses_are_in_units_of_the_variance_of_a_class() -> None:
@@ -101,11 +105,11 @@ def test_losses_are_in_units_of_the_variance_of_a_class() -> None:
     generator = torch.Generator().manual_seed(0)
     config = replace(SMALL, learning_rate=1e-6, updates_per_iteration=5)
     learner = taught(two_tasks(), config, Noisy(1.0, 1.0), Noisy(0.1, 0.1))
-    told = [learner.iterate() for _ in range(4)][-1]
-    assert told["Loss/imitation/task0"] == pytest.approx(1.0, abs=0.03)
-    assert told["Loss/imitation/task1"] == pytest.approx(0.1**2 / (0.1**2 + 0.03**2), abs=0.03)
-    assert told["Loss/imitation"] == pytest.approx(
-        0.5 * (told["Loss/imitation/task0"] + told["Loss/imitation/task1"]), rel=1e-5
+    reported = [learner.iterate() for _ in range(4)][-1]
+    assert reported["Loss/imitation/task0"] == pytest.approx(1.0, abs=0.03)
+    assert reported["Loss/imitation/task1"] == pytest.approx(0.1**2 / (0.1**2 + 0.03**2), abs=0.03)
+    assert reported["Loss/imitation"] == pytest.approx(
+        0.5 * (reported["Loss/imitation/task0"] + reported["Loss/imitation/task1"]), rel=1e-5
     )
 
 
