@@ -34,6 +34,7 @@ ALGOS: dict[str, str] = {
     "td3": "bidex_algos.offpolicy.td3:TD3",
     # From teachers (`--teacher`), of one class or of many.
     "dagger": "bidex_algos.imitation.dagger:DAgger",
+    "icl": "bidex_algos.meta.icl:ICL",
     # These learn from data sets (`--dataset`), of one class or of many.
     "bc": "bidex_algos.offline.bc:BC",
     "bcq": "bidex_algos.offline.bcq:BCQ",

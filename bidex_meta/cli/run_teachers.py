@@ -38,9 +38,10 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
         return
     if not config.teacher:
         raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
-    if source.hides_goals:
+    if source.hides_goals and not kind.make.adapts:
         raise BidexError(
-            f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite."
+            f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite, or take "
+            "--algo icl."
         )
     if SCRIPTS in config.teacher and (config.device != "cpu" or config.engine == "warp"):
         raise BidexError("--teacher scripts reads states of C MuJoCo. Add --device cpu, and leave --engine out.")
@@ -115,13 +116,14 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
     if untaught := [task for task in classes if task not in assigned]:
         say(f"Without a teacher, and not learned: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
-    if not scripted:
-        return Teachers(world, tutors)
     inner: Any = getattr(world, "unwrapped", world)  # without a recorder
+    hidden = inner if source.hides_goals else None
+    if not scripted:
+        return Teachers(world, tutors, hidden=hidden)
     names = [inner.slots[i].name for i, task in enumerate(slots) if task in scripted]
     mask = torch.zeros(world.num_envs, dtype=torch.bool)
     mask[_rows(world, slots, scripted)] = True
-    return Teachers(world, tutors, Scripted(inner, names=names), mask)
+    return Teachers(world, tutors, Scripted(inner, names=names), mask, hidden)
 
 
 def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,11 +24,24 @@ class Tutor:
     width: int
 
 
+class Goals(Protocol):
+    """What a world knows of its goals, though observations do not show them; a ``World`` is one."""
+
+    @property
+    def goal_columns(self) -> Tensor:
+        """The entries of an observation, int64 (k,)."""
+        ...
+
+    def goals(self) -> Tensor:
+        """What they would be now, (N, k)."""
+        ...
+
+
 class Teachers:
     """Labels actions of a world's environments; an agent, asked in every step and reset where episodes begin.
 
     ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays those of ``scripted_rows``, bool
-    (N,); ``tutors`` have others, each its own.
+    (N,); ``tutors`` have others, each its own. ``hidden``: of a world that hides goals, what shows them to the tutors.
     """
 
     def __init__(
@@ -36,7 +50,9 @@ class Teachers:
         tutors: Sequence[Tutor] = (),
         scripted: Scripted | None = None,
         scripted_rows: Tensor | None = None,
+        hidden: Goals | None = None,
     ) -> None:
+        self.hidden = hidden
         self._tutors, self._scripted = tutors, scripted
         self._shape = world.action_space.shape
         self.known = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
@@ -53,6 +69,8 @@ class Teachers:
     def eval_action(self, obs: Tensor) -> Tensor:
         """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
         labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
+        if self.hidden is not None and self._tutors:
+            obs = obs.index_copy(1, self.hidden.goal_columns, self.hidden.goals())
         for tutor in self._tutors:
             actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
             labels[tutor.rows, : actions.shape[1]] = actions

@@ -161,15 +161,28 @@ class Part:
         sensors = self._engine.sensordata
         values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)
         if self._rule != "masked":
-            for member, where, state in states:
-                for name, block in member.scene.task.observe(state).items():
-                    values[where, self._observer.layout.range(name)] = block.float()
+            self._show_goals(values, states)
         self._observer.choose_signs(values)
         if self._sights is not None:
             position, rotation = self._engine.body_poses()
             for member, where, _ in states:
                 own = member.engine_rows if rows is None else rows[where]
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
+        return values.clamp_(-CLIP, CLIP)
+
+    def _show_goals(self, values: Tensor, states: list[tuple[Member, slice, TaskState]]) -> None:
+        for member, where, state in states:
+            for name, block in member.scene.task.observe(state).items():
+                values[where, self._observer.layout.range(name)] = block.float()
+
+    def goals(self, task_index: Tensor, width: int) -> Tensor:
+        """The goals' entries of observations (num, width), as a suite that hides nothing shows them, zero elsewhere.
+
+        ``task_index``: task of each of the part's environments, (num,).
+        """
+        values = torch.zeros(self._engine.num, width, device=self._engine.device)
+        self._show_goals(values, list(self.states(task_index)))
+        self._observer.choose_signs(values)
         return values.clamp_(-CLIP, CLIP)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
+from bidex_algos.meta.memory_agent import MemoryAgent
+from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
@@ -26,7 +27,7 @@ def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
     return played(agent.eval_action, world)
 
 
-def state_of(agent: RL2Agent) -> Tensor:
+def state_of(agent: MemoryAgent) -> Tensor:
     assert agent._learned is not None
     return agent._learned.state.clone()
 
@@ -146,7 +147,7 @@ def test_bad_input_is_named():
         RL2(PointGoals(1), SMALL, seed=0)
 
 
-def agent_on(world: PointGoals) -> RL2Agent:
+def agent_on(world: PointGoals) -> MemoryAgent:
     learner = RL2(PointGoals(8, classes=TEN), SMALL, seed=0)
     learner.iterate()
     agent = RL2.load_policy(learner.policy_state_dict())
@@ -197,7 +198,7 @@ def test_the_agent_plays_the_trial_that_the_training_played():
     learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.0), seed=0)
     learner._update = lambda batch: {}  # type: ignore[method-assign]
     learner.iterate()
-    t, agent = learner.trials, RL2Agent(learner.policy)
+    t, agent = learner.trials, MemoryAgent(learner.policy)
     # Statistics have moved since: what the memory would be by the present ones.
     previous = t.previous(len(t.obs) - 1)
     for row in (0, 5):

@@ -4,6 +4,7 @@ A row whose episode is over waits, its memory untouched. Waiting is not recorded
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,20 +20,31 @@ from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class TrialConfig(LearnerConfig):
-    """Networks and trials of RL²."""
+class MemoryConfig(LearnerConfig):
+    """Networks with a memory, and trials."""
 
-    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
+    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory.
     activation: Activation = "elu"  # Non-linearity of the encoder.
-    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
-    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
+    memory: Count = 128  # Numbers that an environment's memory (GRU) holds.
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
-    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
     max_adapt_steps: Count = 150  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
     blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+
+    @property
+    def trial_steps(self) -> int:
+        """Most steps of a trial."""
+        return self.episodes_per_trial * self.max_adapt_steps
+
+
+@dataclass(frozen=True)
+class TrialConfig(MemoryConfig):
+    """Trials that PPO learns from; the critic has an encoder and a memory like the actor's."""
+
+    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
     lam: Fraction = 0.95  # Trace decay of the advantage estimate.
     chunk: Count | None = None
@@ -92,9 +104,37 @@ class Trials:
         return gamma ** (1.0 + left.float())
 
 
+class Player(Protocol):
+    """Who acts in a trial, knowing what the policy would do."""
+
+    def begin(self) -> None:
+        """All environments are at the start of an episode."""
+
+    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
+        """Actions (N, a), not clamped, for raw observations (N, d) and the policy's means (N, a).
+
+        ``slot`` (N,) is where the step is recorded; of rows that wait, the next step overwrites it.
+        """
+        ...
+
+
+class Sampling:
+    """Actions from the Gaussian around the policy's means."""
+
+    def __init__(self, std: Tensor, generator: torch.Generator):
+        self._std, self._generator = std, generator
+
+    def begin(self) -> None:
+        """Nothing."""
+
+    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
+        """Actions (N, a); not clamped: the world does that, and the density must be that of what was drawn."""
+        return mean + self._std * torch.randn(mean.shape, generator=self._generator, device=mean.device)
+
+
 @torch.no_grad()
 def play(
-    world: VectorWorld, policy: RecurrentPolicy, trials: Trials, obs: Tensor, blind_share: float,
+    world: VectorWorld, policy: RecurrentPolicy, player: Player, trials: Trials, obs: Tensor, blind_share: float,
     generator: torch.Generator, statistics: list[list[EpisodeStatistics]]
 ) -> None:  # fmt: skip
     """Fills ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
@@ -105,18 +145,17 @@ def play(
     rows, device = torch.arange(world.num_envs, device=world.device), world.device
     memory = policy.fresh_memory(world.num_envs)
     trials.lengths.zero_()
-    std = policy.log_std.exp()
     for episode in range(trials.episodes):
         if episode > 0:
             obs, _ = world.reset()
+        player.begin()
         shown = torch.rand(world.num_envs, generator=generator, device=device) >= blind_share
         playing = torch.ones(world.num_envs, dtype=torch.bool, device=device)
         success, whole = ~playing, playing.clone()
         elapsed, earned = torch.zeros_like(rows), torch.zeros(world.num_envs, device=device)
         for _ in range(trials.longest):
             mean, state = policy.step(obs, memory)
-            # Not clamped: the world does that, and the density must be that of what was drawn.
-            action = mean + std * torch.randn(mean.shape, generator=generator, device=device)
+            action = player.act(obs, mean, trials.lengths)
             next_obs, reward, terminated, truncated, info = world.step(action)
             valid = ~info["unstable"]
             reward = reward.masked_fill(~(valid & playing), 0.0)

@@ -1,7 +1,7 @@
 """Networks with a memory: encoder, GRU, output; and a Gaussian policy that remembers what it did and what it earned."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,16 +12,16 @@ from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation
 from bidex_algos.nets.normalise import ObservationNormaliser
 
 
-class RecurrentNet(nn.Module):
-    """An encoder, a GRU on its features, and a linear output of both, so that a reflex need not pass the memory.
+class Remembering(nn.Module):
+    """An encoder and a GRU on its features.
 
     All in float32: a memory would carry the rounding of bfloat16 on. At the start its numbers fade over 2 to
     ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
     """
 
     def __init__(
-        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, outputs: int, output_gain: float,
-        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
+        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, generator: torch.Generator,
+        activation: Activation = "elu", lasting: int = 1
     ):  # fmt: skip
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
@@ -36,13 +36,47 @@ class RecurrentNet(nn.Module):
                 nn.init.orthogonal_(gate, generator=generator)
         # The gates are reset, update, new. An update gate of 1/2 halves the memory, and its gradient, at each step.
         self.gru.get_parameter("bias_ih_l0").data.chunk(3)[1].copy_(torch.linspace(0.0, math.log(lasting), memory))
+
+    def remember(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Features (T, B, hidden) of steps (T, B, inputs), the memory after each (T, B, memory), the last (B, memory).
+
+        ``state`` (B, memory) is the memory before them.
+        """
+        features = self.encoder(x)
+        remembered, last = self.gru(features, state[None].contiguous())
+        return features, remembered, last[0]
+
+
+class RecurrentNet(Remembering):
+    """A linear output of features and memory, so that a reflex need not pass the memory."""
+
+    def __init__(
+        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, outputs: int, output_gain: float,
+        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
+    ):  # fmt: skip
+        super().__init__(inputs, hidden, memory, generator, activation, lasting)
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after, from that before them."""
-        features = self.encoder(x)
-        remembered, last = self.gru(features, state[None].contiguous())
-        return self.head(torch.cat([features, remembered], dim=-1)), last[0]
+        features, remembered, last = self.remember(x, state)
+        return self.head(torch.cat([features, remembered], dim=-1)), last
+
+
+class BeliefNet(Remembering):
+    """A network of its own for the output, of the whole input and the memory: what to do, given what is known."""
+
+    def __init__(
+        self, inputs: Inputs, hidden: Sequence[int], memory: int, head: Sequence[int], outputs: int,
+        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
+    ):  # fmt: skip
+        super().__init__(inputs, hidden, memory, generator, activation, lasting)
+        self.head = MLP(inputs.extended("memory", memory), head, outputs, 0.01, generator, activation)
+
+    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """As of :class:`RecurrentNet`."""
+        _, remembered, last = self.remember(x, state)
+        return self.head(torch.cat([x, remembered], dim=-1)), last
 
 
 @dataclass
@@ -69,19 +103,20 @@ class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
     Rewards of unknown classes differ by orders of magnitude; one rule serves all: asinh(reward / ``reward_unit``),
-    normalised by running statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
+    normalised by running statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation, and
+    ``make_actor`` the result.
     """
 
     def __init__(
-        self, inputs: Inputs, actions: int, hidden: Sequence[int], memory: int, init_std: float, reward_unit: float,
-        normalise_observations: bool, generator: torch.Generator, activation: Activation, lasting: int
+        self, inputs: Inputs, actions: int, memory: int, init_std: float, reward_unit: float,
+        normalise_observations: bool, make_actor: Callable[[Inputs], nn.Module]
     ):  # fmt: skip
         super().__init__()
         self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
         self.inputs = inputs.extended("last_step", actions + 3)
         self.observations = ObservationNormaliser(inputs, normalise_observations)
         self.rewards = ObservationNormaliser(1)
-        self.actor = RecurrentNet(self.inputs, hidden, memory, actions, 0.01, generator, activation, lasting)
+        self.actor = make_actor(self.inputs)
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:

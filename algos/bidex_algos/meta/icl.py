@@ -1,0 +1,238 @@
+"""In-context learning: a policy with a memory, taught by teachers that know what it has to find out.
+
+An iteration plays one trial, a few episodes of one task with one memory, in every environment. Teachers, to which the
+goal is shown, say what they would do in each of its states (DAgger); the student learns that from what it has seen and
+earned so far. Where it cannot know the goal yet, the mean over what is possible is best for its loss. A second loss
+asks its memory for the goal.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.learner import as_numbers
+from bidex_algos.meta.taught_trials import Lesson, TaughtTrials
+from bidex_algos.meta.trial_learner import TrialLearner
+from bidex_algos.meta.trials import MemoryConfig, Trials
+from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, Layers
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.recurrent import BeliefNet, RecurrentPolicy
+from bidex_algos.nets.shape import Shape
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
+from bidex_meta.train.learner import Parts, State
+from bidex_meta.utils.validation import Count, NonNegative, Positive, Whole
+from bidex_meta.witness.teachers import Teachers
+from bidex_meta.world.contract import PooledWorld
+
+# Added to deviations, in which errors count: 1.5 % of an action's range, and 1 cm of a goal.
+_ACTION_FLOOR, _GOAL_FLOOR = 0.03, 0.01
+
+
+@dataclass(frozen=True)
+class ICLConfig(MemoryConfig):
+    """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
+
+    head: Layers = (512, 512)  # Widths of the actor's hidden layers, behind the memory.
+    init_std: Positive = 0.05  # Standard deviation of the actions in episodes that a meta-test adapts to.
+    max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    reward_unit: Positive = 0.3
+    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    updates_per_iteration: Count = 50  # Updates after each trial.
+    batch_trials: Count = 16  # Trials of an update, split evenly over the classes with a teacher.
+    batch_steps: Count = 128  # Steps of each of them whose labels count; the memory passes all.
+    trials: Count = 1024  # Trials that each process keeps; the oldest go first.
+    learning_rate: Positive = 1e-3  # Adam's step size.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
+    goal_weight: NonNegative = 0.3  # Factor of the loss that asks the memory for what the suite hides.
+    teacher_steps: Whole = 300_000
+    """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0."""
+    noise_std: NonNegative = 0.0  # Standard deviation of noise on the actions that are played.
+    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base, for episodes of 300 steps: how long they are is not known here."""
+        steps = self.episodes_per_trial * min(self.max_adapt_steps, 300)
+        memory = 4 * 4 * 3 * self.memory * (self.memory + self.hidden[-1])
+        return (
+            (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
+            + memory
+            + network_bytes((*self.hidden, *self.head), width, 1)
+        )
+
+
+PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
+
+
+class ICL(TrialLearner):
+    """In-context learning by imitation: a memory infers the task from episodes and rewards, no weight changes."""
+
+    name, remedy = "icl", "lower learning_rate"
+    config_type, presets = ICLConfig, PRESETS
+    taught = True
+    per_process = ("generator", "episodes", "data")
+    config: ICLConfig
+    data: TaughtTrials | None = None
+
+    def __init__(self, world: PooledWorld, config: ICLConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
+
+    @classmethod
+    def _make_policy(
+        cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> RecurrentPolicy:
+        def actor(inputs: Inputs) -> BeliefNet:
+            return BeliefNet(
+                inputs, config.hidden, config.memory, config.head, shape.actions, init, config.activation,
+                config.trial_steps
+            )  # fmt: skip
+
+        return RecurrentPolicy(
+            cls._inputs(config, shape), shape.actions, config.memory, config.init_std, config.reward_unit,
+            config.normalise_observations, actor
+        ).to(device)  # fmt: skip
+
+    def learn_from_teachers(self, teachers: Teachers) -> None:
+        """Takes who labels; before the first iteration and before a checkpoint is loaded."""
+        self.teachers, cfg = teachers, self.config
+        goals = 0 if teachers.hidden is None else len(teachers.hidden.goal_columns)
+        rows = teachers.known.nonzero().squeeze(1)
+        self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
+        self.rows, self.first = rows, self.count.cumsum(0) - self.count
+        trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
+        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), goals)
+        self.goal_stats = RunningStats((self.world.num_tasks, goals)).to(self.device)
+        self.belief = MLP(cfg.memory, (cfg.memory,), goals, 0.01, self.initial, cfg.activation).to(self.device)
+        self.adam = torch.optim.Adam(self._weights(), lr=cfg.learning_rate, fused=True)
+
+    def _weights(self) -> list[nn.Parameter]:
+        return [*self.policy.actor.parameters(), *self.belief.parameters()]
+
+    def _iterate(self) -> dict[str, float]:
+        data = self.data
+        if data is None:
+            raise BidexError(f"{self.name}: has nobody to learn from. Call learn_from_teachers first.")
+        player = _Pupil(self, data)
+        self._play(data.trials, player)
+        data.keep()
+        t, filled = data.trials, data.trials.filled()
+        valid = t.valid & filled
+        self._take_moments(data)
+        self.policy.update_statistics(t.obs[filled], t.rewards[valid])
+        losses = self._learn(data)
+        self._count(t)
+        tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": player.share(), **losses}
+        return self._episodes_metrics() | as_numbers(tensors)
+
+    def teachers_share(self) -> float:
+        """Of the episodes that begin now: those that the teacher plays."""
+        steps = self.config.teacher_steps
+        return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
+
+    @torch.no_grad()
+    def _take_moments(self, data: TaughtTrials) -> None:
+        """Takes labels and goals of the trials into the statistics of their classes."""
+        filled = data.trials.filled()
+        for stats, values in ((self.label_stats, data.labels), (self.goal_stats, data.goals)):
+            mean, var, count = torch.zeros(3, *stats.mean.shape, dtype=torch.float64, device=self.device)
+            for task in self.tasks.tolist():
+                mine = self.rows[self.world.task_id[self.rows] == task]
+                found = values[:, mine][filled[:, mine]].double()
+                var[task], mean[task] = torch.var_mean(found, dim=0, correction=0)
+                count[task] = len(found)
+            stats.merge(*pool_moments(mean, var, count))
+
+    def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
+        cfg, device = self.config, self.device
+        shape = len(self.tasks), math.ceil(cfg.batch_trials / len(self.tasks))
+        losses = list[Tensor]()
+        for _ in range(cfg.updates_per_iteration):
+            trial = torch.randint(data.filled, shape, generator=self.generator, device=device)
+            # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+            row = torch.randint(2**40, shape, generator=self.generator, device=device) % self.count[:, None]
+            rows = self.rows[self.first[:, None] + row]
+            losses.append(self._descend(data.take(trial.flatten(), rows.flatten())))
+        imitation, goal = torch.stack(losses).mean(0)
+        names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
+        found = dict(zip(names, imitation, strict=True))
+        return {"Loss/imitation": imitation.mean(), "Loss/goal": goal.mean(), **found}
+
+    def _descend(self, lesson: Lesson) -> Tensor:
+        """A step down the mean of the classes' losses; imitation and goal of each class (2, K), of all processes."""
+        errors = self._errors(lesson) / world_size()
+        self.adam.zero_grad()
+        (errors[0].mean() + self.config.goal_weight * errors[1].mean()).backward()
+        errors = sum_gradients(self._weights(), errors.detach())
+        nn.utils.clip_grad_norm_(self._weights(), self.config.max_grad_norm)
+        self.adam.step()
+        return errors
+
+    def _errors(self, lesson: Lesson) -> Tensor:
+        """Mean squared errors of actions and of goals in units of their class's deviation, (2, K)."""
+        batch = len(lesson.lengths)
+        actor: BeliefNet = self.policy.actor  # type: ignore[assignment]
+        tasks = self.tasks.repeat_interleave(batch // len(self.tasks))
+        x = self.policy.see(lesson.obs, *lesson.previous)
+        _, remembered, _ = actor.remember(x, x.new_zeros(batch, self.config.memory))
+        drawn = torch.rand(self.config.batch_steps, batch, generator=self.generator, device=self.device)
+        at = (drawn * lesson.lengths).long(), torch.arange(batch, device=self.device)
+        known = remembered[at]
+        means = actor.head(torch.cat([x[at], known], dim=-1))
+        acted = (means - lesson.labels[at]) / self.label_stats.std(_ACTION_FLOOR).float()[tasks]
+        unit, middle = self.goal_stats.std(_GOAL_FLOOR).float()[tasks], self.goal_stats.mean.float()[tasks]
+        believed = self.belief(known) - (lesson.goals[at] - middle) / unit
+        off = [each.square().sum(-1).mean(0) / max(1, each.shape[-1]) for each in (acted, believed)]
+        return torch.stack([each.view(len(self.tasks), -1).mean(1) for each in off])
+
+    def _parts(self) -> Parts:
+        taught = {"belief": self.belief, "adam": self.adam, "goal_stats": self.goal_stats} if self.data else {}
+        counts = [self.episodes, self.firsts, self.lasts]
+        return {"label_stats": self.label_stats, "generator": self.generator, "episodes": counts, **taught}
+
+    def state_dict(self) -> State:
+        """As in the base; the data set makes its own copy, since two of it at once may not fit."""
+        return super().state_dict() | {"data": self.data and self.data.state_dict()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or data set had another size."""
+        super().load_state_dict(state)
+        if self.data is not None:
+            self.data.load_state_dict(state["data"])
+
+
+class _Pupil:
+    """Plays trials: in some episodes the teachers do, elsewhere the policy's mean; all is labelled."""
+
+    def __init__(self, learner: ICL, data: TaughtTrials):
+        self._learner, self._data, self._shares = learner, data, list[Tensor]()
+        self._rows = torch.arange(learner.world.num_envs, device=learner.device)
+
+    def begin(self) -> None:
+        """Draws who plays the episodes."""
+        learner = self._learner
+        drawn = torch.rand(len(self._rows), generator=learner.generator, device=learner.device)
+        self._teacher_plays = (drawn < learner.teachers_share()) & learner.teachers.known
+        self._shares.append(self._teacher_plays.double().mean())
+        learner.teachers.reset(torch.ones_like(self._teacher_plays))
+
+    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
+        """Of the teachers or the policy, and notes what the teachers would do, and the goals."""
+        learner, data, rows = self._learner, self._data, self._rows
+        labels = learner.teachers.eval_action(obs)
+        data.labels[slot, rows] = labels
+        if learner.teachers.hidden is not None:
+            data.goals[slot, rows] = learner.teachers.hidden.goals()
+        actions = torch.where(self._teacher_plays[:, None], labels, mean)
+        if learner.config.noise_std:
+            noise = torch.randn(mean.shape, generator=learner.generator, device=mean.device)
+            actions = actions + learner.config.noise_std * noise
+        return actions
+
+    def share(self) -> Tensor:
+        """Of the episodes: those that the teachers played."""
+        return all_sum(torch.stack(self._shares).mean()) / world_size()

@@ -1,0 +1,86 @@
+"""The agent of a policy that adapts by what it remembers of a trial (RL², in-context learning)."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
+from bidex_meta.agents import Timestep
+
+
+class MemoryAgent:
+    """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` is of what it explores with.
+
+    Episodes that adapt write the memory, each environment its own; evaluation episodes play on a copy, each after the
+    same shots. No weight changes.
+    """
+
+    def __init__(self, policy: RecurrentPolicy, seed: int = 0):
+        self.policy = policy
+        self.device = policy.log_std.device
+        self.noise = torch.Generator(self.device).manual_seed(seed)
+        self.init()
+
+    def assign(self, task_of_row: Tensor | None) -> None:
+        """Nothing: each environment learns from its own episodes, rows of one task do not share what they learn."""
+
+    def init(self) -> None:
+        """Every memory is as at the start of a trial."""
+        self._learned: Memory | None = None
+        self._playing: Memory | None = None
+        self._next_state: Tensor | None = None
+        self._wait(0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """An episode begins where ``env_mask`` (N,): the memory learns of it, and forgets what was only evaluated."""
+        learned = self._memory(self._learned, len(env_mask))
+        self._over = ~env_mask
+        self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
+        self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
+
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sampled actions (N, a) in [-1, 1] for raw observations (N, d), and the Gaussian they are from."""
+        self._learned = self._memory(self._learned, len(obs))
+        mean, self._next_state = self.policy.step(obs, self._learned)
+        std = self.policy.log_std.detach().exp().expand_as(mean)
+        noise = torch.randn(mean.shape, generator=self.noise, device=mean.device)
+        return (mean + std * noise).clamp(-1.0, 1.0), {"mean": mean, "std": std}
+
+    def step(self, timestep: Timestep) -> None:
+        """Remembers one transition of every environment but those whose episode is over: they wait for ``reset``."""
+        if self._learned is None or self._next_state is None:
+            return
+        valid, ended = timestep.valid, timestep.terminated | timestep.truncated
+        # Meta-World's evaluation names no valid rows: all are.
+        known = torch.ones_like(ended) if valid is None else valid
+        moved = torch.ones_like(ended) if valid is None else ~self._over
+        after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
+        self._learned = self._learned.replaced(moved, after)
+        self._begun, self._over = self._begun | moved, (self._over & ~moved) | ended
+        self._next_state = None
+
+    def adapt(self) -> None:
+        """Nothing: the memory has learned along the way."""
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Mean actions (N, a) in [-1, 1] for raw observations (N, d).
+
+        The memory goes on within the episode, shown that rewards are not known, as in training (``blind_share``).
+        """
+        memory = self._memory(self._playing, len(obs))
+        mean, state = self.policy.step(obs, memory)
+        action, no = mean.clamp(-1.0, 1.0), torch.zeros_like(memory.done)
+        self._playing = Memory(state, action, torch.zeros_like(memory.reward), no, no)
+        return action
+
+    def _memory(self, memory: Memory | None, rows: int) -> Memory:
+        if memory is not None and len(memory.state) == rows:
+            return memory
+        if self._learned is None or len(self._learned.state) != rows:
+            self._wait(rows)
+        return self.policy.fresh_memory(rows)
+
+    def _wait(self, rows: int) -> None:
+        self._begun = torch.zeros(rows, dtype=torch.bool, device=self.device)
+        self._over = ~self._begun

@@ -1,0 +1,77 @@
+"""What the learners of a policy with a memory share: trials, tasks by turns, statistics of first and last episodes."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.learner import Learner
+from bidex_algos.meta.memory_agent import MemoryAgent
+from bidex_algos.meta.trials import MemoryConfig, Player, Trials, play
+from bidex_algos.nets.recurrent import RecurrentPolicy
+from bidex_algos.rollout import EpisodeStatistics
+from bidex_meta.train.distributed import all_sum, own_seed, rank, world_size
+from bidex_meta.train.learner import AutoresetMode, State
+from bidex_meta.world.contract import PooledWorld
+
+
+class TrialLearner(Learner):
+    """Base: an iteration plays one trial, a few episodes of one task with one memory, in every environment."""
+
+    world: PooledWorld
+    policy: RecurrentPolicy
+    per_process = ("generator", "episodes")
+    adapts = independent_adaptation = True
+    going_on = ("trials_played", *Learner.going_on)
+
+    def __init__(self, world: PooledWorld, config: MemoryConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.agent = MemoryAgent(self.policy, own_seed(seed))
+        self.trials_played = 0
+        self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
+        """Most steps of an episode of each environment (N,)."""
+        self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
+        # Classes with fewer rows than tasks: their pools and numbers of rows. Each trial takes as many tasks as that.
+        rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
+        each = zip(world.task_names, world.pools, rows, strict=True)
+        self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}
+
+    @classmethod
+    def autoreset_mode(cls, config: Any) -> AutoresetMode:
+        """Episodes of a trial begin together."""
+        return "DISABLED"
+
+    def _play(self, trials: Trials, player: Player) -> None:
+        """Plays the next trial in all environments into ``trials``."""
+        counts = [[self.episodes] for _ in range(trials.episodes)]
+        counts[0].append(self.firsts)
+        counts[-1].append(self.lasts)
+        with self._collecting():
+            obs = self._begin()
+            play(self.world, self.policy, player, trials, obs, self.config.blind_share, self.generator, counts)
+
+    def _begin(self) -> Tensor:
+        if self.pools:
+            trial = self.trials_played * world_size() + rank()
+            # By turns: all tasks of a class come equally often.
+            turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}
+            self.world.set_tasks(turned)
+        return self._first_observations() if self.trials_played == 0 else self.world.reset()[0]
+
+    def _count(self, trials: Trials) -> None:
+        self.env_steps += int(all_sum(trials.lengths.sum()))
+        self.trials_played += 1
+
+    def _episodes_metrics(self) -> dict[str, float]:
+        metrics = self.episodes.metrics()
+        for which, statistics in (("first", self.firsts), ("last", self.lasts)):
+            found = statistics.metrics()
+            if found:
+                metrics[f"Train/return_{which}_episode"] = found["Train/mean_return"]
+                metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
+        return metrics
+
+    @classmethod
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MemoryAgent:
+        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        return MemoryAgent(super().load_policy(state, device))
