@@ -79,7 +79,7 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     other = Worlds.open(config.to_json())
     own, theirs = source.task_classes(), other.task_classes()
     if other.class_name is None:
-        same = slots_of(source) == slots_of(other) and not other.hides_goals
+        same = slots_of(source) == slots_of(other) and not (source.hides_goals or other.hides_goals)
         agree = same and all(_alike(own[task], theirs[task]) for task in own)
         known = set(own) if agree else set[str]()
     else:
@@ -88,7 +88,8 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     if not known or source.points != other.points or (source.points and other.class_name is not None):
         raise BidexError(
             f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected "
-            "a run on the same suite, or on one of its classes with the same rules, bases and objects."
+            "a run on the same suite (one that shows goals), or on one of its classes with the same rules, bases and "
+            "objects."
         )
     return known
 

@@ -24,15 +24,15 @@ class Tutor:
     width: int
 
 
-class Goals(Protocol):
-    """What a world knows of its goals, though observations do not show them; a ``World`` is one."""
+class HidingWorld(Protocol):
+    """A world that knows goals which its observations do not show."""
 
     @property
-    def goal_columns(self) -> Tensor:
+    def hidden_columns(self) -> Tensor:
         """The entries of an observation, int64 (k,)."""
         ...
 
-    def goals(self) -> Tensor:
+    def hidden_entries(self) -> Tensor:
         """What they would be now, (N, k)."""
         ...
 
@@ -50,7 +50,7 @@ class Teachers:
         tutors: Sequence[Tutor] = (),
         scripted: Scripted | None = None,
         scripted_rows: Tensor | None = None,
-        hidden: Goals | None = None,
+        hidden: HidingWorld | None = None,
     ) -> None:
         self.hidden = hidden
         self._tutors, self._scripted = tutors, scripted
@@ -70,7 +70,7 @@ class Teachers:
         """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
         labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
         if self.hidden is not None and self._tutors:
-            obs = obs.index_copy(1, self.hidden.goal_columns, self.hidden.goals())
+            obs = obs.index_copy(1, self.hidden.hidden_columns, self.hidden.hidden_entries())
         for tutor in self._tutors:
             actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
             labels[tutor.rows, : actions.shape[1]] = actions

@@ -269,17 +269,17 @@ class World(BatchedWorld):
         return [slot.tasks.copy() for slot in self.slots]
 
     @property
-    def goal_columns(self) -> Tensor:
-        """Entries of observations that show some class's goal, and that a meta suite hides: ascending, int64 (k,)."""
-        each = {i for slot in self.slots for i in slot.task_class.layout.goal_indices()}
+    def hidden_columns(self) -> Tensor:
+        """Entries of observations that the suite hides, those of goals: ascending, int64 (k,); else none."""
+        each = {i for slot in self.slots for i in slot.task_class.layout.goal_indices()} if self.hides_goals else set()
         return torch.tensor(sorted(each), dtype=torch.int64, device=self.device)
 
-    def goals(self) -> Tensor:
-        """What these entries are now, though a suite may hide them: (N, k), zeros where a class has no such entry."""
-        values, columns = torch.empty(self.num_envs, self.observation_size, device=self.device), self.goal_columns
+    def hidden_entries(self) -> Tensor:
+        """What these entries would be now: (N, k), zeros where a class has no such entry."""
+        values = torch.empty(self.num_envs, self.observation_size, device=self.device)
         for part in self.parts:
             values[part.group.rows] = part.goals(part.group.take(self.task_index), self.observation_size)
-        return values[:, columns]
+        return values[:, self.hidden_columns]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees what pictures were drawn with."""

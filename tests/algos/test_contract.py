@@ -82,6 +82,7 @@ CASES = {
     "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
     "dagger": Case("dagger", DATA),
+    "icl": Case("icl", {"hidden": (8,), "memory": 8, "head": (8,), "updates_per_iteration": 2, "trials": 32}),
 }  # fmt: skip
 SHARING = {
     f"{algo} {name}": Case(algo, more | shared | {"hidden": (16, 8)})
@@ -158,7 +159,7 @@ def test_a_loss_that_is_no_number_ends_the_training_by_its_name(case: Case) -> N
         learner.iterate()
     with torch.no_grad():
         for weight in (
-            learner.policy if case.algo in ("maml", "promp", "bc", "dagger") else learner.critic
+            learner.policy if case.algo in ("maml", "promp", "bc", "dagger", "icl") else learner.critic
         ).parameters():
             weight.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match=rf"{case.algo}: the loss is not finite after \d+ steps; lower "):

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from bidex_algos import learner as base
 from bidex_algos.imitation.dagger import DAgger, DAggerConfig
+from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.multiagent.happo import HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPOConfig
@@ -56,6 +57,10 @@ PLAIN_SAC = replace(
 )
 RECURRENT = RL2Config(hidden=(8,), memory=8, episodes_per_trial=2, chunk=5, num_minibatches=2, epochs=2)
 TAUGHT = DAggerConfig(hidden=(8,), batch_size=32, updates_per_iteration=3, teacher_steps=800, autocast="off")
+CONTEXT = ICLConfig(
+    hidden=(8,), memory=8, head=(8,), episodes_per_trial=2, updates_per_iteration=3, batch_trials=4, trials=12,
+    teacher_steps=100,
+)  # fmt: skip
 UPDATES = (ONE_BATCH, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
 Learner = MTPPO | MTTRPO
 ROWS = 16
@@ -181,6 +186,14 @@ def dagger() -> DAgger:
     return learner
 
 
+def icl() -> ICL:
+    classes = (PointClass("Short", steps=4, count=3), PointClass("Long", steps=7, count=8))
+    world = PointGoals(6, classes=classes)
+    learner = ICL(world, CONTEXT, seed=0)
+    learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(6), 4)]))
+    return learner
+
+
 def mtsac_moves() -> torch.Tensor:
     learner, moved = mtsac(PLAIN_SAC), []
     for _ in range(2):
@@ -200,8 +213,10 @@ def rl2_tells() -> torch.Tensor:
 
 TWINS: dict[str, Callable[[], torch.Tensor]] = {"mtsac": mtsac_moves, "rl2": rl2_tells}
 OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2, "dagger": dagger}
+OTHERS["icl"] = icl
 REPLAYING = 2 * 3 * SAC.steps_per_iteration * 8
 STEPS = {"mtppo": 4 * ITERATION, "mtsac": REPLAYING, "brc": REPLAYING, "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7)}
+STEPS["icl"] = STEPS["rl2"]
 STEPS["dagger"] = 2 * 3 * TAUGHT.rollout_steps * 8
 
 
@@ -271,7 +286,7 @@ def test_an_update_of_twins_is_that_of_one(found, name):
         assert_close(twin, alone, rtol=1e-3, atol=tolerance)
 
 
-KINDS = [("mtppo", MTPPO), ("mtsac", MTSAC), ("brc", BRC), ("rl2", RL2), ("dagger", DAgger)]
+KINDS = [("mtppo", MTPPO), ("mtsac", MTSAC), ("brc", BRC), ("rl2", RL2), ("dagger", DAgger), ("icl", ICL)]
 
 
 @pytest.mark.parametrize(("name", "make"), KINDS)

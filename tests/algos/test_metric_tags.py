@@ -23,7 +23,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
     **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "ddpg", "rl2", "bc", "bcq", "td3bc", "iql")},
-    "dagger": [{}],
+    "dagger": [{}], "icl": [{"trials": 32, "memory": 8}],
 }  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
 TEAM = {"agents": "a=action/0;b=action/1"}

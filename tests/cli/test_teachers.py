@@ -59,12 +59,29 @@ def test_a_suite_learns_from_a_run_of_one_class_and_leaves_others_out(
     assert RunFolder.open(tmp_path / "r").config().teacher == (str(student), "scripts")
 
 
+def test_a_memory_learns_from_scripts_and_a_run_what_a_suite_hides(
+    student: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hides = (
+        SUITE.replace('"one-hot"', '"masked"').replace('"multi-task"', '"meta"').replace('" }', '", split = "train" }')
+    )
+    hides = hides.replace('"CatchAbreast"', '"PushBlock"')
+    (tmp_path / "hides.toml").write_text(hides.replace("[{", '[{ name = "HandOver", split = "test" }, {'))
+    words = ["--teacher", str(student), "--teacher", "scripts", *SMALL.replace("dagger", "icl").split()[:-6]]
+    words += ["--learner.episodes-per-trial", "1", "--learner.updates-per-iteration", "2", "--learner.hidden", "8"]
+    path = tmp_path / "r"
+    assert main(["run", "--suite", str(tmp_path / "hides.toml"), *words, "--steps", "9", "--run-dir", str(path)]) == 0
+    assert f"Teacher {student}: Switch." in capsys.readouterr().err
+    (row,) = read_metrics(path / "metrics.jsonl")
+    assert row["Loss/goal"] > 0.0 and {"Loss/imitation/Switch", "Loss/imitation/PushBlock"} < set(row)
+
+
 def test_teachers_that_do_not_fit_are_refused(student: Path, refused: Command) -> None:
     def told(*words: object) -> str:
         return refused("run", "--device", "cpu", *words)
 
     assert "Add --teacher scripts" in told("--suite", "MT4-v2", "--algo", "dagger")
-    assert "goes with dagger" in told("--suite", "MT4-v2", "--algo", "mtppo", "--teacher", "scripts")
+    assert "goes with dagger, icl" in told("--suite", "MT4-v2", "--algo", "mtppo", "--teacher", "scripts")
     assert "No class of MT1 has" in told("--suite", "MT1", "--algo", "dagger", "--teacher", "scripts")
     assert "that ML20-v2 hides" in told("--suite", "ML20-v2", "--algo", "dagger", "--teacher", "scripts")
     for words in (("--suite", "MT4-v2"), ("--task", "Switch")):

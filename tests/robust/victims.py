@@ -50,15 +50,16 @@ FLAGS = {
     **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),
     "bcq": f"{_STORED} --learner.vae-hidden 8 --learner.candidates 2",
     "dagger": f"{_STORED} --learner.rollout-steps 4 --learner.teacher-steps 200",
+    "icl": f"{_ADAPTS} --learner.memory 8 --learner.head 8 --learner.updates-per-iteration 2 --learner.trials 32",
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
 _LOADED += tuple(f"bidex_meta.cli.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
 _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references"))
 """What each process would load by itself, for longer than it runs."""
-ADAPTS = ("promp", "maml", "rl2")
+ADAPTS = ("promp", "maml", "rl2", "icl")
 OFFLINE = ("bc", "bcq", "td3bc", "iql")
-TAUGHT = ("dagger",)
+TAUGHT = ("dagger", "icl")
 ROWS = 8
 
 
@@ -76,7 +77,8 @@ def arguments(
     # One that adapts plays two phases of four steps.
     adapts = algo in ADAPTS
     steps = iterations * ROWS * processes * (8 if adapts else 4)
-    words = ["run", "--suite", "ML4" if adapts else "MT4", "--algo", algo, "--num-envs", str(ROWS), "--seed", "5"]
+    suite = "ML4" if adapts and algo not in TAUGHT else "MT4"  # a run on MT4 teaches
+    words = ["run", "--suite", suite, "--algo", algo, "--num-envs", str(ROWS), "--seed", "5"]
     words += ["--steps", str(steps), "--threads", "1", "--device", "cpu", "--logger", "none", *FLAGS[algo].split()]
     words += ["--teacher", str(given)] if algo in TAUGHT else []
     return [*words, "--episodes", "1", "--evaluate-every", "4", *(["--record", str(steps)] if record else [])]

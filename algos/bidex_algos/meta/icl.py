@@ -1,12 +1,13 @@
-"""In-context learning: a policy with a memory, taught by teachers that know what it has to find out.
+"""In-context learning: a memory that infers the goal, and an actor that is taught as if it were shown it.
 
 An iteration plays one trial, a few episodes of one task with one memory, in every environment. Teachers, to which the
-goal is shown, say what they would do in each of its states (DAgger); the student learns that from what it has seen and
-earned so far. Where it cannot know the goal yet, the mean over what is possible is best for its loss. A second loss
-asks its memory for the goal.
+goal is shown, say what they would do in each of its states (DAgger); the actor learns that for the true goal. The
+memory learns to tell the goal from what was seen and earned so far: mean and deviation. The policy acts on the mean,
+and where it explores, on a goal drawn from its belief for the episode (posterior sampling).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,9 +19,9 @@ from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import MemoryConfig, Trials
 from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Layers
+from bidex_algos.nets.networks import Layers
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.recurrent import BeliefNet, RecurrentPolicy
+from bidex_algos.nets.recurrent import BeliefNet, BeliefPolicy, Memory
 from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
@@ -38,7 +39,7 @@ class ICLConfig(MemoryConfig):
     """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
 
     head: Layers = (512, 512)  # Widths of the actor's hidden layers, behind the memory.
-    init_std: Positive = 0.05  # Standard deviation of the actions in episodes that a meta-test adapts to.
+    init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
@@ -48,10 +49,9 @@ class ICLConfig(MemoryConfig):
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
-    goal_weight: NonNegative = 0.3  # Factor of the loss that asks the memory for what the suite hides.
+    goal_weight: NonNegative = 1.0  # Factor of the memory's losses, which ask for what the suite hides.
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0."""
-    noise_std: NonNegative = 0.0  # Standard deviation of noise on the actions that are played.
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
@@ -76,42 +76,38 @@ class ICL(TrialLearner):
     taught = True
     per_process = ("generator", "episodes", "data")
     config: ICLConfig
+    policy: BeliefPolicy
     data: TaughtTrials | None = None
 
     def __init__(self, world: PooledWorld, config: ICLConfig, seed: int):
         super().__init__(world, config, seed)
+        self.goal_stats = RunningStats((world.num_tasks, self.policy.draws)).to(self.device)
+        self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
 
     @classmethod
-    def _make_policy(
-        cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> RecurrentPolicy:
+    def _make_policy(cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device) -> BeliefPolicy:
+        seen, goals = cls._inputs(config, shape), max(1, shape.hidden)  # a 0 where nothing is hidden
+
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                inputs, config.hidden, config.memory, config.head, shape.actions, init, config.activation,
+                inputs, seen, config.hidden, config.memory, config.head, goals, shape.actions, init, config.activation,
                 config.trial_steps
             )  # fmt: skip
 
-        return RecurrentPolicy(
-            cls._inputs(config, shape), shape.actions, config.memory, config.init_std, config.reward_unit,
+        return BeliefPolicy(
+            seen, shape.actions, config.memory, goals, config.init_std, config.reward_unit,
             config.normalise_observations, actor
         ).to(device)  # fmt: skip
 
     def learn_from_teachers(self, teachers: Teachers) -> None:
         """Takes who labels; before the first iteration and before a checkpoint is loaded."""
         self.teachers, cfg = teachers, self.config
-        goals = 0 if teachers.hidden is None else len(teachers.hidden.goal_columns)
         rows = teachers.known.nonzero().squeeze(1)
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows, self.first = rows, self.count.cumsum(0) - self.count
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
-        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), goals)
-        self.goal_stats = RunningStats((self.world.num_tasks, goals)).to(self.device)
-        self.belief = MLP(cfg.memory, (cfg.memory,), goals, 0.01, self.initial, cfg.activation).to(self.device)
-        self.adam = torch.optim.Adam(self._weights(), lr=cfg.learning_rate, fused=True)
-
-    def _weights(self) -> list[nn.Parameter]:
-        return [*self.policy.actor.parameters(), *self.belief.parameters()]
+        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), self.policy.draws)
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
@@ -124,6 +120,7 @@ class ICL(TrialLearner):
         valid = t.valid & filled
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
+        self.policy.goals.update(data.goals[filled])
         losses = self._learn(data)
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": player.share(), **losses}
@@ -157,42 +154,48 @@ class ICL(TrialLearner):
             row = torch.randint(2**40, shape, generator=self.generator, device=device) % self.count[:, None]
             rows = self.rows[self.first[:, None] + row]
             losses.append(self._descend(data.take(trial.flatten(), rows.flatten())))
-        imitation, goal = torch.stack(losses).mean(0)
+        imitation, goal, doubt = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
-        return {"Loss/imitation": imitation.mean(), "Loss/goal": goal.mean(), **found}
+        return {"Loss/imitation": imitation.mean(), "Loss/goal": goal.mean(), "Loss/doubt": doubt.mean(), **found}
 
     def _descend(self, lesson: Lesson) -> Tensor:
-        """A step down the mean of the classes' losses; imitation and goal of each class (2, K), of all processes."""
-        errors = self._errors(lesson) / world_size()
+        """A step down the mean of the classes' losses (3, K), which are those of all processes."""
+        losses = self._losses(lesson) / world_size()
+        weights = list(self.policy.actor.parameters())
         self.adam.zero_grad()
-        (errors[0].mean() + self.config.goal_weight * errors[1].mean()).backward()
-        errors = sum_gradients(self._weights(), errors.detach())
-        nn.utils.clip_grad_norm_(self._weights(), self.config.max_grad_norm)
+        (losses[0].mean() + self.config.goal_weight * losses[1:].mean(1).sum()).backward()
+        losses = sum_gradients(weights, losses.detach())
+        nn.utils.clip_grad_norm_(weights, self.config.max_grad_norm)
         self.adam.step()
-        return errors
+        return losses
 
-    def _errors(self, lesson: Lesson) -> Tensor:
-        """Mean squared errors of actions and of goals in units of their class's deviation, (2, K)."""
-        batch = len(lesson.lengths)
-        actor: BeliefNet = self.policy.actor  # type: ignore[assignment]
+    def _losses(self, lesson: Lesson) -> Tensor:
+        """Of each class: squared errors of actions and of believed goals, minus log-density of the goals, (3, K).
+
+        Errors are in units of the class's deviation: 1 is no better than a constant. The density is by the believed
+        deviation, and teaches that alone.
+        """
+        policy, batch = self.policy, len(lesson.lengths)
         tasks = self.tasks.repeat_interleave(batch // len(self.tasks))
-        x = self.policy.see(lesson.obs, *lesson.previous)
-        _, remembered, _ = actor.remember(x, x.new_zeros(batch, self.config.memory))
+        x = policy.see(lesson.obs, *lesson.previous)
+        _, remembered, _ = policy.actor.remember(x, x.new_zeros(batch, self.config.memory))
         drawn = torch.rand(self.config.batch_steps, batch, generator=self.generator, device=self.device)
         at = (drawn * lesson.lengths).long(), torch.arange(batch, device=self.device)
-        known = remembered[at]
-        means = actor.head(torch.cat([x[at], known], dim=-1))
-        acted = (means - lesson.labels[at]) / self.label_stats.std(_ACTION_FLOOR).float()[tasks]
-        unit, middle = self.goal_stats.std(_GOAL_FLOOR).float()[tasks], self.goal_stats.mean.float()[tasks]
-        believed = self.belief(known) - (lesson.goals[at] - middle) / unit
-        off = [each.square().sum(-1).mean(0) / max(1, each.shape[-1]) for each in (acted, believed)]
-        return torch.stack([each.view(len(self.tasks), -1).mean(1) for each in off])
+        goals = policy.goals(lesson.goals[at])
+        actions = policy.actor.act(x[at][..., : self.shape.observations], goals)
+        acted = (actions - lesson.labels[at]) / self.label_stats.std(_ACTION_FLOOR).float()[tasks]
+        mean, std = policy.actor.believe(remembered[at])
+        missed = mean - goals
+        unit = self.goal_stats.std(_GOAL_FLOOR).float()[tasks] * policy.goals.scale
+        doubt = 0.5 * (missed.detach() / std).square() + std.log()
+        each = [x.mean(dim=(0, 2)) for x in (acted.square(), (missed / unit).square(), doubt)]
+        return torch.stack([x.view(len(self.tasks), -1).mean(1) for x in each])
 
     def _parts(self) -> Parts:
-        taught = {"belief": self.belief, "adam": self.adam, "goal_stats": self.goal_stats} if self.data else {}
+        statistics = {"label_stats": self.label_stats, "goal_stats": self.goal_stats}
         counts = [self.episodes, self.firsts, self.lasts]
-        return {"label_stats": self.label_stats, "generator": self.generator, "episodes": counts, **taught}
+        return {"adam": self.adam, "generator": self.generator, "episodes": counts, **statistics}
 
     def state_dict(self) -> State:
         """As in the base; the data set makes its own copy, since two of it at once may not fit."""
@@ -206,32 +209,37 @@ class ICL(TrialLearner):
 
 
 class _Pupil:
-    """Plays trials: in some episodes the teachers do, elsewhere the policy's mean; all is labelled."""
+    """Plays trials: in some episodes the teachers do, elsewhere the policy; all is labelled.
+
+    Episodes whose rewards the policy is shown explore, others are as those of an evaluation.
+    """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
         self._learner, self._data, self._shares = learner, data, list[Tensor]()
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
 
-    def begin(self) -> None:
-        """Draws who plays the episodes."""
+    def begin(self, shown: Tensor) -> None:
+        """Draws who plays the episodes, and what those that explore try."""
         learner = self._learner
-        drawn = torch.rand(len(self._rows), generator=learner.generator, device=learner.device)
-        self._teacher_plays = (drawn < learner.teachers_share()) & learner.teachers.known
+        self._shown = shown[:, None]
+        self._teacher_plays = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
+        self._tried = self._draw(torch.randn, learner.policy.draws) * self._shown
         self._shares.append(self._teacher_plays.double().mean())
         learner.teachers.reset(torch.ones_like(self._teacher_plays))
 
-    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
-        """Of the teachers or the policy, and notes what the teachers would do, and the goals."""
-        learner, data, rows = self._learner, self._data, self._rows
+    def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
+        return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
+
+    def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the teachers or the policy; notes what the teachers would do, and the goals."""
+        learner, data = self._learner, self._data
         labels = learner.teachers.eval_action(obs)
-        data.labels[slot, rows] = labels
+        data.labels[slot, self._rows] = labels
         if learner.teachers.hidden is not None:
-            data.goals[slot, rows] = learner.teachers.hidden.goals()
-        actions = torch.where(self._teacher_plays[:, None], labels, mean)
-        if learner.config.noise_std:
-            noise = torch.randn(mean.shape, generator=learner.generator, device=mean.device)
-            actions = actions + learner.config.noise_std * noise
-        return actions
+            data.goals[slot, self._rows] = learner.teachers.hidden.hidden_entries()
+        mean, state = learner.policy.step(obs, memory, self._tried)
+        action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._shown
+        return torch.where(self._teacher_plays[:, None], labels, action), state
 
     def share(self) -> Tensor:
         """Of the episodes: those that the teachers played."""

@@ -88,7 +88,7 @@ class RL2(TrialLearner):
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
 
     def _iterate(self) -> dict[str, float]:
-        self._play(self.trials, Sampling(self.policy.log_std.detach().exp(), self.generator))
+        self._play(self.trials, Sampling(self.policy, self.generator))
         filled = self.trials.filled()
         valid = self.trials.valid & filled
         seen = self.trials.obs[filled], self.trials.rewards[valid]

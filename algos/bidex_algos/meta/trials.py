@@ -105,13 +105,13 @@ class Trials:
 
 
 class Player(Protocol):
-    """Who acts in a trial, knowing what the policy would do."""
+    """Who acts in a trial."""
 
-    def begin(self) -> None:
-        """All environments are at the start of an episode."""
+    def begin(self, shown: Tensor) -> None:
+        """All environments are at the start of an episode, in which the policy is ``shown`` (N,) rewards."""
 
-    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
-        """Actions (N, a), not clamped, for raw observations (N, d) and the policy's means (N, a).
+    def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (N, a), not clamped, for raw observations (N, d), and the memory's next state (N, memory).
 
         ``slot`` (N,) is where the step is recorded; of rows that wait, the next step overwrites it.
         """
@@ -119,17 +119,19 @@ class Player(Protocol):
 
 
 class Sampling:
-    """Actions from the Gaussian around the policy's means."""
+    """Plays by the policy's Gaussian."""
 
-    def __init__(self, std: Tensor, generator: torch.Generator):
-        self._std, self._generator = std, generator
+    def __init__(self, policy: RecurrentPolicy, generator: torch.Generator):
+        self._policy, self._generator = policy, generator
 
-    def begin(self) -> None:
+    def begin(self, shown: Tensor) -> None:
         """Nothing."""
 
-    def act(self, obs: Tensor, mean: Tensor, slot: Tensor) -> Tensor:
-        """Actions (N, a); not clamped: the world does that, and the density must be that of what was drawn."""
-        return mean + self._std * torch.randn(mean.shape, generator=self._generator, device=mean.device)
+    def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
+        """Not clamped: the world does that, and the density must be that of what was drawn."""
+        mean, state = self._policy.step(obs, memory)
+        noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
+        return mean + self._policy.log_std.exp() * noise, state
 
 
 @torch.no_grad()
@@ -148,14 +150,13 @@ def play(
     for episode in range(trials.episodes):
         if episode > 0:
             obs, _ = world.reset()
-        player.begin()
         shown = torch.rand(world.num_envs, generator=generator, device=device) >= blind_share
+        player.begin(shown)
         playing = torch.ones(world.num_envs, dtype=torch.bool, device=device)
         success, whole = ~playing, playing.clone()
         elapsed, earned = torch.zeros_like(rows), torch.zeros(world.num_envs, device=device)
         for _ in range(trials.longest):
-            mean, state = policy.step(obs, memory)
-            action = player.act(obs, mean, trials.lengths)
+            action, state = player.act(obs, memory, trials.lengths)
             next_obs, reward, terminated, truncated, info = world.step(action)
             valid = ~info["unstable"]
             reward = reward.masked_fill(~(valid & playing), 0.0)

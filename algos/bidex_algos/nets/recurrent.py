@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -64,19 +65,27 @@ class RecurrentNet(Remembering):
 
 
 class BeliefNet(Remembering):
-    """A network of its own for the output, of the whole input and the memory: what to do, given what is known."""
+    """What is believed of the goal, from the memory, and an actor that acts on it as if it were shown the goal.
+
+    Goals are normalised. ``inputs`` are the memory's, ``seen`` the actor's without the goal.
+    """
 
     def __init__(
-        self, inputs: Inputs, hidden: Sequence[int], memory: int, head: Sequence[int], outputs: int,
-        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
+        self, inputs: Inputs, seen: Inputs, hidden: Sequence[int], memory: int, head: Sequence[int], goals: int,
+        actions: int, generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
     ):  # fmt: skip
         super().__init__(inputs, hidden, memory, generator, activation, lasting)
-        self.head = MLP(inputs.extended("memory", memory), head, outputs, 0.01, generator, activation)
+        self.belief = MLP(memory, (memory,), 2 * goals, 0.01, generator, activation)
+        self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
 
-    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As of :class:`RecurrentNet`."""
-        _, remembered, last = self.remember(x, state)
-        return self.head(torch.cat([x, remembered], dim=-1)), last
+    def believe(self, remembered: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the goal, (..., goals) each, for memories (..., memory)."""
+        mean, log_std = self.belief(remembered).chunk(2, dim=-1)
+        return mean, log_std.clamp(-5.0, 1.0).exp()
+
+    def act(self, seen: Tensor, goal: Tensor) -> Tensor:
+        """Mean actions (..., actions) for normalised observations and goals."""
+        return self.head(torch.cat([seen, goal], dim=-1))
 
 
 @dataclass
@@ -107,6 +116,8 @@ class RecurrentPolicy(nn.Module):
     ``make_actor`` the result.
     """
 
+    draws = 0
+
     def __init__(
         self, inputs: Inputs, actions: int, memory: int, init_std: float, reward_unit: float,
         normalise_observations: bool, make_actor: Callable[[Inputs], nn.Module]
@@ -129,8 +140,11 @@ class RecurrentPolicy(nn.Module):
         return torch.cat([self.observations(obs), action.clamp(-1.0, 1.0), last], dim=-1)
 
     @torch.no_grad()
-    def step(self, obs: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
-        """Mean actions (N, a), not clamped, and the GRU's next state (N, memory), for raw observations (N, d)."""
+    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean actions (N, a), not clamped, and the GRU's next state (N, memory), for raw observations (N, d).
+
+        ``drawn``: ``draws`` standard normals (N, draws) that decide what an exploring episode tries; None: nothing.
+        """
         x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
         mean, state = self.actor(x[None], memory.state)
         return mean[0], state
@@ -150,3 +164,27 @@ class RecurrentPolicy(nn.Module):
 
     def _compressed(self, reward: Tensor) -> Tensor:
         return torch.asinh(reward / self.reward_unit)[..., None]
+
+
+class BeliefPolicy(RecurrentPolicy):
+    """A policy that acts on what it believes of the goal; an exploring episode on one drawn from its belief.
+
+    ``actor`` is a :class:`BeliefNet`.
+    """
+
+    actor: BeliefNet
+
+    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, *rest: Any):
+        """``goals``: entries of a goal; the others as of :class:`RecurrentPolicy`."""
+        super().__init__(inputs, actions, memory, *rest)
+        self.draws, self.goals = goals, ObservationNormaliser(goals)
+
+    @torch.no_grad()
+    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As in the base."""
+        x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
+        _, remembered, state = self.actor.remember(x[None], memory.state)
+        goal, std = self.actor.believe(remembered[0])
+        if drawn is not None:
+            goal = goal + std * drawn
+        return self.actor.act(x[:, : obs.shape[1]], goal), state

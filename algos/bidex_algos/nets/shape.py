@@ -15,12 +15,15 @@ class Shape:
     observations: int
     actions: int
     groups: tuple[ObservationGroup, ...]
+    hidden: int = 0
+    """Entries of the observation that are zero, though the world knows them: the goals of a meta suite."""
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
         """That of a world."""
         observations, actions = world.single_observation_space, world.single_action_space
-        return cls(int(observations.shape[0]), int(actions.shape[0]), tuple(world.observation_groups))
+        hidden = len(getattr(world, "hidden_columns", ()))
+        return cls(int(observations.shape[0]), int(actions.shape[0]), tuple(world.observation_groups), hidden)
 
     @classmethod
     def plain(cls, observations: int, actions: int, num_id_columns: int = 0) -> "Shape":
@@ -38,7 +41,8 @@ class Shape:
 
     def state_dict(self) -> State:
         """Plain values for a checkpoint."""
-        return self.sizes() | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
+        hidden = {"hidden": self.hidden} if self.hidden else {}
+        return self.sizes() | hidden | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
 
     @classmethod
     def load(cls, state: State) -> "Shape":
@@ -46,7 +50,8 @@ class Shape:
         if "groups" not in state:
             return cls.plain(**state)
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
-        return cls(state["observations"], state["actions"], tuple(ObservationGroup(*group) for group in groups))
+        named = tuple(ObservationGroup(*group) for group in groups)
+        return cls(state["observations"], state["actions"], named, state.get("hidden", 0))
 
 
 _OF_SEVERAL = ("task_embedding", "normalise_per_task")

@@ -1,0 +1,107 @@
+"""In-context learning: what one episode tells, what the memory is asked, who labels, what is kept."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_algos.meta.icl import ICL, ICLConfig
+from bidex_algos.meta.taught_trials import TaughtTrials
+from bidex_algos.meta.trials import Trials
+from bidex_meta.errors import BidexError
+from bidex_meta.witness.teachers import Teachers, Tutor
+from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
+
+SMALL = ICLConfig(
+    hidden=(32,), memory=32, head=(32,), init_std=0.3, episodes_per_trial=2, updates_per_iteration=40, batch_trials=32,
+    batch_steps=10, trials=320, learning_rate=3e-3, teacher_steps=10_000,
+)  # fmt: skip
+TEN = (PointClass(steps=10, count=16),)
+
+
+class Knowing:
+    """Goes to the goals of a world that hides them; reads nothing but what ``Teachers`` show."""
+
+    def __init__(self, world: PointGoals):
+        self.world, self.hidden_columns = world, world.hidden_columns
+
+    def hidden_entries(self) -> Tensor:
+        return self.world.goal.float()
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        return self.world.best(obs)
+
+    def reset(self, env_mask: Tensor) -> None:
+        pass
+
+
+def taught(world: PointGoals, config: ICLConfig = SMALL, rows: Tensor | None = None) -> ICL:
+    learner, knowing = ICL(world, config, seed=0), Knowing(world)
+    rows = torch.arange(world.num_envs) if rows is None else rows
+    learner.learn_from_teachers(Teachers(world, [Tutor(knowing, rows, 4)], hidden=knowing))
+    return learner
+
+
+def evaluated(agent: Any, world: PointGoals) -> float:
+    agent.reset(everyone(world))
+    return played(agent.eval_action, world)
+
+
+def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal() -> None:
+    learner = taught(PointGoals(160, classes=TEN))
+    metrics = [learner.iterate() for _ in range(30)]
+    assert metrics[-1]["Train/return_last_episode"] > metrics[-1]["Train/return_first_episode"] + 1.5
+    assert metrics[-1]["Loss/goal"] < 0.5  # over both episodes; 1 is no better than a guess
+
+    # Goals between those of the training.
+    test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
+    test.set_tasks({"PointGoals": circle(16, first=0.2)})
+    agent = ICL.load_policy(learner.policy_state_dict())
+    best, before = played(shown.best, shown), evaluated(agent, test)
+    assert before == pytest.approx(-10.0, abs=1.0)
+    shot(agent, test)
+    assert (evaluated(agent, test) - before) / (best - before) > 0.6
+
+
+def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
+    classes = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2))
+    world = PointGoals(8, classes=classes)
+    learner = taught(world, rows=torch.arange(4, 8))
+    told = learner.iterate()
+    assert "Loss/imitation/Long" in told and "Loss/imitation/Short" not in told
+    assert told["Policy/teacher_share"] == pytest.approx(0.5) and learner.env_steps == 2 * 4 * (3 + 7)
+    # Labels and goals are those of the recorded states.
+    data = learner.data
+    assert data is not None
+    t, filled = data.trials, data.trials.filled()
+    assert torch.equal(data.goals[filled], world.goal.float().expand(len(filled), -1, -1)[filled])
+    shown = torch.cat([t.obs[..., :2], data.goals], dim=-1)
+    long = filled & (torch.arange(8) >= 4)
+    assert torch.equal(data.labels[long], world.best(shown[long]))
+
+
+def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
+    trials = Trials(2, torch.tensor([2, 3]), 1, 1, None)
+    data = TaughtTrials(trials, 2, 1)
+    for number in range(3):
+        for name in ("obs", "actions", "rewards"):
+            vars(trials)[name].fill_(float(number))
+            trials.shown[:] = trials.valid[:] = True
+        trials.lengths = torch.tensor([4, 6])
+        data.labels.fill_(10.0 * number)
+        data.keep()
+    lesson = data.take(torch.tensor([0, 1]), torch.tensor([1, 0]))  # places of the third trial and of the second
+    assert lesson.lengths.tolist() == [6, 4] and lesson.obs.shape == (6, 2, 1)
+    assert lesson.obs[:, :, 0].unique(dim=0).tolist() == [[2.0, 1.0]]
+    assert lesson.labels[0].flatten().tolist() == [20.0, 10.0]
+    action, reward, known, _ = lesson.previous
+    assert action[:, 0].flatten().tolist() == [0.0, *[2.0] * 5] and reward[1:, 1].tolist() == [1.0] * 5
+    assert known[:, 0].tolist() == [False, *[True] * 5]
+    with pytest.raises(BidexError, match="trials of"):
+        TaughtTrials(Trials(2, torch.tensor([2, 3, 3]), 1, 1, None), 2, 1).load_state_dict(data.state_dict())
+
+
+def test_it_learns_from_nobody_until_it_has_teachers() -> None:
+    with pytest.raises(BidexError, match="nobody to learn from"):
+        ICL(PointGoals(8), SMALL, seed=0).iterate()
