@@ -115,7 +115,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
     --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
     teacher: Several = ()
-    """With --algo dagger: who labels what the student comes to. scripts: the scripts of all classes that have one; or
+    """With --algo dagger and icl: who labels what the student comes to. scripts: the scripts of all classes that have one; or
     the folder of a run on the same suite, or on one of its classes alone. Given several times: each class takes the
     first that knows it."""
     record: Steps = 0
