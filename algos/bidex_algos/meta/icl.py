@@ -26,7 +26,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, NonNegative, Positive, Whole
+from bidex_meta.utils.validation import Count, Positive, Whole
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld
 
@@ -48,8 +48,7 @@ class ICLConfig(MemoryConfig):
     batch_steps: Count = 128  # Steps of each of them whose labels count; the memory passes all.
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
-    goal_weight: NonNegative = 1.0  # Factor of the memory's losses, which ask for what the suite hides.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
@@ -162,11 +161,17 @@ class ICL(TrialLearner):
     def _descend(self, lesson: Lesson) -> Tensor:
         """A step down the mean of the classes' losses (3, K), which are those of all processes."""
         losses = self._losses(lesson) / world_size()
-        weights = list(self.policy.actor.parameters())
+        actor = self.policy.actor
+        weights = list(actor.parameters())
         self.adam.zero_grad()
-        (losses[0].mean() + self.config.goal_weight * losses[1:].mean(1).sum()).backward()
+        losses.mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach())
-        nn.utils.clip_grad_norm_(weights, self.config.max_grad_norm)
+        for part in (
+            actor.head,
+            actor.doubt,
+            nn.ModuleList([actor.encoder, actor.gru, actor.belief]),
+        ):  # of one loss each
+            nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
         return losses
 

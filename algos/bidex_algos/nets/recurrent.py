@@ -75,13 +75,13 @@ class BeliefNet(Remembering):
         actions: int, generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
     ):  # fmt: skip
         super().__init__(inputs, hidden, memory, generator, activation, lasting)
-        self.belief = MLP(memory, (memory,), 2 * goals, 0.01, generator, activation)
+        self.belief, self.doubt = (MLP(memory, (memory,), goals, 0.01, generator, activation) for _ in range(2))
         self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
 
     def believe(self, remembered: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the goal, (..., goals) each, for memories (..., memory)."""
-        mean, log_std = self.belief(remembered).chunk(2, dim=-1)
-        return mean, log_std.clamp(-5.0, 1.0).exp()
+        # The deviation learns from what the memory is good for, and does not shape it.
+        return self.belief(remembered), self.doubt(remembered.detach()).clamp(-5.0, 1.0).exp()
 
     def act(self, seen: Tensor, goal: Tensor) -> Tensor:
         """Mean actions (..., actions) for normalised observations and goals."""
