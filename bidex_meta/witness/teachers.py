@@ -36,6 +36,10 @@ class HidingWorld(Protocol):
         """What they would be now, (N, k)."""
         ...
 
+    def hidden_values(self) -> Tensor:
+        """What each environment's task hides, in [-1, 1]: (N, n)."""
+        ...
+
 
 class Teachers:
     """Labels actions of a world's environments; an agent, asked in every step and reset where episodes begin.

@@ -281,6 +281,23 @@ class World(BatchedWorld):
             values[part.group.rows] = part.goals(part.group.take(self.task_index), self.observation_size)
         return values[:, self.hidden_columns]
 
+    @property
+    def hidden_size(self) -> int:
+        """Numbers that tasks of a class hide at most (``TaskClass.hides``); 0 where the suite shows its goals."""
+        sizes = (sum(len(part.names) for part in slot.task_class.hides()) for slot in self.slots)
+        return max(sizes) * self.hides_goals
+
+    def hidden_values(self) -> Tensor:
+        """What the task of each environment hides, scaled from its range to [-1, 1]: (N, hidden_size), zeros behind."""
+        values = torch.zeros(self.num_envs, self.hidden_size, device=self.device)
+        for slot, rows in zip(self.slots, self.slot_rows, strict=True):
+            space = slot.task_class.variation_space
+            columns = [space.names.index(name) for part in slot.task_class.hides() for name in part.names]
+            low, high = (np.asarray(end)[columns] for end in (space.low, space.high))
+            scaled = torch.as_tensor((2.0 * slot.tasks[:, columns] - low - high) / (high - low))
+            values[rows, : len(columns)] = scaled.float().to(self.device)[self.task_index[rows]]
+        return values
+
     def close_extras(self, **kwargs: Any) -> None:
         """Frees what pictures were drawn with."""
         self._painter.close()

@@ -14,8 +14,8 @@ from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 
 SMALL = ICLConfig(
-    hidden=(32,), memory=32, head=(32,), init_std=0.3, episodes_per_trial=2, updates_per_iteration=40, batch_trials=32,
-    batch_steps=10, trials=320, learning_rate=3e-3, teacher_steps=10_000,
+    hidden=(32,), memory=32, heads=4, head=(32,), init_std=0.3, episodes_per_trial=2, updates_per_iteration=40,
+    batch_trials=32, batch_steps=10, trials=320, learning_rate=3e-3, teacher_steps=10_000,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 
@@ -28,6 +28,8 @@ class Knowing:
 
     def hidden_entries(self) -> Tensor:
         return self.world.goal.float()
+
+    hidden_values = hidden_entries
 
     def eval_action(self, obs: Tensor) -> Tensor:
         return self.world.best(obs)
@@ -75,8 +77,8 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     data = learner.data
     assert data is not None
     t, filled = data.trials, data.trials.filled()
-    assert torch.equal(data.goals[filled], world.goal.float().expand(len(filled), -1, -1)[filled])
-    shown = torch.cat([t.obs[..., :2], data.goals], dim=-1)
+    assert torch.equal(data.goals, world.goal.float()) and data.taught.tolist() == [False] * 4 + [True] * 4
+    shown = torch.cat([t.obs[..., :2], data.goals.expand(len(filled), -1, -1)], dim=-1)
     long = filled & (torch.arange(8) >= 4)
     assert torch.equal(data.labels[long], world.best(shown[long]))
 

@@ -2,7 +2,7 @@
 
 An iteration plays one trial, a few episodes of one task with one memory, in every environment. Teachers, to which the
 goal is shown, say what they would do in each of its states (DAgger); the actor learns that for the true goal. The
-memory learns to tell the goal from what was seen and earned so far: mean and deviation. The policy acts on the mean,
+memory learns to tell the goal, mean and deviation, from what was seen and earned so far. The policy acts on the mean,
 and where it explores, on a goal drawn from its belief for the episode (posterior sampling).
 """
 
@@ -18,15 +18,16 @@ from bidex_algos.meta.taught_trials import Lesson, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import MemoryConfig, Trials
 from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.evidence import BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Layers
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.recurrent import BeliefNet, BeliefPolicy, Memory
+from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, Positive, Whole
+from bidex_meta.utils.validation import Count, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld
 
@@ -38,7 +39,10 @@ _ACTION_FLOOR, _GOAL_FLOOR = 0.03, 0.01
 class ICLConfig(MemoryConfig):
     """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
 
-    head: Layers = (512, 512)  # Widths of the actor's hidden layers, behind the memory.
+    hidden: Widths = (128, 128)  # Widths of the layers that a step passes before the memory.
+    memory: Count = 128  # Numbers that the memory holds, beside a weight for each head.
+    heads: Count = 8  # Weighted means that the memory is made of; divides ``memory``.
+    head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
     reward_unit: Positive = 0.3
@@ -50,7 +54,7 @@ class ICLConfig(MemoryConfig):
     learning_rate: Positive = 1e-3  # Adam's step size.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
     teacher_steps: Whole = 300_000
-    """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0."""
+    """Environment steps over which the share of trials that the teacher plays falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
@@ -90,12 +94,12 @@ class ICL(TrialLearner):
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                inputs, seen, config.hidden, config.memory, config.head, goals, shape.actions, init, config.activation,
-                config.trial_steps
+                inputs, seen, config.hidden, config.heads, config.memory // config.heads, config.head, goals,
+                shape.actions, init, config.activation
             )  # fmt: skip
 
         return BeliefPolicy(
-            seen, shape.actions, config.memory, goals, config.init_std, config.reward_unit,
+            seen, shape.actions, config.heads + config.memory, goals, config.init_std, config.reward_unit,
             config.normalise_observations, actor
         ).to(device)  # fmt: skip
 
@@ -112,17 +116,17 @@ class ICL(TrialLearner):
         data = self.data
         if data is None:
             raise BidexError(f"{self.name}: has nobody to learn from. Call learn_from_teachers first.")
-        player = _Pupil(self, data)
-        self._play(data.trials, player)
+        self._play(data.trials, _Pupil(self, data))
         data.keep()
+        share = all_sum(data.taught.double().mean()) / world_size()
         t, filled = data.trials, data.trials.filled()
         valid = t.valid & filled
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
-        self.policy.goals.update(data.goals[filled])
+        self.policy.goals.update(data.goals)
         losses = self._learn(data)
         self._count(t)
-        tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": player.share(), **losses}
+        tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
         return self._episodes_metrics() | as_numbers(tensors)
 
     def teachers_share(self) -> float:
@@ -134,7 +138,8 @@ class ICL(TrialLearner):
     def _take_moments(self, data: TaughtTrials) -> None:
         """Takes labels and goals of the trials into the statistics of their classes."""
         filled = data.trials.filled()
-        for stats, values in ((self.label_stats, data.labels), (self.goal_stats, data.goals)):
+        goals = data.goals.expand(len(filled), -1, -1)
+        for stats, values in ((self.label_stats, data.labels), (self.goal_stats, goals)):
             mean, var, count = torch.zeros(3, *stats.mean.shape, dtype=torch.float64, device=self.device)
             for task in self.tasks.tolist():
                 mine = self.rows[self.world.task_id[self.rows] == task]
@@ -169,7 +174,7 @@ class ICL(TrialLearner):
         for part in (
             actor.head,
             actor.doubt,
-            nn.ModuleList([actor.encoder, actor.gru, actor.belief]),
+            nn.ModuleList([actor.encoder, actor.weigh, actor.note, actor.belief]),
         ):  # of one loss each
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
@@ -183,19 +188,20 @@ class ICL(TrialLearner):
         """
         policy, batch = self.policy, len(lesson.lengths)
         tasks = self.tasks.repeat_interleave(batch // len(self.tasks))
-        x = policy.see(lesson.obs, *lesson.previous)
-        _, remembered, _ = policy.actor.remember(x, x.new_zeros(batch, self.config.memory))
+        x, goals = policy.see(lesson.obs, *lesson.previous), policy.goals(lesson.goals)
+        memory = policy.actor.evidence(x).cumsum(0)
         drawn = torch.rand(self.config.batch_steps, batch, generator=self.generator, device=self.device)
         at = (drawn * lesson.lengths).long(), torch.arange(batch, device=self.device)
-        goals = policy.goals(lesson.goals[at])
-        actions = policy.actor.act(x[at][..., : self.shape.observations], goals)
+        actions = policy.actor.act(x[at][..., : self.shape.observations], goals.expand(len(drawn), -1, -1))
         acted = (actions - lesson.labels[at]) / self.label_stats.std(_ACTION_FLOOR).float()[tasks]
-        mean, std = policy.actor.believe(remembered[at])
+        mean, std = policy.actor.believe(memory[at])
         missed = mean - goals
         unit = self.goal_stats.std(_GOAL_FLOOR).float()[tasks] * policy.goals.scale
         doubt = 0.5 * (missed.detach() / std).square() + std.log()
-        each = [x.mean(dim=(0, 2)) for x in (acted.square(), (missed / unit).square(), doubt)]
-        return torch.stack([x.view(len(self.tasks), -1).mean(1) for x in each])
+        untaught = (~lesson.taught).float().view(len(self.tasks), -1)
+        honest = untaught / untaught.sum(1, keepdim=True).clamp_min(1.0)
+        each = [e.mean(dim=(0, 2)).view(len(self.tasks), -1) for e in (acted.square(), (missed / unit).square(), doubt)]
+        return torch.stack([each[0].mean(1), (honest * each[1]).sum(1), (honest * each[2]).sum(1)])
 
     def _parts(self) -> Parts:
         statistics = {"label_stats": self.label_stats, "goal_stats": self.goal_stats}
@@ -214,38 +220,33 @@ class ICL(TrialLearner):
 
 
 class _Pupil:
-    """Plays trials: in some episodes the teachers do, elsewhere the policy; all is labelled.
+    """Plays a trial: in some environments the teachers do, elsewhere the policy; all is labelled.
 
     Episodes whose rewards the policy is shown explore, others are as those of an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
-        self._learner, self._data, self._shares = learner, data, list[Tensor]()
+        self._learner, self._data = learner, data
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
+        data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Draws who plays the episodes, and what those that explore try."""
+        """Draws what the episodes that explore try."""
         learner = self._learner
         self._shown = shown[:, None]
-        self._teacher_plays = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
         self._tried = self._draw(torch.randn, learner.policy.draws) * self._shown
-        self._shares.append(self._teacher_plays.double().mean())
-        learner.teachers.reset(torch.ones_like(self._teacher_plays))
+        learner.teachers.reset(torch.ones_like(shown))
+        if learner.teachers.hidden is not None:
+            self._data.goals[:] = learner.teachers.hidden.hidden_values()
 
     def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the teachers or the policy; notes what the teachers would do, and the goals."""
+        """Of the teachers or the policy; keeps what the teachers would do."""
         learner, data = self._learner, self._data
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels
-        if learner.teachers.hidden is not None:
-            data.goals[slot, self._rows] = learner.teachers.hidden.hidden_entries()
         mean, state = learner.policy.step(obs, memory, self._tried)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._shown
-        return torch.where(self._teacher_plays[:, None], labels, action), state
-
-    def share(self) -> Tensor:
-        """Of the episodes: those that the teachers played."""
-        return all_sum(torch.stack(self._shares).mean()) / world_size()
+        return torch.where(data.taught[:, None], labels, action), state

@@ -1,4 +1,4 @@
-"""The data set of a student with a memory: trials, what teachers would have done in them, and what the suite hides.
+"""The data set of a student with a memory: trials, what teachers would have done in them, and what the tasks hide.
 
 A ring of trials of all environments on the device, in half precision: 1,024 of ML1-v2, with three episodes of 225
 steps, take 0.9 GB.
@@ -24,7 +24,9 @@ class Lesson(NamedTuple):
     labels: Tensor
     """What the teachers would have done (S, B, a)."""
     goals: Tensor
-    """What the suite hides (S, B, k)."""
+    """What the tasks hide (B, k)."""
+    taught: Tensor
+    """Whether a teacher played (B,): what it does tells the goal, which rewards alone shall tell."""
     lengths: Tensor
     """Slots that hold a step (B,)."""
 
@@ -32,7 +34,8 @@ class Lesson(NamedTuple):
 class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
-    ``labels`` (S, N, a) and ``goals`` (S, N, k) are filled while ``trials`` is played; ``keep`` then takes all of it.
+    ``labels`` (S, N, a), ``goals`` (N, k) and ``taught`` (N,) are filled while ``trials`` is played; then ``keep``
+    takes all.
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int):
@@ -40,7 +43,8 @@ class TaughtTrials:
         slots, rows, actions = trials.actions.shape
         device = trials.obs.device
         self.labels = torch.zeros(slots, rows, actions, device=device)
-        self.goals = torch.zeros(slots, rows, goals, device=device)
+        self.goals = torch.zeros(rows, goals, device=device)
+        self.taught = torch.zeros(rows, dtype=torch.bool, device=device)
 
         def empty(*shape: int, dtype: torch.dtype = torch.float16) -> Tensor:
             # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
@@ -49,7 +53,9 @@ class TaughtTrials:
         self._ring = {
             "obs": empty(trials.obs.shape[2]), "action": empty(actions), "reward": empty(dtype=torch.float32),
             "known": empty(dtype=torch.bool), "done": empty(dtype=torch.bool), "labels": empty(actions),
-            "goals": empty(goals), "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
+            "goals": torch.empty(kept, rows, goals, device=device),
+            "taught": torch.empty(kept, rows, dtype=torch.bool, device=device),
+            "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
         }  # fmt: skip
 
     @property
@@ -62,7 +68,7 @@ class TaughtTrials:
         t = self.trials
         names = ("action", "reward", "known", "done")
         new = dict(zip(names, t.previous(len(t.obs)), strict=True))
-        new |= {"obs": t.obs, "labels": self.labels, "goals": self.goals, "lengths": t.lengths}
+        new |= {"obs": t.obs, "labels": self.labels, "goals": self.goals, "taught": self.taught, "lengths": t.lengths}
         for name, value in new.items():
             self._ring[name][self.added % self.kept] = value
         self.added += 1
@@ -77,7 +83,8 @@ class TaughtTrials:
             return found if found.dtype == torch.bool else found.float()
 
         previous = (of("action"), of("reward"), of("known"), of("done"))
-        return Lesson(of("obs"), previous, of("labels"), of("goals"), lengths)
+        goals, taught = (self._ring[name][trial, row] for name in ("goals", "taught"))
+        return Lesson(of("obs"), previous, of("labels"), goals, taught, lengths)
 
     def state_dict(self) -> State:
         """A copy of all that is kept."""

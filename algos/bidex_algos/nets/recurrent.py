@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,16 +12,16 @@ from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation
 from bidex_algos.nets.normalise import ObservationNormaliser
 
 
-class Remembering(nn.Module):
-    """An encoder and a GRU on its features.
+class RecurrentNet(nn.Module):
+    """An encoder, a GRU on its features, and a linear output of both, so that a reflex need not pass the memory.
 
     All in float32: a memory would carry the rounding of bfloat16 on. At the start its numbers fade over 2 to
     ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
     """
 
     def __init__(
-        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, generator: torch.Generator,
-        activation: Activation = "elu", lasting: int = 1
+        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, outputs: int, output_gain: float,
+        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
     ):  # fmt: skip
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
@@ -37,60 +36,18 @@ class Remembering(nn.Module):
                 nn.init.orthogonal_(gate, generator=generator)
         # The gates are reset, update, new. An update gate of 1/2 halves the memory, and its gradient, at each step.
         self.gru.get_parameter("bias_ih_l0").data.chunk(3)[1].copy_(torch.linspace(0.0, math.log(lasting), memory))
-
-    def remember(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features (T, B, hidden) of steps (T, B, inputs), the memory after each (T, B, memory), the last (B, memory).
-
-        ``state`` (B, memory) is the memory before them.
-        """
-        features = self.encoder(x)
-        remembered, last = self.gru(features, state[None].contiguous())
-        return features, remembered, last[0]
-
-
-class RecurrentNet(Remembering):
-    """A linear output of features and memory, so that a reflex need not pass the memory."""
-
-    def __init__(
-        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, outputs: int, output_gain: float,
-        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
-    ):  # fmt: skip
-        super().__init__(inputs, hidden, memory, generator, activation, lasting)
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after, from that before them."""
-        features, remembered, last = self.remember(x, state)
-        return self.head(torch.cat([features, remembered], dim=-1)), last
-
-
-class BeliefNet(Remembering):
-    """What is believed of the goal, from the memory, and an actor that acts on it as if it were shown the goal.
-
-    Goals are normalised. ``inputs`` are the memory's, ``seen`` the actor's without the goal.
-    """
-
-    def __init__(
-        self, inputs: Inputs, seen: Inputs, hidden: Sequence[int], memory: int, head: Sequence[int], goals: int,
-        actions: int, generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
-    ):  # fmt: skip
-        super().__init__(inputs, hidden, memory, generator, activation, lasting)
-        self.belief, self.doubt = (MLP(memory, (memory,), goals, 0.01, generator, activation) for _ in range(2))
-        self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
-
-    def believe(self, remembered: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of the goal, (..., goals) each, for memories (..., memory)."""
-        # The deviation learns from what the memory is good for, and does not shape it.
-        return self.belief(remembered), self.doubt(remembered.detach()).clamp(-5.0, 1.0).exp()
-
-    def act(self, seen: Tensor, goal: Tensor) -> Tensor:
-        """Mean actions (..., actions) for normalised observations and goals."""
-        return self.head(torch.cat([seen, goal], dim=-1))
+        features = self.encoder(x)
+        remembered, last = self.gru(features, state[None].contiguous())
+        return self.head(torch.cat([features, remembered], dim=-1)), last[0]
 
 
 @dataclass
 class Memory:
-    """What each environment brings along from the step before; zeros at first. ``state`` (N, memory) is the GRU's.
+    """What each environment brings along from the step before; zeros at first. ``state`` (N, memory) is the network's.
 
     Of the action (N, a) what exceeds [-1, 1] was not done; ``known`` (N,): whether the policy is shown the reward (N,);
     ``done`` (N,): whether the step ended an episode.
@@ -141,7 +98,7 @@ class RecurrentPolicy(nn.Module):
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Mean actions (N, a), not clamped, and the GRU's next state (N, memory), for raw observations (N, d).
+        """Mean actions (N, a), not clamped, and the memory's next state (N, memory), for raw observations (N, d).
 
         ``drawn``: ``draws`` standard normals (N, draws) that decide what an exploring episode tries; None: nothing.
         """
@@ -164,27 +121,3 @@ class RecurrentPolicy(nn.Module):
 
     def _compressed(self, reward: Tensor) -> Tensor:
         return torch.asinh(reward / self.reward_unit)[..., None]
-
-
-class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on what it believes of the goal; an exploring episode on one drawn from its belief.
-
-    ``actor`` is a :class:`BeliefNet`.
-    """
-
-    actor: BeliefNet
-
-    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, *rest: Any):
-        """``goals``: entries of a goal; the others as of :class:`RecurrentPolicy`."""
-        super().__init__(inputs, actions, memory, *rest)
-        self.draws, self.goals = goals, ObservationNormaliser(goals)
-
-    @torch.no_grad()
-    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As in the base."""
-        x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
-        _, remembered, state = self.actor.remember(x[None], memory.state)
-        goal, std = self.actor.believe(remembered[0])
-        if drawn is not None:
-            goal = goal + std * drawn
-        return self.actor.act(x[:, : obs.shape[1]], goal), state

@@ -16,13 +16,13 @@ class Shape:
     actions: int
     groups: tuple[ObservationGroup, ...]
     hidden: int = 0
-    """Entries of the observation that are zero, though the world knows them: the goals of a meta suite."""
+    """Numbers of a task that the world knows and does not show: those of goals in a meta suite."""
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
         """That of a world."""
         observations, actions = world.single_observation_space, world.single_action_space
-        hidden = len(getattr(world, "hidden_columns", ()))
+        hidden = int(getattr(world, "hidden_size", 0))
         return cls(int(observations.shape[0]), int(actions.shape[0]), tuple(world.observation_groups), hidden)
 
     @classmethod

@@ -1,0 +1,86 @@
+"""A memory that adds up evidence, what it lets believe of a goal, and a policy that acts on that.
+
+What a trial hides does not change in it, so the order of its steps does not matter: as log-likelihoods add up, so do a
+step's notes. The memory holds weighted means of them, one for each head, as linear attention does (Katharopoulos et al.
+2020, arXiv 2006.16236); all steps of a trial pass at once.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.inputs import Columns, Inputs
+from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, linear
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
+
+_NO_EVIDENCE = ("right_hand", "left_hand", "padding", "task_id")
+"""Groups of an observation that are not noted: with the hands a memory learns fifty tasks by heart, not the rewards."""
+
+
+class BeliefNet(nn.Module):
+    """Notes of steps, belief of the normalised goal from their sum, and an actor that is given a goal.
+
+    ``inputs`` are what :meth:`RecurrentPolicy.see` gives, ``seen`` its observation.
+    """
+
+    def __init__(
+        self, inputs: Inputs, seen: Inputs, hidden: Sequence[int], heads: int, size: int, head: Sequence[int],
+        goals: int, actions: int, generator: torch.Generator, activation: Activation = "elu"
+    ):  # fmt: skip
+        super().__init__()
+        self.known = inputs.width - 2  # behind the reward
+        noted = [part for group in seen.groups if group.name not in _NO_EVIDENCE for part in group.where]
+        self.noted = Columns([*noted, slice(self.known - 1, self.known)])
+        self.heads, self.size = heads, size
+        features = MLP(self.noted.size, hidden[:-1], hidden[-1], 1.0, generator, activation)
+        self.encoder = nn.Sequential(features, ACTIVATIONS[activation]())
+        self.weigh, self.note = (linear(hidden[-1], n, 1.0, generator) for n in (heads, heads * size))
+        memory, middle = heads * (size + 1), hidden[-1]
+        self.belief, self.doubt = (MLP(memory, (middle,), goals, 0.01, generator, activation) for _ in range(2))
+        self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
+
+    def evidence(self, x: Tensor) -> Tensor:
+        """What steps (..., inputs) add to the memory, (..., heads * (1 + size)); nothing where no reward is known."""
+        features = self.encoder(self.noted(x))
+        weight = self.weigh(features).clamp(-8.0, 8.0).exp() * x[..., self.known, None]
+        notes = weight[..., None] * self.note(features).unflatten(-1, (self.heads, self.size))
+        return torch.cat([weight, notes.flatten(-2)], dim=-1)
+
+    def believe(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the goal, (..., goals) each, for memories (..., heads * (1 + size))."""
+        weight, notes = memory[..., : self.heads] + 1e-6, memory[..., self.heads :]
+        means = notes.unflatten(-1, (self.heads, self.size)) / weight[..., None]
+        known = torch.cat([weight.log() / 3.0, means.flatten(-2)], dim=-1)
+        # The deviation learns from what the memory is good for, and does not shape it.
+        return self.belief(known), self.doubt(known.detach()).clamp(-5.0, 1.0).exp()
+
+    def act(self, seen: Tensor, goal: Tensor) -> Tensor:
+        """Mean actions (..., actions) for normalised observations and goals."""
+        return self.head(torch.cat([seen, goal], dim=-1))
+
+
+class BeliefPolicy(RecurrentPolicy):
+    """A policy that acts on what it believes of the goal; an exploring episode on one drawn from its belief.
+
+    ``actor`` is a :class:`BeliefNet`.
+    """
+
+    actor: BeliefNet
+
+    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, *rest: Any):
+        """``goals``: numbers of a goal; the others as of :class:`RecurrentPolicy`."""
+        super().__init__(inputs, actions, memory, *rest)
+        self.draws, self.goals = goals, ObservationNormaliser(goals)
+
+    @torch.no_grad()
+    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As in the base."""
+        x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
+        state = memory.state + self.actor.evidence(x)
+        goal, std = self.actor.believe(state)
+        if drawn is not None:
+            goal = goal + std * drawn
+        return self.actor.act(x[:, : obs.shape[1]], goal), state
