@@ -74,7 +74,8 @@ class Teachers:
         """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
         labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
         if self.hidden is not None and self._tutors:
-            obs = obs.index_copy(1, self.hidden.hidden_columns, self.hidden.hidden_entries())
+            # Added, since an entry that is a goal's in one class may be an object's in another.
+            obs = obs.index_add(1, self.hidden.hidden_columns, self.hidden.hidden_entries())
         for tutor in self._tutors:
             actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
             labels[tutor.rows, : actions.shape[1]] = actions

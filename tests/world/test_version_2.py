@@ -48,3 +48,19 @@ def test_recorded_rewards_are_computed_again_by_the_right_formula(of: dict[str, 
     found = verify(dataset)
     assert found.count == 0 and list(found.recomputed.values()) == [found.steps], found
     assert (dataset.metadata["rules"]["reward"] == "v2") == v2 and (dataset.metadata["references"] == {}) == v2
+
+
+def test_a_world_knows_what_its_observations_hide() -> None:
+    classes = [slot(registry.get(name)) for name in ("PushBlock-v2", "BottleCap-v2")]
+    shows, hides = (
+        World(classes, 4, observation=rule, autoreset_mode="DISABLED", threads=1) for rule in ("plain", "masked")
+    )
+    action = torch.rand(4, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    for world in (shows, hides):
+        world.reset(seed=0)
+    (seen, *_), (masked, *_) = shows.step(action), hides.step(action)
+    columns = hides.hidden_columns
+    assert not torch.equal(seen, masked) and len(shows.hidden_columns) == shows.hidden_size == 0
+    torch.testing.assert_close(masked.index_add(1, columns, hides.hidden_entries()), seen, rtol=0, atol=1e-6)
+    values = hides.hidden_values()
+    assert values.shape == (4, 4) and values.abs().max() <= 1.0 and not values[2:, 1:].any() and values[:, 0].all()
