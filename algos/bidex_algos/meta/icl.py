@@ -45,6 +45,7 @@ class ICLConfig(MemoryConfig):
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
@@ -84,7 +85,7 @@ class ICL(TrialLearner):
 
     def __init__(self, world: PooledWorld, config: ICLConfig, seed: int):
         super().__init__(world, config, seed)
-        self.goal_stats = RunningStats((world.num_tasks, self.policy.draws)).to(self.device)
+        self.goal_stats = RunningStats((world.num_tasks, max(1, self.shape.hidden))).to(self.device)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
 
@@ -99,8 +100,8 @@ class ICL(TrialLearner):
             )  # fmt: skip
 
         return BeliefPolicy(
-            seen, shape.actions, config.heads + config.memory, goals, config.init_std, config.reward_unit,
-            config.normalise_observations, actor
+            seen, shape.actions, config.heads + config.memory, goals, config.try_steps, config.init_std,
+            config.reward_unit, config.normalise_observations, actor
         ).to(device)  # fmt: skip
 
     def learn_from_teachers(self, teachers: Teachers) -> None:
@@ -110,7 +111,7 @@ class ICL(TrialLearner):
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows, self.first = rows, self.count.cumsum(0) - self.count
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
-        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), self.policy.draws)
+        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), self.goal_stats.mean.shape[1])
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
@@ -228,13 +229,13 @@ class _Pupil:
     def __init__(self, learner: ICL, data: TaughtTrials):
         self._learner, self._data = learner, data
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
+        self._tried: Tensor | None = None
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Draws what the episodes that explore try."""
+        """Which episodes explore; the teachers begin anew."""
         learner = self._learner
         self._shown = shown[:, None]
-        self._tried = self._draw(torch.randn, learner.policy.draws) * self._shown
         learner.teachers.reset(torch.ones_like(shown))
         if learner.teachers.hidden is not None:
             self._data.goals[:] = learner.teachers.hidden.hidden_values()
@@ -247,6 +248,7 @@ class _Pupil:
         learner, data = self._learner, self._data
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels
-        mean, state = learner.policy.step(obs, memory, self._tried)
+        self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
+        mean, state = learner.policy.step(obs, memory, self._tried * self._shown)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._shown
         return torch.where(data.taught[:, None], labels, action), state

@@ -36,15 +36,13 @@ class MemoryAgent:
         """An episode begins where ``env_mask`` (N,): the memory learns of it, and forgets what was only evaluated."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
-        if self.policy.draws:
-            new = torch.randn(len(env_mask), self.policy.draws, generator=self.noise, device=self.device)
-            self._drawn = new if self._drawn is None else torch.where(env_mask[:, None], new, self._drawn)
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
         self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Sampled actions (N, a) in [-1, 1] for raw observations (N, d), and the Gaussian they are from."""
         self._learned = self._memory(self._learned, len(obs))
+        self._drawn = self.policy.drawn(self._drawn, len(obs), self.noise)
         mean, self._next_state = self.policy.step(obs, self._learned, self._drawn)
         std = self.policy.log_std.detach().exp().expand_as(mean)
         noise = torch.randn(mean.shape, generator=self.noise, device=mean.device)

@@ -63,17 +63,24 @@ class BeliefNet(nn.Module):
 
 
 class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on what it believes of the goal; an exploring episode on one drawn from its belief.
+    """A policy that acts on what it believes of the goal; where it explores, on one drawn from its belief.
 
-    ``actor`` is a :class:`BeliefNet`.
+    ``actor`` is a :class:`BeliefNet`; a goal is tried for ``try_steps`` steps in the mean.
     """
 
     actor: BeliefNet
 
-    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, *rest: Any):
+    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, try_steps: int, *rest: Any):
         """``goals``: numbers of a goal; the others as of :class:`RecurrentPolicy`."""
         super().__init__(inputs, actions, memory, *rest)
-        self.draws, self.goals = goals, ObservationNormaliser(goals)
+        self.goals, self.try_steps = ObservationNormaliser(goals), try_steps
+
+    def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
+        """Standard normals (rows, goals): deviations of the goal that is tried from the mean, in deviations."""
+        device = self.log_std.device
+        new = torch.randn(rows, self.goals.shift.numel(), generator=generator, device=device)
+        again = torch.rand(rows, 1, generator=generator, device=device) < 1.0 / self.try_steps
+        return new if last is None else torch.where(again, new, last)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:

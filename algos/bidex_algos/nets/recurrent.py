@@ -73,8 +73,6 @@ class RecurrentPolicy(nn.Module):
     ``make_actor`` the result.
     """
 
-    draws = 0
-
     def __init__(
         self, inputs: Inputs, actions: int, memory: int, init_std: float, reward_unit: float,
         normalise_observations: bool, make_actor: Callable[[Inputs], nn.Module]
@@ -100,11 +98,15 @@ class RecurrentPolicy(nn.Module):
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Mean actions (N, a), not clamped, and the memory's next state (N, memory), for raw observations (N, d).
 
-        ``drawn``: ``draws`` standard normals (N, draws) that decide what an exploring episode tries; None: nothing.
+        ``drawn``: what an exploring episode tries now, of :meth:`drawn`; None: nothing.
         """
         x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
         mean, state = self.actor(x[None], memory.state)
         return mean[0], state
+
+    def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor | None:
+        """What so many exploring environments try in the next step, from that in the last; None: nothing."""
+        return None
 
     def fresh_memory(self, rows: int) -> Memory:
         """The memory at the start of a trial of so many environments."""
