@@ -32,7 +32,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
     "td3bc": {"alpha": -1.0, "policy_delay": 0},
     "dagger": {"teacher_steps": -1, "noise_std": -0.1, "samples": 0, "updates_per_iteration": 0, "max_grad_norm": 0.0},
-    "icl": {"reward_unit": 0.0, "batch_trials": 0, "batch_steps": 0, "trials": 0, "head": (0,)},
+    "icl": {"reward_unit": 0.0, "batch_trials": 0, "batch_size": 0, "trials": 0, "head": (0,)},
 }  # fmt: skip
 TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("mtppo", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),

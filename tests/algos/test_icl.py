@@ -9,13 +9,14 @@ from torch import Tensor
 from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trials import Trials
+from bidex_algos.nets.inputs import Columns
 from bidex_meta.errors import BidexError
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 
 SMALL = ICLConfig(
     hidden=(32,), memory=64, head=(32,), init_std=0.3, try_steps=4, episodes_per_trial=2, updates_per_iteration=40,
-    batch_trials=32, batch_steps=10, trials=320, learning_rate=6e-3, teacher_steps=10_000,
+    batch_size=256, batch_trials=32, trials=320, learning_rate=6e-3, teacher_steps=10_000,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 
@@ -93,13 +94,12 @@ def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
         trials.lengths = torch.tensor([4, 6])
         data.labels.fill_(10.0 * number)
         data.keep()
-    lesson = data.take(torch.tensor([0, 1]), torch.tensor([1, 0]))  # places of the third trial and of the second
-    assert lesson.lengths.tolist() == [6, 4] and lesson.obs.shape == (6, 2, 1)
-    assert lesson.obs[:, :, 0].unique(dim=0).tolist() == [[2.0, 1.0]]
-    assert lesson.labels[0].flatten().tolist() == [20.0, 10.0]
-    action, reward, known, _ = lesson.previous
-    assert action[:, 0].flatten().tolist() == [0.0, *[2.0] * 5] and reward[1:, 1].tolist() == [1.0] * 5
-    assert known[:, 0].tolist() == [False, *[True] * 5]
+    trial, row = torch.tensor([0, 1]), torch.tensor([1, 0])  # places of the third trial and of the second
+    shown = data.evidence(trial, row, Columns([slice(0, 1)]))
+    assert shown.noted[:, :, 0].unique(dim=0).tolist() == [[2.0, 1.0]] and shown.counts.sum(0).tolist() == [6, 4]
+    assert shown.reward[1:4].unique(dim=0).tolist() == [[2.0, 1.0]] and shown.known[0].tolist() == [False, False]
+    obs, labels, _ = data.steps(trial, row, torch.tensor([0.99, 0.0]))
+    assert obs.flatten().tolist() == [2.0, 1.0] and labels.flatten().tolist() == [20.0, 10.0]
     with pytest.raises(BidexError, match="trials of"):
         TaughtTrials(Trials(2, torch.tensor([2, 3, 3]), 1, 1, None), 2, 1).load_state_dict(data.state_dict())
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
-from bidex_algos.meta.taught_trials import Lesson, TaughtTrials
+from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import MemoryConfig, Trials
 from bidex_algos.nets.architecture import network_bytes
@@ -49,8 +49,8 @@ class ICLConfig(MemoryConfig):
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
-    batch_trials: Count = 16  # Trials of an update, split evenly over the classes with a teacher.
-    batch_steps: Count = 128  # Steps of each of them whose labels count; the memory passes all.
+    batch_size: Count = 1024  # Labelled steps of an update, split evenly over the classes with a teacher.
+    batch_trials: Count = 32  # Trials of an update whose evidence the memory adds up, split likewise.
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
@@ -95,7 +95,7 @@ class ICL(TrialLearner):
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                inputs, seen, config.hidden, config.heads, config.memory // config.heads, config.head, goals,
+                seen, config.hidden, config.heads, config.memory // config.heads, config.head, goals,
                 shape.actions, init, config.activation
             )  # fmt: skip
 
@@ -150,59 +150,60 @@ class ICL(TrialLearner):
             stats.merge(*pool_moments(mean, var, count))
 
     def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
-        cfg, device = self.config, self.device
-        shape = len(self.tasks), math.ceil(cfg.batch_trials / len(self.tasks))
-        losses = list[Tensor]()
-        for _ in range(cfg.updates_per_iteration):
-            trial = torch.randint(data.filled, shape, generator=self.generator, device=device)
-            # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
-            row = torch.randint(2**40, shape, generator=self.generator, device=device) % self.count[:, None]
-            rows = self.rows[self.first[:, None] + row]
-            losses.append(self._descend(data.take(trial.flatten(), rows.flatten())))
+        losses = [self._descend(data) for _ in range(self.config.updates_per_iteration)]
         imitation, goal, doubt = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
         return {"Loss/imitation": imitation.mean(), "Loss/goal": goal.mean(), "Loss/doubt": doubt.mean(), **found}
 
-    def _descend(self, lesson: Lesson) -> Tensor:
+    def _descend(self, data: TaughtTrials) -> Tensor:
         """A step down the mean of the classes' losses (3, K), which are those of all processes."""
-        losses = self._losses(lesson) / world_size()
+        losses = torch.stack([self._imitation(data), *self._belief(data)]) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())
         self.adam.zero_grad()
         losses.mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach())
-        for part in (
-            actor.head,
-            actor.doubt,
-            nn.ModuleList([actor.encoder, actor.weigh, actor.note, actor.belief]),
-        ):  # of one loss each
+        memory = nn.ModuleList([actor.encoder, actor.weigh, actor.note, actor.belief])
+        for part in (actor.head, actor.doubt, memory):  # of one loss each
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
         return losses
 
-    def _losses(self, lesson: Lesson) -> Tensor:
-        """Of each class: squared errors of actions and of believed goals, minus log-density of the goals, (3, K).
+    def _drawn(self, data: TaughtTrials, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """So many trials, evenly over the classes: trial, environment and class of each, (B,)."""
+        shape = len(self.tasks), math.ceil(count / len(self.tasks))
+        trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
+        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        row = torch.randint(2**40, shape, generator=self.generator, device=self.device) % self.count[:, None]
+        rows = self.rows[self.first[:, None] + row]
+        return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
-        Errors are in units of the class's deviation: 1 is no better than a constant. The density is by the believed
-        deviation, and teaches that alone.
+    def _imitation(self, data: TaughtTrials) -> Tensor:
+        """Squared errors of actions in units of their deviation in the class (1: no better than a constant), (K,)."""
+        trial, row, task = self._drawn(data, self.config.batch_size)
+        share = torch.rand(len(row), generator=self.generator, device=self.device)
+        obs, labels, goals = data.steps(trial, row, share)
+        actions = self.policy.actor.act(self.policy.observations(obs), self.policy.goals(goals))
+        off = (actions - labels) / self.label_stats.std(_ACTION_FLOOR).float()[task]
+        return off.square().mean(1).view(len(self.tasks), -1).mean(1)
+
+    def _belief(self, data: TaughtTrials) -> tuple[Tensor, Tensor]:
+        """Squared errors of believed goals in such units, and minus the log-density by the believed deviation, (K,).
+
+        The latter teaches the deviation alone.
         """
-        policy, batch = self.policy, len(lesson.lengths)
-        tasks = self.tasks.repeat_interleave(batch // len(self.tasks))
-        x, goals = policy.see(lesson.obs, *lesson.previous), policy.goals(lesson.goals)
-        memory = policy.actor.evidence(x).cumsum(0)
-        drawn = torch.rand(self.config.batch_steps, batch, generator=self.generator, device=self.device)
-        at = (drawn * lesson.lengths).long(), torch.arange(batch, device=self.device)
-        actions = policy.actor.act(x[at][..., : self.shape.observations], goals.expand(len(drawn), -1, -1))
-        acted = (actions - lesson.labels[at]) / self.label_stats.std(_ACTION_FLOOR).float()[tasks]
-        mean, std = policy.actor.believe(memory[at])
-        missed = mean - goals
-        unit = self.goal_stats.std(_GOAL_FLOOR).float()[tasks] * policy.goals.scale
+        trial, row, task = self._drawn(data, self.config.batch_trials)
+        policy, shown = self.policy, data.evidence(trial, row, self.policy.actor.noted)
+        memory = policy.evidence(shown.noted, shown.reward, shown.known).cumsum(0)
+        mean, std = policy.actor.believe(memory)
+        missed = mean - policy.goals(shown.goals)
+        unit = self.goal_stats.std(_GOAL_FLOOR).float()[task] * policy.goals.scale
         doubt = 0.5 * (missed.detach() / std).square() + std.log()
-        untaught = (~lesson.taught).float().view(len(self.tasks), -1)
-        honest = untaught / untaught.sum(1, keepdim=True).clamp_min(1.0)
-        each = [e.mean(dim=(0, 2)).view(len(self.tasks), -1) for e in (acted.square(), (missed / unit).square(), doubt)]
-        return torch.stack([each[0].mean(1), (honest * each[1]).sum(1), (honest * each[2]).sum(1)])
+        count = shown.counts.float()
+        total = count.sum(0).view(len(self.tasks), -1).sum(1).clamp_min(1.0)
+        each = [(e.mean(2) * count).sum(0).view(len(self.tasks), -1).sum(1) for e in ((missed / unit).square(), doubt)]
+        return each[0] / total, each[1] / total
 
     def _parts(self) -> Parts:
         statistics = {"label_stats": self.label_stats, "goal_stats": self.goal_stats}

@@ -10,25 +10,24 @@ import torch
 from torch import Tensor
 
 from bidex_algos.meta.trials import Trials
+from bidex_algos.nets.inputs import Columns
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import State
 
 
-class Lesson(NamedTuple):
-    """Trials to learn from: S slots of B rows, float32."""
+class Evidence(NamedTuple):
+    """What the memory was shown in some trials: S slots of B rows."""
 
-    obs: Tensor
-    """Raw observations (S, B, d)."""
-    previous: tuple[Tensor, Tensor, Tensor, Tensor]
-    """What the memory was fed beside them; see ``Trials.previous``."""
-    labels: Tensor
-    """What the teachers would have done (S, B, a)."""
+    noted: Tensor
+    """Columns of raw observations (S, B, n)."""
+    reward: Tensor
+    """Rewards that led there (S, B)."""
+    known: Tensor
+    """Whether they were shown, bool (S, B)."""
     goals: Tensor
     """What the tasks hide (B, k)."""
-    taught: Tensor
-    """Whether a teacher played (B,): what it does tells the goal, which rewards alone shall tell."""
-    lengths: Tensor
-    """Slots that hold a step (B,)."""
+    counts: Tensor
+    """Steps of trials that no teacher played, bool (S, B): what a teacher does tells the goal, which rewards shall."""
 
 
 class TaughtTrials:
@@ -51,8 +50,8 @@ class TaughtTrials:
             return torch.empty(kept, slots, rows, *shape, dtype=dtype, device=device)
 
         self._ring = {
-            "obs": empty(trials.obs.shape[2]), "action": empty(actions), "reward": empty(dtype=torch.float32),
-            "known": empty(dtype=torch.bool), "done": empty(dtype=torch.bool), "labels": empty(actions),
+            "obs": empty(trials.obs.shape[2]), "labels": empty(actions), "reward": empty(dtype=torch.float32),
+            "known": empty(dtype=torch.bool),
             "goals": torch.empty(kept, rows, goals, device=device),
             "taught": torch.empty(kept, rows, dtype=torch.bool, device=device),
             "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
@@ -66,25 +65,29 @@ class TaughtTrials:
     def keep(self) -> None:
         """Takes the trials that were played."""
         t = self.trials
-        names = ("action", "reward", "known", "done")
-        new = dict(zip(names, t.previous(len(t.obs)), strict=True))
-        new |= {"obs": t.obs, "labels": self.labels, "goals": self.goals, "taught": self.taught, "lengths": t.lengths}
-        for name, value in new.items():
+        _, reward, known, _ = t.previous(len(t.obs))
+        new = {"obs": t.obs, "reward": reward, "known": known, "labels": self.labels, "goals": self.goals}
+        for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():
             self._ring[name][self.added % self.kept] = value
         self.added += 1
 
-    def take(self, trial: Tensor, row: Tensor) -> Lesson:
-        """The trials (B,), numbers below ``filled``, of environments (B,)."""
-        lengths = self._ring["lengths"][trial, row]
+    def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Raw observations (B, d), labels (B, a) and goals (B, k) of a step of each of some trials.
+
+        Of trials (B,), numbers below ``filled``, of environments (B,), at a share in [0, 1) of their lengths (B,).
+        """
+        slot = (share * self._ring["lengths"][trial, row]).long()
+        obs, labels = (self._ring[name][trial, slot, row].float() for name in ("obs", "labels"))
+        return obs, labels, self._ring["goals"][trial, row]
+
+    def evidence(self, trial: Tensor, row: Tensor, columns: Columns) -> Evidence:
+        """Of trials (B,) of environments (B,)."""
+        lengths, taught = (self._ring[name][trial, row] for name in ("lengths", "taught"))
         slots = int(lengths.max())
-
-        def of(name: str) -> Tensor:
-            found = self._ring[name][trial, :slots, row].transpose(0, 1)
-            return found if found.dtype == torch.bool else found.float()
-
-        previous = (of("action"), of("reward"), of("known"), of("done"))
-        goals, taught = (self._ring[name][trial, row] for name in ("goals", "taught"))
-        return Lesson(of("obs"), previous, of("labels"), goals, taught, lengths)
+        obs, reward, known = (self._ring[name][trial, :slots, row] for name in ("obs", "reward", "known"))
+        counts = (torch.arange(slots, device=lengths.device)[:, None] < lengths) & ~taught
+        noted = columns(obs).transpose(0, 1).float()
+        return Evidence(noted, reward.T, known.T, self._ring["goals"][trial, row], counts)
 
     def state_dict(self) -> State:
         """A copy of all that is kept."""

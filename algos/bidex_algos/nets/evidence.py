@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.inputs import Columns, Inputs
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, linear
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
@@ -21,31 +21,30 @@ _NO_EVIDENCE = ("right_hand", "left_hand", "padding", "task_id")
 
 
 class BeliefNet(nn.Module):
-    """Notes of steps, belief of the normalised goal from their sum, and an actor that is given a goal.
-
-    ``inputs`` are what :meth:`RecurrentPolicy.see` gives, ``seen`` its observation.
-    """
+    """Notes of steps, belief of the normalised goal from their sum, and an actor that is given a goal."""
 
     def __init__(
-        self, inputs: Inputs, seen: Inputs, hidden: Sequence[int], heads: int, size: int, head: Sequence[int],
+        self, seen: Inputs, hidden: Sequence[int], heads: int, size: int, head: Sequence[int],
         goals: int, actions: int, generator: torch.Generator, activation: Activation = "elu"
     ):  # fmt: skip
         super().__init__()
-        self.known = inputs.width - 2  # behind the reward
-        noted = [part for group in seen.groups if group.name not in _NO_EVIDENCE for part in group.where]
-        self.noted = Columns([*noted, slice(self.known - 1, self.known)])
+        self.noted = seen.columns(*(group.name for group in seen.groups if group.name not in _NO_EVIDENCE))
         self.heads, self.size = heads, size
-        features = MLP(self.noted.size, hidden[:-1], hidden[-1], 1.0, generator, activation)
+        features = MLP(self.noted.size + 1, hidden[:-1], hidden[-1], 1.0, generator, activation)
         self.encoder = nn.Sequential(features, ACTIVATIONS[activation]())
         self.weigh, self.note = (linear(hidden[-1], n, 1.0, generator) for n in (heads, heads * size))
         memory, middle = heads * (size + 1), hidden[-1]
         self.belief, self.doubt = (MLP(memory, (middle,), goals, 0.01, generator, activation) for _ in range(2))
         self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
 
-    def evidence(self, x: Tensor) -> Tensor:
-        """What steps (..., inputs) add to the memory, (..., heads * (1 + size)); nothing where no reward is known."""
-        features = self.encoder(self.noted(x))
-        weight = self.weigh(features).clamp(-8.0, 8.0).exp() * x[..., self.known, None]
+    def evidence(self, noted: Tensor, earned: Tensor, known: Tensor) -> Tensor:
+        """What steps add to the memory, (..., heads * (1 + size)); nothing where no reward is known.
+
+        Of normalised columns of the observation (..., n), the normalised reward that led there (...), and whether it is
+        known.
+        """
+        features = self.encoder(torch.cat([noted, earned[..., None]], dim=-1))
+        weight = self.weigh(features).clamp(-8.0, 8.0).exp() * known[..., None]
         notes = weight[..., None] * self.note(features).unflatten(-1, (self.heads, self.size))
         return torch.cat([weight, notes.flatten(-2)], dim=-1)
 
@@ -82,12 +81,18 @@ class BeliefPolicy(RecurrentPolicy):
         again = torch.rand(rows, 1, generator=generator, device=device) < 1.0 / self.try_steps
         return new if last is None else torch.where(again, new, last)
 
+    def evidence(self, noted: Tensor, reward: Tensor, known: Tensor) -> Tensor:
+        """As of :class:`BeliefNet`, for raw columns and rewards."""
+        columns = self.actor.noted
+        return self.actor.evidence(
+            self.observations.some(noted, columns), self.rewards(self._compressed(reward)).squeeze(-1), known
+        )
+
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As in the base."""
-        x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
-        state = memory.state + self.actor.evidence(x)
+        state = memory.state + self.evidence(self.actor.noted(obs), memory.reward, memory.known)
         goal, std = self.actor.believe(state)
         if drawn is not None:
             goal = goal + std * drawn
-        return self.actor.act(x[:, : obs.shape[1]], goal), state
+        return self.actor.act(self.observations(obs), goal), state

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.train.distributed import pool_moments
 from bidex_meta.train.learner import LearnerConfig
 
@@ -77,6 +77,12 @@ class ObservationNormaliser(nn.Module):
         if not self.enabled:
             return obs
         return ((obs - self.shift) * self.scale).clamp_(-self.clip, self.clip)
+
+    def some(self, obs: Tensor, columns: Columns) -> Tensor:
+        """The same of some columns (..., n) alone."""
+        if not self.enabled:
+            return obs
+        return ((obs - columns(self.shift)) * columns(self.scale)).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
