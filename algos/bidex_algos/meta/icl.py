@@ -34,6 +34,9 @@ from bidex_meta.world.contract import PooledWorld
 # Added to deviations, in which errors count: 1.5 % of an action's range, and 1 cm of a goal.
 _ACTION_FLOOR, _GOAL_FLOOR = 0.03, 0.01
 
+_ASKED = 64
+"""Steps of a trial after which the memory is asked for the goal, in each update."""
+
 
 @dataclass(frozen=True)
 class ICLConfig(MemoryConfig):
@@ -50,7 +53,7 @@ class ICLConfig(MemoryConfig):
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
     batch_size: Count = 1024  # Labelled steps of an update, split evenly over the classes with a teacher.
-    batch_trials: Count = 32  # Trials of an update whose evidence the memory adds up, split likewise.
+    batch_trials: Count = 16  # Trials of an update whose evidence the memory adds up, split likewise.
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
@@ -196,11 +199,12 @@ class ICL(TrialLearner):
         trial, row, task = self._drawn(data, self.config.batch_trials)
         policy, shown = self.policy, data.evidence(trial, row, self.policy.actor.noted)
         memory = policy.evidence(shown.noted, shown.reward, shown.known).cumsum(0)
-        mean, std = policy.actor.believe(memory)
+        asked = torch.randint(len(memory), (_ASKED,), generator=self.generator, device=self.device)
+        mean, std = policy.actor.believe(memory[asked])
         missed = mean - policy.goals(shown.goals)
         unit = self.goal_stats.std(_GOAL_FLOOR).float()[task] * policy.goals.scale
         doubt = 0.5 * (missed.detach() / std).square() + std.log()
-        count = shown.counts.float()
+        count = shown.counts[asked].float()
         total = count.sum(0).view(len(self.tasks), -1).sum(1).clamp_min(1.0)
         each = [(e.mean(2) * count).sum(0).view(len(self.tasks), -1).sum(1) for e in ((missed / unit).square(), doubt)]
         return each[0] / total, each[1] / total
