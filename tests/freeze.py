@@ -120,7 +120,7 @@ def _data_set(folder: str) -> Path:
 def _run(algo: str) -> list[str]:
     fixed = ["--seed", "5", "--threads", "1", "--device", "cpu", "--logger", "none"]
     taught = ["--teacher", "scripts"] if algo in TAUGHT else []
-    suite = "ML4" if algo in ADAPTS else "MT4-v2" if taught else "MT4"
+    suite = ("ML4" if algo in ADAPTS else "MT4") + "-v2" * bool(taught)
     return ["run", "--suite", suite, "--algo", algo, *taught, *fixed]
 
 

@@ -282,17 +282,25 @@ class World(BatchedWorld):
         return values[:, self.hidden_columns]
 
     @property
+    def hidden_variations(self) -> dict[str, list[int]]:
+        """Columns of each slot's tasks that hold what they hide (``TaskClass.hides``); none where goals are shown."""
+        found = {}
+        for slot in self.slots if self.hides_goals else []:
+            names = slot.task_class.variation_space.names
+            found[slot.name] = [names.index(name) for part in slot.task_class.hides() for name in part.names]
+        return found
+
+    @property
     def hidden_size(self) -> int:
-        """Numbers that tasks of a class hide at most (``TaskClass.hides``); 0 where the suite shows its goals."""
-        sizes = (sum(len(part.names) for part in slot.task_class.hides()) for slot in self.slots)
-        return max(sizes) * self.hides_goals
+        """Numbers that tasks of a class hide at most; 0 where the suite shows its goals."""
+        return max(map(len, self.hidden_variations.values()), default=0)
 
     def hidden_values(self) -> Tensor:
         """What the task of each environment hides, scaled from its range to [-1, 1]: (N, hidden_size), zeros behind."""
         values = torch.zeros(self.num_envs, self.hidden_size, device=self.device)
+        hidden = self.hidden_variations
         for slot, rows in zip(self.slots, self.slot_rows, strict=True):
-            space = slot.task_class.variation_space
-            columns = [space.names.index(name) for part in slot.task_class.hides() for name in part.names]
+            space, columns = slot.task_class.variation_space, hidden.get(slot.name, [])
             low, high = (np.asarray(end)[columns] for end in (space.low, space.high))
             scaled = torch.as_tensor((2.0 * slot.tasks[:, columns] - low - high) / (high - low))
             values[rows, : len(columns)] = scaled.float().to(self.device)[self.task_index[rows]]

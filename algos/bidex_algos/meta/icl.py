@@ -88,6 +88,8 @@ class ICL(TrialLearner):
 
     def __init__(self, world: PooledWorld, config: ICLConfig, seed: int):
         super().__init__(world, config, seed)
+        self.every_pool = dict(zip(world.task_names, world.pools, strict=True))
+        self.pools.clear()  # tasks are mixed instead of taking turns
         self.goal_stats = RunningStats((world.num_tasks, max(1, self.shape.hidden))).to(self.device)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
@@ -132,6 +134,20 @@ class ICL(TrialLearner):
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
         return self._episodes_metrics() | as_numbers(tensors)
+
+    def _begin(self) -> Tensor:
+        """Starts the next trial, of tasks with the hidden part of one train task and the rest of another.
+
+        A memory would learn fifty tasks by heart by where their objects start.
+        """
+        hidden = getattr(self.world, "hidden_variations", {})
+        mixed = {}
+        for name, pool in self.every_pool.items():
+            rest, goals = (torch.randperm(len(pool), generator=self.generator, device=self.device) for _ in range(2))
+            mixed[name] = pool[rest.tolist()]
+            mixed[name][:, hidden.get(name, [])] = pool[goals.tolist()][:, hidden.get(name, [])]
+        self.world.set_tasks(mixed)
+        return super()._begin()
 
     def teachers_share(self) -> float:
         """Of the episodes that begin now: those that the teacher plays."""
