@@ -19,6 +19,7 @@ from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.worlds import Worlds
 
 SCRIPTS = "scripts"
@@ -118,7 +119,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         say(f"Without a teacher, and not learned: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     inner: Any = getattr(world, "unwrapped", world)  # without a recorder
-    hidden = inner if source.hides_goals else None
+    hidden = HiddenParts(inner) if source.hides_goals else None
     if not scripted:
         return Teachers(world, tutors, hidden=hidden)
     names = [inner.slots[i].name for i, task in enumerate(slots) if task in scripted]

@@ -214,6 +214,11 @@ class TaskClass(ABC):
         """What only goal entries show of a task, and how exactly success asks for it; nothing by default."""
         return ()
 
+    def hidden_columns(self) -> list[int]:
+        """Columns of a variation that hold what it hides."""
+        names = self.variation_space.names
+        return [names.index(name) for part in self.hides() for name in part.names]
+
     def guides(self, state: TaskState) -> list[Tensor]:
         """Distances (m), each (n,), that the reward of version 2 wants small beside the errors: hands to points."""
         return []

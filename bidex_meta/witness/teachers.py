@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,6 +9,7 @@ from torch import Tensor
 from bidex_meta.agents import Agent
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.hidden_parts import HiddenParts
 
 
 @dataclass(frozen=True)
@@ -22,23 +22,6 @@ class Tutor:
     policy: Agent
     rows: Tensor
     width: int
-
-
-class HidingWorld(Protocol):
-    """A world that knows goals which its observations do not show."""
-
-    @property
-    def hidden_columns(self) -> Tensor:
-        """The entries of an observation, int64 (k,)."""
-        ...
-
-    def hidden_entries(self) -> Tensor:
-        """What they would be now, (N, k)."""
-        ...
-
-    def hidden_values(self) -> Tensor:
-        """What each environment's task hides, in [-1, 1]: (N, n)."""
-        ...
 
 
 class Teachers:
@@ -54,7 +37,7 @@ class Teachers:
         tutors: Sequence[Tutor] = (),
         scripted: Scripted | None = None,
         scripted_rows: Tensor | None = None,
-        hidden: HidingWorld | None = None,
+        hidden: HiddenParts | None = None,
     ) -> None:
         self.hidden = hidden
         self._tutors, self._scripted = tutors, scripted
@@ -75,7 +58,7 @@ class Teachers:
         labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
         if self.hidden is not None and self._tutors:
             # Added, since an entry that is a goal's in one class may be an object's in another.
-            obs = obs.index_add(1, self.hidden.hidden_columns, self.hidden.hidden_entries())
+            obs = obs.index_add(1, self.hidden.columns, self.hidden.entries())
         for tutor in self._tutors:
             actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
             labels[tutor.rows, : actions.shape[1]] = actions

@@ -269,42 +269,9 @@ class World(BatchedWorld):
         return [slot.tasks.copy() for slot in self.slots]
 
     @property
-    def hidden_columns(self) -> Tensor:
-        """Entries of observations that the suite hides, those of goals: ascending, int64 (k,); else none."""
-        each = {i for slot in self.slots for i in slot.task_class.layout.goal_indices()} if self.hides_goals else set()
-        return torch.tensor(sorted(each), dtype=torch.int64, device=self.device)
-
-    def hidden_entries(self) -> Tensor:
-        """What these entries would be now: (N, k), zeros where a class has no such entry."""
-        values = torch.empty(self.num_envs, self.observation_size, device=self.device)
-        for part in self.parts:
-            values[part.group.rows] = part.goals(part.group.take(self.task_index), self.observation_size)
-        return values[:, self.hidden_columns]
-
-    @property
-    def hidden_variations(self) -> dict[str, list[int]]:
-        """Columns of each slot's tasks that hold what they hide (``TaskClass.hides``); none where goals are shown."""
-        found = {}
-        for slot in self.slots if self.hides_goals else []:
-            names = slot.task_class.variation_space.names
-            found[slot.name] = [names.index(name) for part in slot.task_class.hides() for name in part.names]
-        return found
-
-    @property
     def hidden_size(self) -> int:
-        """Numbers that tasks of a class hide at most; 0 where the suite shows its goals."""
-        return max(map(len, self.hidden_variations.values()), default=0)
-
-    def hidden_values(self) -> Tensor:
-        """What the task of each environment hides, scaled from its range to [-1, 1]: (N, hidden_size), zeros behind."""
-        values = torch.zeros(self.num_envs, self.hidden_size, device=self.device)
-        hidden = self.hidden_variations
-        for slot, rows in zip(self.slots, self.slot_rows, strict=True):
-            space, columns = slot.task_class.variation_space, hidden.get(slot.name, [])
-            low, high = (np.asarray(end)[columns] for end in (space.low, space.high))
-            scaled = torch.as_tensor((2.0 * slot.tasks[:, columns] - low - high) / (high - low))
-            values[rows, : len(columns)] = scaled.float().to(self.device)[self.task_index[rows]]
-        return values
+        """Numbers that tasks of a class hide at most (``HiddenParts``); 0 where the suite shows its goals."""
+        return max(len(slot.task_class.hidden_columns()) for slot in self.slots) * self.hides_goals
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees what pictures were drawn with."""

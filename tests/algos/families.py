@@ -40,7 +40,7 @@ class PointGoals(FakePools):
 
     speed = 0.2
     kept = ("position",)
-    hidden_columns, hidden_size = torch.tensor([2, 3]), 2
+    hidden_size = 2
 
     def __init__(
         self, rows: int = 40, goal_visible: bool = False, classes: Sequence[PointClass] = (PointClass(),),

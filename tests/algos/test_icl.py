@@ -24,13 +24,18 @@ TEN = (PointClass(steps=10, count=16),)
 class Knowing:
     """Goes to the goals of a world that hides them; reads nothing but what ``Teachers`` show."""
 
-    def __init__(self, world: PointGoals):
-        self.world, self.hidden_columns = world, world.hidden_columns
+    columns, variations = torch.tensor([2, 3]), {"PointGoals": [0, 1], "Short": [0, 1], "Long": [0, 1]}
 
-    def hidden_entries(self) -> Tensor:
+    def __init__(self, world: PointGoals):
+        self.world = world
+
+    def entries(self) -> Tensor:
         return self.world.goal.float()
 
-    hidden_values = hidden_entries
+    values = entries
+
+    def rewards(self, values: Tensor) -> Tensor:
+        return -(self.world.position - values).norm(dim=1)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         return self.world.best(obs)
@@ -78,30 +83,36 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     data = learner.data
     assert data is not None
     t, filled = data.trials, data.trials.filled()
-    assert torch.equal(data.goals, world.goal.float()) and data.taught.tolist() == [False] * 4 + [True] * 4
-    shown = torch.cat([t.obs[..., :2], data.goals.expand(len(filled), -1, -1)], dim=-1)
+    assert torch.equal(data.goals[:, 0], world.goal.float()) and data.taught.tolist() == [False] * 4 + [True] * 4
+    shown = torch.cat([t.obs[..., :2], data.goals[:, 0].expand(len(filled), -1, -1)], dim=-1)
     long = filled & (torch.arange(8) >= 4)
     assert torch.equal(data.labels[long], world.best(shown[long]))
 
 
 def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
     trials = Trials(2, torch.tensor([2, 3]), 1, 1, None)
-    data = TaughtTrials(trials, 2, 1)
+    data = TaughtTrials(trials, 2, 2, 1)
     for number in range(3):
         for name in ("obs", "actions", "rewards"):
             vars(trials)[name].fill_(float(number))
             trials.shown[:] = trials.valid[:] = True
         trials.lengths = torch.tensor([4, 6])
         data.labels.fill_(10.0 * number)
+        data.rewards[:] = torch.tensor([number, -number])
+        data.goals[:, 1] = 1.0
         data.keep()
     trial, row = torch.tensor([0, 1]), torch.tensor([1, 0])  # places of the third trial and of the second
-    shown = data.evidence(trial, row, Columns([slice(0, 1)]))
+    shown = data.evidence(trial, row, torch.tensor([0, 1]), Columns([slice(0, 1)]))
     assert shown.noted[:, :, 0].unique(dim=0).tolist() == [[2.0, 1.0]] and shown.counts.sum(0).tolist() == [6, 4]
-    assert shown.reward[1:4].unique(dim=0).tolist() == [[2.0, 1.0]] and shown.known[0].tolist() == [False, False]
+    assert (
+        shown.reward[1:4].unique(dim=0).tolist() == [[2.0, -1.0]]
+        and shown.goals.tolist() == [[0.0], [1.0]]
+        and shown.known[0].tolist() == [False, False]
+    )
     obs, labels, _ = data.steps(trial, row, torch.tensor([0.99, 0.0]))
     assert obs.flatten().tolist() == [2.0, 1.0] and labels.flatten().tolist() == [20.0, 10.0]
     with pytest.raises(BidexError, match="trials of"):
-        TaughtTrials(Trials(2, torch.tensor([2, 3, 3]), 1, 1, None), 2, 1).load_state_dict(data.state_dict())
+        TaughtTrials(Trials(2, torch.tensor([2, 3, 3]), 1, 1, None), 2, 2, 1).load_state_dict(data.state_dict())
 
 
 def test_it_learns_from_nobody_until_it_has_teachers() -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from bidex_meta.evaluation.references import references_of
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from bidex_meta.world.agent_views import agent_views
+from bidex_meta.world.hidden_parts import HiddenParts
 from tests.data.test_commands import recorded
 from tests.tasks.worlds import slot
 from tests.world.play import flat, suite_world
@@ -59,8 +61,30 @@ def test_a_world_knows_what_its_observations_hide() -> None:
     for world in (shows, hides):
         world.reset(seed=0)
     (seen, *_), (masked, *_) = shows.step(action), hides.step(action)
-    columns = hides.hidden_columns
-    assert not torch.equal(seen, masked) and len(shows.hidden_columns) == shows.hidden_size == 0
-    torch.testing.assert_close(masked.index_add(1, columns, hides.hidden_entries()), seen, rtol=0, atol=1e-6)
-    values = hides.hidden_values()
+    parts = HiddenParts(hides)
+    assert not torch.equal(seen, masked) and shows.hidden_size == 0
+    torch.testing.assert_close(masked.index_add(1, parts.columns, parts.entries()), seen, rtol=0, atol=1e-6)
+    values = parts.values()
     assert values.shape == (4, 4) and values.abs().max() <= 1.0 and not values[2:, 1:].any() and values[:, 0].all()
+
+
+def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
+    classes = [slot(registry.get(name)) for name in ("PushBlock-v2", "BottleCap-v2")]
+    one = World(classes, 4, observation="masked", autoreset_mode="DISABLED", threads=1)
+    action = torch.rand(4, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    parts = HiddenParts(one)
+    one.reset(seed=0)
+    mirrored, own = -parts.values(), one.step(action)[1]
+    torch.testing.assert_close(parts.rewards(parts.values()), own, rtol=0, atol=1e-5)
+    earned = parts.rewards(mirrored)
+    pools = {}
+    for each in one.slots:
+        low, high = (
+            np.asarray(end) for end in (each.task_class.variation_space.low, each.task_class.variation_space.high)
+        )
+        pools[each.name], columns = each.tasks.copy(), parts.variations[each.name]
+        pools[each.name][:, columns] = (low + high)[columns] - each.tasks[:, columns]
+    one.set_tasks(pools)
+    one.reset(seed=0)
+    torch.testing.assert_close(one.step(action)[1], earned, rtol=0, atol=1e-5)
+    assert not torch.allclose(earned, own)

@@ -54,6 +54,7 @@ class ICLConfig(MemoryConfig):
     updates_per_iteration: Count = 50  # Updates after each trial.
     batch_size: Count = 1024  # Labelled steps of an update, split evenly over the classes with a teacher.
     batch_trials: Count = 16  # Trials of an update whose evidence the memory adds up, split likewise.
+    goals: Count = 8  # Goals for which each trial's steps are rewarded in hindsight, beside the task's own.
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
@@ -115,8 +116,9 @@ class ICL(TrialLearner):
         rows = teachers.known.nonzero().squeeze(1)
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows, self.first = rows, self.count.cumsum(0) - self.count
+        size = self.goal_stats.mean.shape[1]
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
-        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), self.goal_stats.mean.shape[1])
+        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, size)
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
@@ -129,7 +131,7 @@ class ICL(TrialLearner):
         valid = t.valid & filled
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
-        self.policy.goals.update(data.goals)
+        self.policy.goals.update(data.goals[:, 0])
         losses = self._learn(data)
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
@@ -140,7 +142,7 @@ class ICL(TrialLearner):
 
         A memory would learn fifty tasks by heart by where their objects start.
         """
-        hidden = getattr(self.world, "hidden_variations", {})
+        hidden = {} if self.teachers.hidden is None else self.teachers.hidden.variations
         mixed = {}
         for name, pool in self.every_pool.items():
             rest, goals = (torch.randperm(len(pool), generator=self.generator, device=self.device) for _ in range(2))
@@ -158,7 +160,7 @@ class ICL(TrialLearner):
     def _take_moments(self, data: TaughtTrials) -> None:
         """Takes labels and goals of the trials into the statistics of their classes."""
         filled = data.trials.filled()
-        goals = data.goals.expand(len(filled), -1, -1)
+        goals = data.goals[:, 0].expand(len(filled), -1, -1)
         for stats, values in ((self.label_stats, data.labels), (self.goal_stats, goals)):
             mean, var, count = torch.zeros(3, *stats.mean.shape, dtype=torch.float64, device=self.device)
             for task in self.tasks.tolist():
@@ -213,7 +215,8 @@ class ICL(TrialLearner):
         The latter teaches the deviation alone.
         """
         trial, row, task = self._drawn(data, self.config.batch_trials)
-        policy, shown = self.policy, data.evidence(trial, row, self.policy.actor.noted)
+        goal = torch.randint(1 + self.config.goals, row.shape, generator=self.generator, device=self.device)
+        policy, shown = self.policy, data.evidence(trial, row, goal, self.policy.actor.noted)
         memory = policy.evidence(shown.noted, shown.reward, shown.known).cumsum(0)
         asked = torch.randint(len(memory), (_ASKED,), generator=self.generator, device=self.device)
         mean, std = policy.actor.believe(memory[asked])
@@ -258,11 +261,27 @@ class _Pupil:
         learner = self._learner
         self._shown = shown[:, None]
         learner.teachers.reset(torch.ones_like(shown))
-        if learner.teachers.hidden is not None:
-            self._data.goals[:] = learner.teachers.hidden.hidden_values()
+        if self._tried is None and learner.teachers.hidden is not None:
+            self._draw_goals(learner.teachers.hidden.values())
 
     def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
+
+    def _draw_goals(self, own: Tensor) -> None:
+        """The tasks' own (N, k), and goals between those of two tasks of the same class."""
+        goals, task_id = self._data.goals, self._learner.world.task_id
+        goals[:, 0] = own
+        same = (task_id[:, None] == task_id).double()
+        pairs = same.multinomial(2 * (goals.shape[1] - 1), replacement=True, generator=self._learner.generator)
+        ends = own[pairs].unflatten(1, (2, -1))
+        goals[:, 1:] = torch.lerp(ends[:, 0], ends[:, 1], self._draw(torch.rand, goals.shape[1] - 1)[..., None])
+
+    def earned(self, reward: Tensor, slot: Tensor) -> None:
+        """Keeps what the step was paid, and would have been for the other goals."""
+        hidden, data = self._learner.teachers.hidden, self._data
+        data.rewards[slot, self._rows, 0] = reward
+        for i in range(1, data.goals.shape[1] if hidden is not None else 0):
+            data.rewards[slot, self._rows, i] = hidden.rewards(data.goals[:, i])
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Of the teachers or the policy; keeps what the teachers would do."""

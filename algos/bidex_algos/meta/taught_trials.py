@@ -27,22 +27,23 @@ class Evidence(NamedTuple):
     goals: Tensor
     """What the tasks hide (B, k)."""
     counts: Tensor
-    """Steps of trials that no teacher played, bool (S, B): what a teacher does tells the goal, which rewards shall."""
+    """Steps that count, bool (S, B): not where a teacher went to the goal, which rewards shall tell."""
 
 
 class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
-    ``labels`` (S, N, a), ``goals`` (N, k) and ``taught`` (N,) are filled while ``trials`` is played; then ``keep``
-    takes all.
+    ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,) are filled while ``trials`` is
+    played; then ``keep`` takes all. Of ``g`` goals the first is the task's; for the others the same steps are rewarded
+    in hindsight.
     """
 
-    def __init__(self, trials: Trials, kept: int, goals: int):
+    def __init__(self, trials: Trials, kept: int, goals: int, size: int):
         self.trials, self.kept, self.added = trials, kept, 0
         slots, rows, actions = trials.actions.shape
         device = trials.obs.device
         self.labels = torch.zeros(slots, rows, actions, device=device)
-        self.goals = torch.zeros(rows, goals, device=device)
+        self.goals, self.rewards = (torch.zeros(*n, device=device) for n in ((rows, goals, size), (slots, rows, goals)))
         self.taught = torch.zeros(rows, dtype=torch.bool, device=device)
 
         def empty(*shape: int, dtype: torch.dtype = torch.float16) -> Tensor:
@@ -50,9 +51,9 @@ class TaughtTrials:
             return torch.empty(kept, slots, rows, *shape, dtype=dtype, device=device)
 
         self._ring = {
-            "obs": empty(trials.obs.shape[2]), "labels": empty(actions), "reward": empty(dtype=torch.float32),
+            "obs": empty(trials.obs.shape[2]), "labels": empty(actions), "rewards": empty(goals, dtype=torch.float32),
             "known": empty(dtype=torch.bool),
-            "goals": torch.empty(kept, rows, goals, device=device),
+            "goals": torch.empty(kept, rows, goals, size, device=device),
             "taught": torch.empty(kept, rows, dtype=torch.bool, device=device),
             "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
         }  # fmt: skip
@@ -65,8 +66,10 @@ class TaughtTrials:
     def keep(self) -> None:
         """Takes the trials that were played."""
         t = self.trials
-        _, reward, known, _ = t.previous(len(t.obs))
-        new = {"obs": t.obs, "reward": reward, "known": known, "labels": self.labels, "goals": self.goals}
+        *_, known, _ = t.previous(len(t.obs))
+        # Behind an action as ``previous`` has it, so that a reward stands beside what it led to.
+        rewards = torch.cat([torch.zeros_like(self.rewards[:1]), self.rewards[:-1]])
+        new = {"obs": t.obs, "rewards": rewards, "known": known, "labels": self.labels, "goals": self.goals}
         for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():
             self._ring[name][self.added % self.kept] = value
         self.added += 1
@@ -78,16 +81,17 @@ class TaughtTrials:
         """
         slot = (share * self._ring["lengths"][trial, row]).long()
         obs, labels = (self._ring[name][trial, slot, row].float() for name in ("obs", "labels"))
-        return obs, labels, self._ring["goals"][trial, row]
+        return obs, labels, self._ring["goals"][trial, row, 0]
 
-    def evidence(self, trial: Tensor, row: Tensor, columns: Columns) -> Evidence:
-        """Of trials (B,) of environments (B,)."""
+    def evidence(self, trial: Tensor, row: Tensor, goal: Tensor, columns: Columns) -> Evidence:
+        """Of trials (B,) of environments (B,), rewarded for one of the goals (B,)."""
         lengths, taught = (self._ring[name][trial, row] for name in ("lengths", "taught"))
         slots = int(lengths.max())
-        obs, reward, known = (self._ring[name][trial, :slots, row] for name in ("obs", "reward", "known"))
-        counts = (torch.arange(slots, device=lengths.device)[:, None] < lengths) & ~taught
+        obs, known = (self._ring[name][trial, :slots, row] for name in ("obs", "known"))
+        rewards = self._ring["rewards"][trial, :slots, row, goal]
+        counts = (torch.arange(slots, device=lengths.device)[:, None] < lengths) & ~(taught & (goal == 0))
         noted = columns(obs).transpose(0, 1).float()
-        return Evidence(noted, reward.T, known.T, self._ring["goals"][trial, row], counts)
+        return Evidence(noted, rewards.T, known.T, self._ring["goals"][trial, row, goal], counts)
 
     def state_dict(self) -> State:
         """A copy of all that is kept."""

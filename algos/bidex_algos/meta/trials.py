@@ -117,6 +117,9 @@ class Player(Protocol):
         """
         ...
 
+    def earned(self, reward: Tensor, slot: Tensor) -> None:
+        """The step's rewards (N,), 0 where it teaches nothing."""
+
 
 class Sampling:
     """Plays by the policy's Gaussian."""
@@ -132,6 +135,9 @@ class Sampling:
         mean, state = self._policy.step(obs, memory)
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
         return mean + self._policy.log_std.exp() * noise, state
+
+    def earned(self, reward: Tensor, slot: Tensor) -> None:
+        """Nothing."""
 
 
 @torch.no_grad()
@@ -160,6 +166,7 @@ def play(
             next_obs, reward, terminated, truncated, info = world.step(action)
             valid = ~info["unstable"]
             reward = reward.masked_fill(~(valid & playing), 0.0)
+            player.earned(reward, trials.lengths)
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
