@@ -2,7 +2,6 @@
 
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -65,8 +64,7 @@ class HiddenParts:
     def _range(self, name: str) -> tuple[Tensor, Tensor]:
         """Middle and half width of the hidden values of a slot, (n,) each, float64."""
         (slot,) = (each for each in self._world.slots if each.name == name)
-        space, columns = slot.task_class.variation_space, self.variations[name]
-        low, high = (
-            torch.as_tensor(np.asarray(end)[columns], device=self._world.device) for end in (space.low, space.high)
-        )
+        space, device = slot.task_class.variation_space, self._world.device
+        ends = (torch.tensor(end, dtype=torch.float64, device=device) for end in (space.low, space.high))
+        low, high = (end[self.variations[name]] for end in ends)
         return 0.5 * (high + low), 0.5 * (high - low)

@@ -79,11 +79,9 @@ def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
     earned = parts.rewards(mirrored)
     pools = {}
     for each in one.slots:
-        low, high = (
-            np.asarray(end) for end in (each.task_class.variation_space.low, each.task_class.variation_space.high)
-        )
-        pools[each.name], columns = each.tasks.copy(), parts.variations[each.name]
-        pools[each.name][:, columns] = (low + high)[columns] - each.tasks[:, columns]
+        space, columns = each.task_class.variation_space, parts.variations[each.name]
+        pools[each.name] = each.tasks.copy()
+        pools[each.name][:, columns] = np.add(space.low, space.high)[columns] - each.tasks[:, columns]
     one.set_tasks(pools)
     one.reset(seed=0)
     torch.testing.assert_close(one.step(action)[1], earned, rtol=0, atol=1e-5)

@@ -280,7 +280,9 @@ class _Pupil:
         """Keeps what the step was paid, and would have been for the other goals."""
         hidden, data = self._learner.teachers.hidden, self._data
         data.rewards[slot, self._rows, 0] = reward
-        for i in range(1, data.goals.shape[1] if hidden is not None else 0):
+        if hidden is None:
+            return
+        for i in range(1, data.goals.shape[1]):
             data.rewards[slot, self._rows, i] = hidden.rewards(data.goals[:, i])
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
