@@ -17,12 +17,14 @@ from bidex_algos.nets.architecture import Options
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
+from bidex_algos.onpolicy.lessons import Lessons, imitation
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
+from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -47,6 +49,11 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     demonstration_half_life: Positive = 500_000.0  # Environment steps in which that weight falls to half.
     demonstration_batch: Count = 256  # Transitions of them in each mini-batch, of each process.
     demonstration_cloning: Whole = 0  # Steps of so many of them in which the policy is cloned before it plays.
+    teacher_weight: NonNegative = 1.0
+    """With --teacher: weight, for a class that never succeeds, of the policy's distance from its teacher's actions."""
+    teacher_success: Positive = 0.8
+    """Success of a class's last 100 episodes from which its teacher counts nothing; on the way there its weight falls
+    in a line, and it rises again where success falls."""
     critic_first: Whole = 0
     """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
     or of --start-from), which a critic that knows nothing would spoil."""
@@ -121,12 +128,12 @@ class Demonstrations:
         return self._obs[chosen], self._actions[chosen]
 
     def loss(self, policy: GaussianPolicy) -> Tensor:
-        """Mean of (a - mean)^2 / (2 std^2), summed over actions; deviations, which rewards alone move, get no slope."""
+        """Mean of (a - mean)^2 / (2 std^2), summed over actions."""
         raw, actions = self.draw()
         obs = policy.observations(raw)
         with autocast(raw.device, policy.low_precision):
             means = policy.actor(obs)
-        return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
+        return imitation(actions, means.float(), policy.actor.log_std_of(obs)).mean()
 
     def clone(self, policy: GaussianPolicy) -> None:
         """Behaviour cloning before anything is played: statistics of observations, then steps of the mean alone."""
@@ -141,11 +148,6 @@ class Demonstrations:
             adam.step()
 
 
-def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-    """Half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
-    return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()
-
-
 class MTPPO(OnPolicy):
     """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world."""
 
@@ -154,6 +156,7 @@ class MTPPO(OnPolicy):
     imitates = True
     config: MTPPOConfig
     demonstrations: Demonstrations | None = None
+    lessons: Lessons | None = None
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
@@ -172,11 +175,21 @@ class MTPPO(OnPolicy):
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
         self.per_process = (*OnPolicy.per_process, "demonstrated")
 
+    def learn_from_teachers(self, teachers: Teachers) -> None:
+        """Takes who labels the states that the policy comes to, likewise."""
+        weight, success = self.config.teacher_weight, self.config.teacher_success
+        self.lessons = Lessons(teachers, self.rollout, self.world.task_id, weight, success)
+
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
             self.demonstrations.clone(self.policy)
         self.policy.observations.settled = self._critic_alone()
         return super()._iterate()
+
+    def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        if self.lessons is not None:
+            self.lessons.label(obs)
+        return super()._sample(obs)
 
     def _imitated(self) -> float:
         return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
@@ -189,30 +202,42 @@ class MTPPO(OnPolicy):
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
-        old_log_std = actor.log_std.detach().clone()
+        old_log_std, needs = actor.log_std.detach().clone(), self._needs()
         (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
-            measured.append(self._gradients(part, count, old_log_std))
+            measured.append(self._gradients(part, count, old_log_std, index, needs))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
             with torch.no_grad():
                 actor.log_std.clamp_(low, high)
                 if self.balance is not None:
                     self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
-        names += ["Loss/demonstrations"] * bool(self._imitated())
+        names += ["Loss/teachers"] * (needs is not None) + ["Loss/demonstrations"] * bool(self._imitated())
         means = torch.stack(measured).mean(0)
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
             reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
+        if needs is not None:
+            names = [f"Policy/teacher_weight/{name}" for name in self.world.task_names]
+            reported |= dict(zip(names, needs, strict=True))
         return reported
 
-    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
+    def _needs(self) -> Tensor | None:
+        """Weights of the classes' teachers, (num_tasks,); None without teachers."""
+        return None if self.lessons is None else self.lessons.weights(self.episodes)
+
+    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, index: Tensor, needs: Tensor | None) -> Tensor:
         cfg, actor = self.config, self.policy.actor
-        loss = self._loss(b, count, old_log_std)
+        means = self._means(b)
+        loss = self._loss(b, count, old_log_std, means)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
         rest = cfg.value_loss_weight * value - cfg.entropy_weight * loss.entropy
-        numbers, imitated = loss.numbers(value), None
+        numbers, imitated, taught = loss.numbers(value), None, None
+        if self.lessons is not None and needs is not None:
+            distance = self.lessons.distance(means, actor.log_std_of(b.obs), index)
+            taught = (b.weights / count * needs[b.task_id] * distance).sum()
+            rest = rest + taught
         if self.demonstrations is not None and (weight := self._imitated()):
             imitated = self.demonstrations.loss(self.policy) / world_size()
             rest = rest + weight * imitated
@@ -223,14 +248,15 @@ class MTPPO(OnPolicy):
             rest.backward()
         else:
             (loss.surrogate + rest).backward()
-        if imitated is not None:
-            numbers.append(imitated.detach())
+        numbers += [term.detach() for term in (taught, imitated) if term is not None]
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
-    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PolicyLoss:
-        actor = self.policy.actor
+    def _means(self, b: Batch) -> Tensor:
         with autocast(self.device, self.low_precision):
-            means = actor(b.obs)
+            return self.policy.actor(b.obs)
+
+    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, means: Tensor) -> PolicyLoss:
+        actor = self.policy.actor
         return policy_loss(
             b.actions, means, actor.log_std_of(b.obs), b.old_means, actor.log_std_of(b.obs, old_log_std),
             b.old_log_probs, b.advantages, weights=b.weights / count, clip=self.config.clip
@@ -241,7 +267,7 @@ class MTPPO(OnPolicy):
         return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        loss = self._loss(b, count, old_log_std)
+        loss = self._loss(b, count, old_log_std, self._means(b))
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
@@ -251,6 +277,12 @@ class MTPPO(OnPolicy):
     def _place(self) -> State:
         own = self.demonstrations
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
+
+    def load_state_dict(self, state: State) -> None:
+        """As in the base; with teachers that follow an episode from its start new ones begin."""
+        super().load_state_dict(state)
+        if self.obs is not None and self.lessons is not None and self.lessons.teachers.follow:
+            self.obs, _ = self.world.reset()
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)

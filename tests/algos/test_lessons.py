@@ -1,0 +1,101 @@
+"""Teachers beside PPO: what it forgets without them, when they count and when not, what they leave alone, resuming."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.witness.teachers import Teachers, Tutor
+from tests.algos.ranks import resumed
+from tests.algos.test_dagger import Constant, Following
+from tests.algos.toy import ToyWorld, nearness
+
+SMALL = MTPPOConfig(
+    hidden=(16,), num_minibatches=2, epochs=2, learning_rate=1e-3, init_std=0.2, critic_first=2048, autocast="off"
+)
+
+
+def needle(action: Tensor) -> Tensor:
+    """Solved near 0.5 alone, while what is paid elsewhere leads to -0.5: exploring actions hardly ever solve it."""
+    near = (action - 0.5).abs().amax(-1) < 0.08
+    return torch.where(near, 1.0, 0.8 * (1.0 - (action + 0.5).square().mean(-1)))
+
+
+def skilled(world: ToyWorld, config: MTPPOConfig, taught: bool, seed: int = 0, kind: Any = Teachers) -> MTPPO:
+    """One that solves the first task from its start, with a teacher of this task alone or without."""
+    learner = MTPPO(world, config, seed)
+    with torch.no_grad():
+        learner.policy.actor.mean.output_bias.fill_(0.5)
+    if taught:
+        learner.learn_from_teachers(kind(world, [Tutor(Constant(0.5, 0.5), torch.arange(world.num_envs // 2), 3)]))
+    return learner
+
+
+def test_ppo_forgets_what_its_reward_leads_away_from_and_keeps_it_with_a_teacher() -> None:
+    found = {}
+    for taught in (False, True):
+        world = ToyWorld([needle, nearness(-0.5)], rows=64)
+        learner = skilled(world, SMALL, taught)
+        obs, _ = world.reset(seed=1)
+        before, weights = learner.eval_action(obs), list[float]()
+        for _ in range(2):
+            learner.iterate()
+        assert torch.equal(learner.eval_action(obs), before)  # the critic alone has learned
+        for _ in range(38):
+            reported = learner.iterate()
+            weights.append(reported.get("Policy/teacher_weight/task0", 0.0))
+            assert reported.get("Policy/teacher_weight/task1", 0.0) == 0.0
+        found[taught] = learner.eval_action(obs)[:64].mean().item(), reported["Train/success/task0"]
+        assert reported["Train/success/task1"] > 0.9
+    assert found[False][0] < 0.0 and found[False][1] < 0.05
+    assert found[True][0] == pytest.approx(0.5, abs=0.06) and found[True][1] > 0.9
+    assert weights[0] > 0.5 and weights[-1] == 0.0
+
+
+def test_a_weight_falls_with_success_rises_where_it_falls_and_is_0_without_a_teacher() -> None:
+    learner = skilled(ToyWorld([needle, nearness(-0.5)], rows=4), SMALL, taught=True)
+    assert learner.lessons is not None
+    found = []
+    for solved in (None, 40.0, 80.0, 95.0, 20.0):
+        if solved is not None:
+            learner.episodes.sums[2:] = torch.tensor([[solved, 0.0], [100.0, 100.0]])
+        found.append(learner.lessons.weights(learner.episodes))
+    assert torch.stack(found)[:, 0].tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.75])
+    assert not bool(torch.stack(found)[:, 1].any())
+
+
+@pytest.mark.parametrize("surgery", ["none", "pcgrad"])
+def test_weight_0_is_mt_ppo_bit_for_bit(surgery: str) -> None:
+    config = replace(SMALL, teacher_weight=0.0, critic_first=0, gradient_surgery=surgery)
+    plain, taught = (skilled(ToyWorld([needle, nearness(-0.5)], rows=4), config, taught) for taught in (False, True))
+    for learner in (plain, taught):
+        for _ in range(3):
+            learner.iterate()
+    pairs = zip(plain.policy.state_dict().values(), taught.policy.state_dict().values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_teachers_are_asked_in_each_step_and_begin_with_each_episode() -> None:
+    world, teacher = ToyWorld([needle, nearness(-0.5)], rows=4, unstable=((3, 0),)), Constant(0.5, 0.5)
+    learner = MTPPO(world, SMALL, seed=0)
+    learner.learn_from_teachers(Teachers(world, [Tutor(teacher, torch.arange(4), 3)]))
+    for _ in range(2):
+        learner.iterate()
+    ended = int(world.episodes.number[:4].sum()) - int(learner.rollout.ended[-1, :4].sum())  # before the last step
+    assert teacher.asked == 16 and teacher.begun == 4 + ended
+
+
+def test_a_resumed_run_goes_on_bit_for_bit_or_with_new_episodes() -> None:
+    def make(seed: int, kind: Any = Teachers) -> MTPPO:
+        return skilled(ToyWorld([needle, nearness(-0.5)], rows=4), replace(SMALL, critic_first=0), True, seed, kind)
+
+    resumed(make, iterations=2)
+    learner, again = make(0, Following), make(1, Following)
+    learner.iterate()
+    again.world.load_state_dict(learner.world.state_dict())
+    again.load_state_dict(learner.state_dict())
+    assert torch.equal(again.world.episodes.number, learner.world.episodes.number + 1)
+    again.iterate()
