@@ -170,6 +170,16 @@ class MTPPO(OnPolicy):
         }
         self.balance = balances[config.gradient_surgery]()
 
+    def start_from(self, policy: State) -> None:
+        """As in the base; deviations begin within ``std_range``, where each update leaves them."""
+        super().start_from(policy)
+        self._bound_std()
+
+    @torch.no_grad()
+    def _bound_std(self) -> None:
+        low, high = (math.log(std) for std in self.config.std_range)
+        self.policy.actor.log_std.clamp_(low, high)
+
     def learn_from_demonstrations(self, data: Joined) -> None:
         """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
@@ -203,14 +213,14 @@ class MTPPO(OnPolicy):
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
         old_log_std, needs = actor.log_std.detach().clone(), self._needs()
-        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
+        measured = list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             measured.append(self._gradients(part, count, old_log_std, index, needs))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
-            with torch.no_grad():
-                actor.log_std.clamp_(low, high)
-                if self.balance is not None:
+            self._bound_std()
+            if self.balance is not None:
+                with torch.no_grad():
                     self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
         names += ["Loss/teachers"] * (needs is not None) + ["Loss/demonstrations"] * bool(self._imitated())
