@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from bidex_algos.onpolicy.lessons import imitation
-from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig, imitation
 from bidex_meta.errors import BidexError
 from tests.algos.ranks import resumed
 from tests.algos.toy import ToyWorld, nearness
@@ -50,9 +49,7 @@ def test_the_term_is_the_log_density_and_leaves_deviations_alone() -> None:
     normal = Normal(means, log_std.exp())
     constant = -Normal(torch.zeros(3), log_std.exp()).log_prob(torch.zeros(3)).sum()
     expected = -normal.log_prob(actions).sum(-1).mean() - constant
-    assert float(imitation(actions, means, log_std).mean().detach()) == pytest.approx(
-        float(expected.detach()), rel=1e-5
-    )
+    assert float(imitation(actions, means, log_std).detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
     learner, _ = trained(SMALL, shown(), iterations=1)
     learner.policy.actor.zero_grad()
     assert learner.demonstrations is not None

@@ -14,8 +14,9 @@ from tests.algos.test_dagger import Constant, Following
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTPPOConfig(
-    hidden=(16,), num_minibatches=2, epochs=2, learning_rate=1e-3, init_std=0.2, critic_first=2048, autocast="off"
-)
+    hidden=(32, 32), num_minibatches=2, epochs=2, learning_rate=1e-3, init_std=0.2, critic_first=2048, autocast="off",
+    teacher_updates=8, teacher_batch=128, teacher_learning_rate=1e-3,
+)  # fmt: skip
 
 
 def needle(action: Tensor) -> Tensor:
@@ -44,32 +45,29 @@ def test_ppo_forgets_what_its_reward_leads_away_from_and_keeps_it_with_a_teacher
         for _ in range(2):
             learner.iterate()
         assert torch.equal(learner.eval_action(obs), before)  # the critic alone has learned
-        for _ in range(38):
+        for _ in range(42):
             reported = learner.iterate()
             weights.append(reported.get("Policy/teacher_weight/task0", 0.0))
-            assert reported.get("Policy/teacher_weight/task1", 0.0) == 0.0
+            assert "Policy/teacher_weight/task1" not in reported
         found[taught] = learner.eval_action(obs)[:64].mean().item(), reported["Train/success/task0"]
         assert reported["Train/success/task1"] > 0.9
     assert found[False][0] < 0.0 and found[False][1] < 0.05
-    assert found[True][0] == pytest.approx(0.5, abs=0.06) and found[True][1] > 0.9
-    assert weights[0] > 0.5 and weights[-1] == 0.0
+    assert found[True][0] == pytest.approx(0.5, abs=0.06) and found[True][1] > 0.5
+    assert weights[0] > 0.5 and weights[-1] < 0.4
 
 
-def test_a_weight_falls_with_success_rises_where_it_falls_and_is_0_without_a_teacher() -> None:
+def test_a_weight_falls_with_success_and_rises_where_it_falls() -> None:
     learner = skilled(ToyWorld([needle, nearness(-0.5)], rows=4), SMALL, taught=True)
-    assert learner.lessons is not None
     found = []
-    for solved in (None, 40.0, 80.0, 95.0, 20.0):
-        if solved is not None:
-            learner.episodes.sums[2:] = torch.tensor([[solved, 0.0], [100.0, 100.0]])
-        found.append(learner.lessons.weights(learner.episodes))
-    assert torch.stack(found)[:, 0].tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.75])
-    assert not bool(torch.stack(found)[:, 1].any())
+    for solved, ended in ((0, 0), (40, 100), (80, 100), (95, 100), (20, 100), (2, 2)):
+        learner.episodes.sums[2:] = torch.tensor([[solved, 0], [ended, 100]])
+        found.append(float(learner._needs()[0]))
+    assert found == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.75, 0.875])
 
 
 @pytest.mark.parametrize("surgery", ["none", "pcgrad"])
-def test_weight_0_is_mt_ppo_bit_for_bit(surgery: str) -> None:
-    config = replace(SMALL, teacher_weight=0.0, critic_first=0, gradient_surgery=surgery)
+def test_without_updates_it_is_mt_ppo_bit_for_bit(surgery: str) -> None:
+    config = replace(SMALL, teacher_updates=0, critic_first=0, gradient_surgery=surgery)
     plain, taught = (skilled(ToyWorld([needle, nearness(-0.5)], rows=4), config, taught) for taught in (False, True))
     for learner in (plain, taught):
         for _ in range(3):

@@ -17,11 +17,11 @@ from bidex_algos.nets.architecture import Options
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
-from bidex_algos.onpolicy.lessons import Lessons, imitation
+from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
+from bidex_meta.train.distributed import all_sum, own_seed, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.witness.teachers import Teachers
@@ -49,11 +49,14 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     demonstration_half_life: Positive = 500_000.0  # Environment steps in which that weight falls to half.
     demonstration_batch: Count = 256  # Transitions of them in each mini-batch, of each process.
     demonstration_cloning: Whole = 0  # Steps of so many of them in which the policy is cloned before it plays.
-    teacher_weight: NonNegative = 1.0
-    """With --teacher: weight, for a class that never succeeds, of the policy's distance from its teacher's actions."""
+    teacher_updates: Whole = 20
+    """With --teacher: DAgger's updates after each of PPO's, while a taught class never succeeds; 0: none."""
     teacher_success: Positive = 0.8
-    """Success of a class's last 100 episodes from which its teacher counts nothing; on the way there its weight falls
-    in a line, and it rises again where success falls."""
+    """Success of a class's last 100 episodes from which its teacher counts nothing; up to there its weight falls in a
+    line, and it rises again where success falls."""
+    teacher_learning_rate: Positive = 5e-4  # Adam's step size in these updates.
+    teacher_batch: Count = 1024  # Labelled observations of such an update, split evenly over the taught classes.
+    teacher_samples: Count = 500_000  # Labelled observations that each process keeps; the oldest go first.
     critic_first: Whole = 0
     """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
     or of --start-from), which a critic that knows nothing would spoil."""
@@ -94,6 +97,9 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 }
 
 
+# The first few episodes that end say little: until there are so many, the missing ones count as failures.
+_EPISODES = 20.0
+
 _DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
 
 
@@ -128,12 +134,12 @@ class Demonstrations:
         return self._obs[chosen], self._actions[chosen]
 
     def loss(self, policy: GaussianPolicy) -> Tensor:
-        """Mean of (a - mean)^2 / (2 std^2), summed over actions."""
+        """Mean of (a - mean)^2 / (2 std^2), summed over actions; deviations, which rewards alone move, get no slope."""
         raw, actions = self.draw()
         obs = policy.observations(raw)
         with autocast(raw.device, policy.low_precision):
             means = policy.actor(obs)
-        return imitation(actions, means.float(), policy.actor.log_std_of(obs)).mean()
+        return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
 
     def clone(self, policy: GaussianPolicy) -> None:
         """Behaviour cloning before anything is played: statistics of observations, then steps of the mean alone."""
@@ -146,6 +152,11 @@ class Demonstrations:
             loss.backward()
             sum_gradients(weights, loss.detach()[None])
             adam.step()
+
+
+def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
+    """Half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
+    return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()
 
 
 class MTPPO(OnPolicy):
@@ -183,12 +194,15 @@ class MTPPO(OnPolicy):
     def learn_from_demonstrations(self, data: Joined) -> None:
         """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
-        self.per_process = (*OnPolicy.per_process, "demonstrated")
+        self.per_process = (*self.per_process, "demonstrated")
 
     def learn_from_teachers(self, teachers: Teachers) -> None:
         """Takes who labels the states that the policy comes to, likewise."""
-        weight, success = self.config.teacher_weight, self.config.teacher_success
-        self.lessons = Lessons(teachers, self.rollout, self.world.task_id, weight, success)
+        cfg = self.config
+        self.lessons = Lessons(self.world, self.policy, cfg.teacher_learning_rate, cfg.max_grad_norm)
+        self.lessons.begin(teachers, cfg.teacher_samples, cfg.rollout_steps, cfg.teacher_batch)
+        self.per_process = (*self.per_process, "data")
+        self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
@@ -197,7 +211,9 @@ class MTPPO(OnPolicy):
         return super()._iterate()
 
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        if self.lessons is not None:
+        if self.lessons is not None and self.lessons.data is not None:
+            step = self.lessons.data.added % self.config.rollout_steps
+            self.lessons.teachers.reset(self.rollout.ended[step - 1])
             self.lessons.label(obs)
         return super()._sample(obs)
 
@@ -212,42 +228,46 @@ class MTPPO(OnPolicy):
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
-        old_log_std, needs = actor.log_std.detach().clone(), self._needs()
+        old_log_std = actor.log_std.detach().clone()
         measured = list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
-            measured.append(self._gradients(part, count, old_log_std, index, needs))
+            measured.append(self._gradients(part, count, old_log_std))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
             self._bound_std()
             if self.balance is not None:
                 with torch.no_grad():
                     self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
-        names += ["Loss/teachers"] * (needs is not None) + ["Loss/demonstrations"] * bool(self._imitated())
+        names += ["Loss/demonstrations"] * bool(self._imitated())
         means = torch.stack(measured).mean(0)
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
             reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
-        if needs is not None:
-            names = [f"Policy/teacher_weight/{name}" for name in self.world.task_names]
-            reported |= dict(zip(names, needs, strict=True))
-        return reported
+        return reported | ({} if self.lessons is None else self._take(self.lessons))
 
-    def _needs(self) -> Tensor | None:
-        """Weights of the classes' teachers, (num_tasks,); None without teachers."""
-        return None if self.lessons is None else self.lessons.weights(self.episodes)
+    def _take(self, lessons: Lessons) -> dict[str, Tensor]:
+        """Learns from teachers what the classes that fail need of it; nothing while the critic learns alone."""
+        assert lessons.data is not None
+        lessons.take_moments(self.config.rollout_steps)
+        tasks, needs = lessons.data.tasks, self._needs()
+        most = needs[tasks].max()
+        updates = 0 if self._critic_alone() else round(self.config.teacher_updates * float(most))
+        losses = lessons.learn(updates, self.generator, needs[tasks] / most) if updates else {}
+        weights = {f"Policy/teacher_weight/{self.world.task_names[task]}": needs[task] for task in tasks.tolist()}
+        return losses | weights
 
-    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, index: Tensor, needs: Tensor | None) -> Tensor:
+    def _needs(self) -> Tensor:
+        """How far each class is from ``teacher_success``, from 1 to 0: (num_tasks,)."""
+        _, _, successes, counts = all_sum(self.episodes.sums)
+        return (1.0 - successes / counts.clamp_min(_EPISODES) / self.config.teacher_success).clamp_min(0.0)
+
+    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         cfg, actor = self.config, self.policy.actor
-        means = self._means(b)
-        loss = self._loss(b, count, old_log_std, means)
+        loss = self._loss(b, count, old_log_std)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
         rest = cfg.value_loss_weight * value - cfg.entropy_weight * loss.entropy
-        numbers, imitated, taught = loss.numbers(value), None, None
-        if self.lessons is not None and needs is not None:
-            distance = self.lessons.distance(means, actor.log_std_of(b.obs), index)
-            taught = (b.weights / count * needs[b.task_id] * distance).sum()
-            rest = rest + taught
+        numbers, imitated = loss.numbers(value), None
         if self.demonstrations is not None and (weight := self._imitated()):
             imitated = self.demonstrations.loss(self.policy) / world_size()
             rest = rest + weight * imitated
@@ -258,15 +278,14 @@ class MTPPO(OnPolicy):
             rest.backward()
         else:
             (loss.surrogate + rest).backward()
-        numbers += [term.detach() for term in (taught, imitated) if term is not None]
+        if imitated is not None:
+            numbers.append(imitated.detach())
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
-    def _means(self, b: Batch) -> Tensor:
-        with autocast(self.device, self.low_precision):
-            return self.policy.actor(b.obs)
-
-    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, means: Tensor) -> PolicyLoss:
+    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PolicyLoss:
         actor = self.policy.actor
+        with autocast(self.device, self.low_precision):
+            means = actor(b.obs)
         return policy_loss(
             b.actions, means, actor.log_std_of(b.obs), b.old_means, actor.log_std_of(b.obs, old_log_std),
             b.old_log_probs, b.advantages, weights=b.weights / count, clip=self.config.clip
@@ -277,22 +296,32 @@ class MTPPO(OnPolicy):
         return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        loss = self._loss(b, count, old_log_std, self._means(b))
+        loss = self._loss(b, count, old_log_std)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
-        own = self.demonstrations
-        return super()._parts() | ({} if own is None else {"demonstrated": own.generator})
+        own, told = self.demonstrations, self.lessons
+        parts = {} if told is None else {"teacher_adam": told.adam, "label_stats": told.label_stats}
+        return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
 
     def _place(self) -> State:
         own = self.demonstrations
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
 
+    def state_dict(self) -> State:
+        """As in the base; what teachers said makes its own copy, since two of it at once may not fit."""
+        data = None if self.lessons is None else self.lessons.data
+        return super().state_dict() | ({} if data is None else {"data": data.state_dict()})
+
     def load_state_dict(self, state: State) -> None:
         """As in the base; with teachers that follow an episode from its start new ones begin."""
         super().load_state_dict(state)
-        if self.obs is not None and self.lessons is not None and self.lessons.teachers.follow:
+        if self.lessons is None or self.lessons.data is None:
+            return
+        self.lessons.data.load_state_dict(state["data"])
+        if self.obs is not None and self.lessons.teachers.follow:
             self.obs, _ = self.world.reset()
+            self.rollout.ended[-1] = True
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
