@@ -56,6 +56,15 @@ def test_ppo_forgets_what_its_reward_leads_away_from_and_keeps_it_with_a_teacher
     assert weights[0] > 0.5 and weights[-1] < 0.4
 
 
+def test_a_policy_to_start_from_gets_deviations_within_bounds_and_small_steps() -> None:
+    world, config = ToyWorld([needle, nearness(-0.5)], rows=4), replace(SMALL, critic_first=0)
+    learner = skilled(world, replace(config, std_range=(0.01, 0.05), learning_rate_range=(1e-6, 1e-3)), taught=False)
+    learner.start_from(skilled(world, config, taught=False).policy_state_dict())
+    assert float(learner.policy.actor.log_std.detach().exp().max()) == pytest.approx(0.05)
+    reported = learner.iterate()
+    assert reported["Policy/lr"] <= 1.5**3 * 1.01e-6 and reported["Policy/kl"] < 0.03
+
+
 def test_a_weight_falls_with_success_and_rises_where_it_falls() -> None:
     learner = skilled(ToyWorld([needle, nearness(-0.5)], rows=4), SMALL, taught=True)
     found = []

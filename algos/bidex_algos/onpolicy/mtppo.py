@@ -182,9 +182,14 @@ class MTPPO(OnPolicy):
         self.balance = balances[config.gradient_surgery]()
 
     def start_from(self, policy: State) -> None:
-        """As in the base; deviations begin within ``std_range``, where each update leaves them."""
+        """As in the base; deviations begin within ``std_range``, an adaptive step size at its least.
+
+        A KL is known after a step alone: the first update of a policy of DAgger's had one of 187 from 3e-4.
+        """
         super().start_from(policy)
         self._bound_std()
+        if self.config.adaptive_learning_rate:
+            self.adams.rate.fill_(self.adams.bounds[0])
 
     @torch.no_grad()
     def _bound_std(self) -> None:
