@@ -115,9 +115,9 @@ class RunConfig(Generic[LearnerSettings]):
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
     --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
     teacher: Several = ()
-    """With --algo dagger and icl: who labels what the student comes to. scripts: the scripts of all classes that have
-    one; or the folder of a run on the same suite, or on one of its classes alone. Given several times: each class takes
-    the first that knows it."""
+    """With --algo dagger, icl, mtppo and ppo: who labels what the policy comes to. scripts: the scripts of all classes
+    that have one; or the folder of a run on the same suite, or on one of its classes alone. Given several times: each
+    class takes the first that knows it."""
     record: Steps = 0
     """Keep about so many transitions of the training as the data set replay/ in the run's folder, whole episodes of
     some of the environments (docs/data.md). 0: none."""

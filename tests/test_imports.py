@@ -14,7 +14,7 @@ from tests.pages import PAGES, ROOT
 
 PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in (bidex_meta, bidex_algos)}
 
-SHARED = ("advantages", "balancing", "nets", "replay", "rollout", "trust_region")
+SHARED = ("advantages", "balancing", "labelled", "nets", "replay", "rollout", "trust_region")
 """What learners share."""
 
 ORDER = (

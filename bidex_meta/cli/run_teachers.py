@@ -32,13 +32,13 @@ def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
 
 def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None:
     """Refuses teachers that do not go with the learner or its worlds, before anything is built."""
-    if not kind.make.taught:
-        if config.teacher:
-            takers = ", ".join(name for name in ALGOS if learner_kind(name).make.taught)
-            raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
-        return
     if not config.teacher:
-        raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
+        if kind.make.taught:
+            raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
+        return
+    if not _takes(kind):
+        takers = ", ".join(name for name in ALGOS if _takes(learner_kind(name)))
+        raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
     if source.hides_goals and not kind.make.adapts:
         raise BidexError(
             f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite, or take "
@@ -48,6 +48,10 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
         raise BidexError("--teacher scripts reads states of C MuJoCo. Add --device cpu, and leave --engine out.")
     if not teacher_of_class(config.teacher, source):
         raise BidexError(f"No class of {source.name} has a teacher among {', '.join(config.teacher)}. Name another.")
+
+
+def _takes(kind: LearnerKind) -> bool:
+    return kind.make.taught or kind.make.imitates
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
@@ -116,7 +120,8 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
             width = classes[learn[0]].observation_size if single else int(world.single_observation_space.shape[0])
             tutors.append(Tutor(policy, rows, width))
     if untaught := [task for task in classes if task not in assigned]:
-        say(f"Without a teacher, and not learned: {', '.join(untaught)}.")
+        rest = ", and not learned" * learner_kind(config.algo).make.taught
+        say(f"Without a teacher{rest}: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     inner: Any = getattr(world, "unwrapped", world)  # without a recorder
     hidden = HiddenParts(inner) if source.hides_goals else None

@@ -57,9 +57,10 @@ class Learner(ABC):
     offline: ClassVar[bool] = False
     """Whether it learns from data sets (:meth:`learn_from`) and never steps the world."""
     imitates: ClassVar[bool] = False
-    """Whether it takes demonstrations while it learns by playing (:meth:`learn_from_demonstrations`)."""
+    """Whether it may take demonstrations and teachers while it learns by playing (:meth:`learn_from_demonstrations`,
+    :meth:`learn_from_teachers`)."""
     taught: ClassVar[bool] = False
-    """Whether it plays and teachers label what it comes to (:meth:`learn_from_teachers`)."""
+    """Whether teachers are all that it learns from: it plays, they label what it comes to."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int

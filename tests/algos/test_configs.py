@@ -12,7 +12,8 @@ WRONG: dict[str, dict[str, Any]] = {
         "epochs": 0, "gamma": 1.5, "std_range": (1.0, 0.5), "clip": -0.2, "max_grad_norm": -1.0, "cagrad_radius": 1.0,
         "demonstration_weight": -0.1, "demonstration_half_life": 0.0, "demonstration_batch": 0, "modules": 0,
         "demonstration_cloning": -1, "critic_first": -1, "points_read": -1, "task_embedding": -1,
-        "point_widths": (8, 0),
+        "point_widths": (8, 0), "teacher_updates": -1, "teacher_success": 0.0, "teacher_learning_rate": 0.0,
+        "teacher_batch": 0, "teacher_samples": 0,
     },
     "mttrpo": {"max_kl": 0.0, "backtrack_factor": 1.5, "fisher_stride": 0, "cg_iterations": 0, "damping": -1.0},
     "mtsac": {

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.imitation.dagger import DAgger, DAggerConfig
-from bidex_algos.imitation.labelled import Labelled
+from bidex_algos.labelled import Labelled
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.witness.teachers import Teachers, Tutor
@@ -90,8 +90,8 @@ def test_a_class_without_a_teacher_is_played_by_the_student_and_not_learned() ->
     assert reported["Policy/teacher_share"] == 0.5 and "Loss/imitation/task0" in reported
     assert (
         "Loss/imitation/task1" not in reported
-        and learner.data is not None
-        and learner.data.rows.tolist() == [*range(8)]
+        and learner.lessons.data is not None
+        and learner.lessons.data.rows.tolist() == [*range(8)]
     )
 
 
@@ -163,7 +163,7 @@ def test_with_teachers_that_follow_a_resumed_run_begins_new_episodes_in_all_rows
     again.load_state_dict(state)
     assert bool((again.world.episodes.elapsed == 0).all()) and again.env_steps == learner.env_steps
     assert torch.equal(again.world.episodes.number, learner.world.episodes.number + 1)
-    assert again.data is not None and again.data.added == 8
+    assert again.lessons.data is not None and again.lessons.data.added == 8
     again.iterate()
 
 

@@ -20,7 +20,10 @@ SMALL: dict[str, Any] = {
     "vae_hidden": (8,),
 }  # fmt: skip
 VARIANTS: dict[str, list[dict[str, Any]]] = {
-    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
+    "mtppo": [
+        {}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1},
+        {"teacher_updates": 2},
+    ],
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
     **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "ddpg", "rl2", "bc", "bcq", "td3bc", "iql")},
     "dagger": [{}], "icl": [{"trials": 32, "memory": 8}],
@@ -42,7 +45,7 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         if known.get("demonstration_weight") or kind.make.offline:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
             (learner.learn_from if kind.make.offline else learner.learn_from_demonstrations)(data)
-        if kind.make.taught:
+        if kind.make.taught or known.get("teacher_updates"):
             rows, width = torch.arange(world.num_envs), world.single_observation_space.shape[0]
             learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)]))
         for _ in range(3):

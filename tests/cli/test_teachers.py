@@ -76,12 +76,24 @@ def test_a_memory_learns_from_scripts_and_a_run_what_a_suite_hides(
     assert row["Loss/goal"] > 0.0 and {"Loss/imitation/Switch", "Loss/imitation/PushBlock"} < set(row)
 
 
+def test_ppo_starts_from_a_student_has_its_teachers_and_is_resumed(student: Path, tmp_path: Path) -> None:
+    words = f"--algo ppo --num-envs 4 --threads 1 --device cpu --logger none --learner.hidden 32 --start-from {student}"
+    words += f" --teacher scripts --learner.std-range 0.01 0.05 --learner.critic-first 32 --run-dir {tmp_path / 'r'}"
+    assert main(["run", "--task", "Switch-v2", *words.split(), "--steps", "96", "--no-evaluate"]) == 0
+    assert main(["run", "--resume", str(tmp_path / "r"), "--steps", "128", "--no-evaluate"]) == 0
+    rows = read_metrics(tmp_path / "r" / "metrics.jsonl")
+    assert [row["step"] for row in rows] == [32, 64, 96, 128]
+    assert all(row["Policy/teacher_weight/Switch-v2"] == 1.0 for row in rows)
+    assert "Loss/imitation" not in rows[0] and all(row["Loss/imitation"] > 0.0 for row in rows[1:])
+    assert rows[0]["Policy/kl"] == 0.0 and rows[0]["Policy/std"] == pytest.approx(0.05)
+
+
 def test_teachers_that_do_not_fit_are_refused(student: Path, refused: Command) -> None:
     def told(*words: object) -> str:
         return refused("run", "--device", "cpu", *words)
 
     assert "Add --teacher scripts" in told("--suite", "MT4-v2", "--algo", "dagger")
-    assert "goes with dagger, icl" in told("--suite", "MT4-v2", "--algo", "mtppo", "--teacher", "scripts")
+    assert "goes with mtppo, ppo, dagger, icl" in told("--suite", "MT4-v2", "--algo", "mtsac", "--teacher", "scripts")
     assert "No class of MT1 has" in told("--suite", "MT1", "--algo", "dagger", "--teacher", "scripts")
     assert "that ML20-v2 hides" in told("--suite", "ML20-v2", "--algo", "dagger", "--teacher", "scripts")
     for words in (("--suite", "MT4-v2"), ("--task", "Switch")):

@@ -17,12 +17,14 @@ from bidex_algos.nets.architecture import Options
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
+from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
+from bidex_meta.train.distributed import all_sum, own_seed, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
+from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -47,6 +49,14 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     demonstration_half_life: Positive = 500_000.0  # Environment steps in which that weight falls to half.
     demonstration_batch: Count = 256  # Transitions of them in each mini-batch, of each process.
     demonstration_cloning: Whole = 0  # Steps of so many of them in which the policy is cloned before it plays.
+    teacher_updates: Whole = 20
+    """With --teacher: DAgger's updates after each of PPO's, while a taught class never succeeds; 0: none."""
+    teacher_success: Positive = 0.8
+    """Success of a class's last 100 episodes from which its teacher counts nothing; up to there its weight falls in a
+    line, and it rises again where success falls."""
+    teacher_learning_rate: Positive = 5e-4  # Adam's step size in these updates.
+    teacher_batch: Count = 1024  # Labelled observations of such an update, split evenly over the taught classes.
+    teacher_samples: Count = 500_000  # Labelled observations that each process keeps; the oldest go first.
     critic_first: Whole = 0
     """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
     or of --start-from), which a critic that knows nothing would spoil."""
@@ -86,6 +96,9 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
     },
 }
 
+
+# The first few episodes that end say little: until there are so many, the missing ones count as failures.
+_EPISODES = 20.0
 
 _DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
 
@@ -154,6 +167,7 @@ class MTPPO(OnPolicy):
     imitates = True
     config: MTPPOConfig
     demonstrations: Demonstrations | None = None
+    lessons: Lessons | None = None
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
@@ -167,16 +181,46 @@ class MTPPO(OnPolicy):
         }
         self.balance = balances[config.gradient_surgery]()
 
+    def start_from(self, policy: State) -> None:
+        """As in the base; deviations begin within ``std_range``, an adaptive step size at its least.
+
+        A KL is known after a step alone: the first update of a policy of DAgger's had one of 187 from 3e-4.
+        """
+        super().start_from(policy)
+        self._bound_std()
+        if self.config.adaptive_learning_rate:
+            self.adams.rate.fill_(self.adams.bounds[0])
+
+    @torch.no_grad()
+    def _bound_std(self) -> None:
+        low, high = (math.log(std) for std in self.config.std_range)
+        self.policy.actor.log_std.clamp_(low, high)
+
     def learn_from_demonstrations(self, data: Joined) -> None:
         """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
-        self.per_process = (*OnPolicy.per_process, "demonstrated")
+        self.per_process = (*self.per_process, "demonstrated")
+
+    def learn_from_teachers(self, teachers: Teachers) -> None:
+        """Takes who labels the states that the policy comes to, likewise."""
+        cfg = self.config
+        self.lessons = Lessons(self.world, self.policy, cfg.teacher_learning_rate, cfg.max_grad_norm)
+        self.lessons.begin(teachers, cfg.teacher_samples, cfg.rollout_steps, cfg.teacher_batch)
+        self.per_process = (*self.per_process, "data")
+        self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
             self.demonstrations.clone(self.policy)
         self.policy.observations.settled = self._critic_alone()
         return super()._iterate()
+
+    def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        if self.lessons is not None and self.lessons.data is not None:
+            step = self.lessons.data.added % self.config.rollout_steps
+            self.lessons.teachers.reset(self.rollout.ended[step - 1])
+            self.lessons.label(obs)
+        return super()._sample(obs)
 
     def _imitated(self) -> float:
         return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
@@ -190,14 +234,14 @@ class MTPPO(OnPolicy):
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
         old_log_std = actor.log_std.detach().clone()
-        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
+        measured = list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             measured.append(self._gradients(part, count, old_log_std))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
-            with torch.no_grad():
-                actor.log_std.clamp_(low, high)
-                if self.balance is not None:
+            self._bound_std()
+            if self.balance is not None:
+                with torch.no_grad():
                     self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
         names += ["Loss/demonstrations"] * bool(self._imitated())
@@ -205,7 +249,23 @@ class MTPPO(OnPolicy):
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
             reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
-        return reported
+        return reported | ({} if self.lessons is None else self._take(self.lessons))
+
+    def _take(self, lessons: Lessons) -> dict[str, Tensor]:
+        """Learns from teachers what the classes that fail need of it; nothing while the critic learns alone."""
+        assert lessons.data is not None
+        lessons.take_moments(self.config.rollout_steps)
+        tasks, needs = lessons.data.tasks, self._needs()
+        most = needs[tasks].max()
+        updates = 0 if self._critic_alone() else round(self.config.teacher_updates * float(most))
+        losses = lessons.learn(updates, self.generator, needs[tasks] / most) if updates else {}
+        weights = {f"Policy/teacher_weight/{self.world.task_names[task]}": needs[task] for task in tasks.tolist()}
+        return losses | weights
+
+    def _needs(self) -> Tensor:
+        """How far each class is from ``teacher_success``, from 1 to 0: (num_tasks,)."""
+        _, _, successes, counts = all_sum(self.episodes.sums)
+        return (1.0 - successes / counts.clamp_min(_EPISODES) / self.config.teacher_success).clamp_min(0.0)
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         cfg, actor = self.config, self.policy.actor
@@ -245,12 +305,28 @@ class MTPPO(OnPolicy):
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
-        own = self.demonstrations
-        return super()._parts() | ({} if own is None else {"demonstrated": own.generator})
+        own, told = self.demonstrations, self.lessons
+        parts = {} if told is None else {"teacher_adam": told.adam, "label_stats": told.label_stats}
+        return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
 
     def _place(self) -> State:
         own = self.demonstrations
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
+
+    def state_dict(self) -> State:
+        """As in the base; what teachers said makes its own copy, since two of it at once may not fit."""
+        data = None if self.lessons is None else self.lessons.data
+        return super().state_dict() | ({} if data is None else {"data": data.state_dict()})
+
+    def load_state_dict(self, state: State) -> None:
+        """As in the base; with teachers that follow an episode from its start new ones begin."""
+        super().load_state_dict(state)
+        if self.lessons is None or self.lessons.data is None:
+            return
+        self.lessons.data.load_state_dict(state["data"])
+        if self.obs is not None and self.lessons.teachers.follow:
+            self.obs, _ = self.world.reset()
+            self.rollout.ended[-1] = True
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)

@@ -1,0 +1,88 @@
+"""What teachers say, kept, and the steps that bring a policy there: all of DAgger's learning, and beside PPO's."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.labelled import Labelled
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.policy import GaussianPolicy
+from bidex_meta.train.distributed import pool_moments, sum_gradients, world_size
+from bidex_meta.witness.teachers import Teachers
+from bidex_meta.world.contract import VectorWorld
+
+# Added to the deviation of an action of a class's labels: entries that a teacher hardly moves must not outweigh all
+# others. It is 1.5 % of an action's range, and of a finger joint about 0.02 rad.
+_FLOOR = 0.03
+
+
+class Lessons:
+    """Labelled observations of a world, and an optimiser of the mean of ``policy``; deviations stay as they are.
+
+    The error of an action counts in units of its variance among the labels of its class, and all classes alike.
+    """
+
+    teachers: Teachers
+    data: Labelled | None = None
+
+    def __init__(self, world: VectorWorld, policy: GaussianPolicy, learning_rate: float, max_grad_norm: float):
+        self.world, self.policy, self.max_grad_norm = world, policy, max_grad_norm
+        self.adam = torch.optim.Adam(policy.actor.mean.parameters(), lr=learning_rate, fused=True)
+        (actions,) = world.single_action_space.shape
+        self.label_stats = RunningStats((world.num_tasks, actions)).to(world.device)
+
+    def begin(self, teachers: Teachers, samples: int, least_steps: int, batch_size: int) -> None:
+        """Takes who labels; keeps the newest ``samples``, and of each environment ``least_steps`` or more."""
+        (actions,), (observations,) = self.world.single_action_space.shape, self.world.single_observation_space.shape
+        rows = teachers.known.nonzero().squeeze(1)
+        steps = max(least_steps, samples // len(rows))
+        self.teachers = teachers
+        self.data = Labelled(steps, rows, self.world.task_id[rows], observations, actions)
+        self.batch_per_task = math.ceil(batch_size / len(self.data.tasks))
+
+    @torch.no_grad()
+    def label(self, obs: Tensor) -> Tensor:
+        """Asks for raw observations (N, d) of a step, and keeps what is said: actions (N, a)."""
+        assert self.data is not None
+        labels = self.teachers.eval_action(obs)
+        self.data.add(obs, labels)
+        return labels
+
+    @torch.no_grad()
+    def take_moments(self, steps: int) -> None:
+        """Takes the labels of the last steps into the statistics of their classes."""
+        assert self.data is not None
+        mean, var, count = self.label_stats.mean.new_zeros(3, *self.label_stats.mean.shape)
+        for task, labels in zip(self.data.tasks.tolist(), self.data.of_last(steps), strict=True):
+            var[task], mean[task] = torch.var_mean(labels.double(), dim=0, correction=0)
+            count[task] = len(labels)
+        self.label_stats.merge(*pool_moments(mean, var, count))
+
+    def learn(self, updates: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
+        """So many steps down the mean of the classes' losses, weighted (K,); these losses before the weights."""
+        assert self.data is not None
+        data, device = self.data, generator.device
+        tasks = data.tasks.repeat_interleave(self.batch_per_task)
+        unit, losses = self.label_stats.std(_FLOOR).float()[tasks], list[Tensor]()
+        for places in data.draw(updates, self.batch_per_task, generator):
+            obs, labels = data.take(places)
+            obs = self.policy.observations(obs)
+            with autocast(device, self.policy.low_precision):
+                means = self.policy.actor(obs)
+            of_class = ((means - labels) / unit).square().mean(1).view(len(data.tasks), -1).mean(1)
+            losses.append(self._descend(of_class / world_size(), weights))
+        of_class = torch.stack(losses).mean(0)
+        names = [f"Loss/imitation/{self.world.task_names[task]}" for task in data.tasks.tolist()]
+        return {"Loss/imitation": of_class.mean(), **dict(zip(names, of_class, strict=True))}
+
+    def _descend(self, of_class: Tensor, weights: Tensor | None) -> Tensor:
+        """A step, summed over processes; the classes' losses (K,)."""
+        parameters = list(self.policy.actor.mean.parameters())
+        self.adam.zero_grad()
+        (of_class if weights is None else weights * of_class).mean().backward()
+        of_class = sum_gradients(parameters, of_class.detach())
+        nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.adam.step()
+        return of_class
