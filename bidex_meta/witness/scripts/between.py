@@ -18,19 +18,23 @@ class Take:
     """How two hands take a thing; metres.
 
     ``ahead``, ``above``: from the thing to the hands' points along x and z; ``high``: of the hands' points where they
-    pass over everything; ``apart``: from the thing to each hand's point along y before they close. ``joints``: one of
-    the right and one of the left hand that gives way to what it presses: its angle while ``free``, and while the thing
-    is ``firm``ly held, rad.
+    pass over everything; ``apart``: from the thing to each hand's point along y before they close; ``aim``: how far off
+    their middle may be as they go down. ``joints``: one of the right and one of the left hand that gives way to what it
+    presses: its angle while ``free``, and while the thing is ``firm``ly held, rad. The hands close until it is. A base
+    that presses by itself holds too hard or too loosely: a newton is 0.1 to 0.3 % of its range.
     """
 
     ahead: float
     above: float
     high: float
     apart: float
+    aim: float
     joints: tuple[str, str]
     free: tuple[float, float]
     firm: tuple[float, float]
-    closing: float = 0.015  # of a hand that does not hold anything, in 1 / GAIN
+
+
+_CLOSING = 0.015  # how far ahead a hand is led that does not press yet, metres
 
 
 def ramp(value: float, first: float, last: float) -> float:
@@ -56,7 +60,11 @@ class Between:
             (float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free)
             for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True)
         )
-        near = ramp(self.off, 0.05, 0.03) * ramp(abs(self.over), 0.05, 0.035) * ramp(self.half, self.apart + 0.01, self.apart)
+        near = (
+            ramp(self.off, 0.05, 0.03)
+            * ramp(abs(self.over), 0.05, 0.035)
+            * ramp(self.half, self.apart + 0.01, self.apart)
+        )
         self.held = near * ramp(self.firm, 0.15, 0.35)
 
     def far(self, goal: Tensor) -> float:
@@ -83,19 +91,21 @@ class Between:
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
 
     def _close(self) -> float:
-        return self.half - self.take.closing * (1.0 - min(2.0, self.firm))
+        """Half the distance to which the hands are led to hold the thing firmly."""
+        return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
         """From above to both sides of the thing, and closer until it is held."""
         take, (x, y, height) = self.take, self.middle
         near = max(ramp(self.off, 0.06, 0.04), ramp(height, take.high - 0.03, take.high - 0.01))
         low = self.thing[2] + take.above
-        over = self._rise(low + (take.high - low) * ramp(self.off, 0.012, 0.04))
-        close = ramp(self.off, 0.03, 0.015) * ramp(self.over, 0.035, 0.015)
+        over = self._rise(low + (take.high - low) * ramp(self.off, take.aim, take.aim + 0.03))
+        close = ramp(self.off, take.aim + 0.018, take.aim + 0.003) * ramp(self.over, 0.035, 0.015)
         half = self.apart + close * (self._close() - self.apart)
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
+        """Up first, then over the place, then down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far, up = math.hypot(*way), self.thing[2]

@@ -1,14 +1,14 @@
-"""Scripted policy of version 2 for two blocks that are stacked at a given place in a given order."""
-
-import math
+"""Scripted policy for two blocks that are stacked at a given place, in version 2 in a given order."""
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.between import Between, Take, ramp
 
-_BENT = 1.3  # of the knuckles, rad: the fingers point down, and give way to what their backs press
-_TAKE = Take(0.0, 0.065, 0.765, 0.097, ("MFJ2", "MFJ2"), (_BENT, _BENT), (_BENT + 0.1, _BENT + 0.1))
-_LIES, _EDGE = 0.629, 0.05
+# Bend of the knuckles, rad: the fingers point down, and give way to what their backs press. About 2 N are enough; more
+# turn the hands, whose torque is weak.
+_BENT, _FIRM = 1.3, 1.4
+_TAKE = Take(0.0, 0.065, 0.765, 0.097, 0.012, ("MFJ2", "MFJ2"), (_BENT, _BENT), (_FIRM, _FIRM))
+_LIES, _EDGE = 0.629, 0.05  # height of a block on the table; a block's edge, metres
 
 
 def stack_in_order(hands: HandController) -> Actions:
