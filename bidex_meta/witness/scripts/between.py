@@ -74,11 +74,13 @@ class Between:
     def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
         """Where the hands go to take the thing to a place, at a height ``carried``, and to set it down at another."""
         aside, held = self._get(), self._bring(goal, carried, lowered)
-        return self._points(*(a + self.held * (b - a) for a, b in zip(aside, held, strict=True)))
+        x, y, z, half = (a + self.held * (b - a) for a, b in zip(aside, held, strict=True))
+        return self._points(x, y, z, half)
 
     def leave(self) -> tuple[Point, Point]:
         """Where the hands go to let go of what they hold, and up."""
-        return self._points(*self.middle[:2], self._rise(self.take.high), self.apart)
+        x, y, _ = self.middle
+        return self._points(x, y, self._rise(self.take.high), self.apart)
 
     @staticmethod
     def _points(x: float, y: float, z: float, half: float) -> tuple[Point, Point]:
