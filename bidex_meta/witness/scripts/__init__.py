@@ -6,7 +6,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.suite import Rules
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
-from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
+from bidex_meta.witness.scripts.blocks import push_blocks
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.carrying import carry_egg
 from bidex_meta.witness.scripts.placing import place_in_bucket
@@ -21,11 +21,11 @@ Script = Callable[[HandController], Actions]
 SCRIPTS: dict[str, Script] = {
     "DoorCloseOutward": close_outward,
     "DoorOpenInward": open_inward,
-    "GraspAndPlace": grasp_and_place,
+    "GraspAndPlace": place_in_bucket,
     "LiftUnderarm": lift_underarm,
     "PourWater": pour_water,
     "ReOrientation": turn_cubes,
-    "StackBlock": stack_block,
+    "StackBlock": stack_in_order,
 }
 """Of version 1; they play version 2 too."""
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
@@ -33,12 +33,10 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "CatchUnderarm": carry_egg,
     "DoorCloseInward": push,
     "DoorOpenOutward": push,
-    "GraspAndPlace": place_in_bucket,
     "HandOver": carry_egg,
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
     "PushBlock": push_blocks,
-    "StackBlock": stack_in_order,
     "SwingCup": swing_cup,
     "Switch": press_switches,
 }

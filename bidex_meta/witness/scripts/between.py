@@ -1,56 +1,117 @@
-"""What policies share that carry a thing between both hands, one on either side of it along y."""
+"""What policies share that carry a thing between both hands, one on either side of it along y.
 
-import torch
+All is a function of the present state, and changes little where the state does: a policy without memory can learn it,
+and who comes late or drops the thing goes on from there.
+"""
+
+import math
+from dataclasses import dataclass
+
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.witness.controller import Actions, HandController, Point
-
-PRESS = 0.002  # distance inside what a hand presses to which it is led, metres: about 8 N
+from bidex_meta.witness.controller import HandController, Point, point
 
 
-def move(hands: HandController, what: str, goal: Tensor, height: float, far: float, press: float = PRESS) -> Actions:
-    """Carries what is clamped to a goal, at most ``far`` metres ahead of it; ends too where it is lost."""
-    for _ in range(100):
-        place = hands.where(what)
-        way = goal[:2] - place[:2]
-        if float(way.norm()) < 0.01 or float(hands.at("right")[2] - place[2]) > 0.09:
-            break
-        way *= min(1.0, far / float(way.norm()))
-        yield from clamp(hands, middle(hands) + way, height, press=press)
+@dataclass(frozen=True)
+class Take:
+    """How two hands take a thing; metres.
+
+    ``ahead``, ``above``: from the thing to the hands' points along x and z; ``high``: of the hands' points where they
+    pass over everything; ``apart``: from the thing to each hand's point along y before they close; ``aim``: how far off
+    their middle may be as they go down. ``joints``: one of the right and one of the left hand that gives way to what it
+    presses: its angle while ``free``, and while the thing is ``firm``ly held, rad. The hands close until it is. A base
+    that presses by itself holds too hard or too loosely: a newton is 0.1 to 0.3 % of its range.
+    """
+
+    ahead: float
+    above: float
+    high: float
+    apart: float
+    aim: float
+    joints: tuple[str, str]
+    free: tuple[float, float]
+    firm: tuple[float, float]
 
 
-def around(
-    hands: HandController, place: Tensor, ahead: float, half: float, height: float, steps: int, speed: float = 0.6
-) -> Actions:
-    """Leads the hands to both sides of a place: ``half`` metres beside it in y, ``ahead`` of it in x."""
-    x, y = float(place[0]) + ahead, float(place[1])
-    yield from reach(hands, (x, y + half, height), (x, y - half, height), steps, speed)
+_CLOSING = 0.015  # how far ahead a hand is led that does not press yet, metres
 
 
-def reach(hands: HandController, right: Point, left: Point, steps: int, speed: float = 0.6) -> Actions:
-    """Leads the hands to two points until both are there."""
-    goals = torch.tensor([right, left])
-    for _ in range(steps):
-        off = torch.stack([hands.at(side) for side in SIDES]) - goals
-        if float(off.norm(dim=1).max()) < 0.01:
-            break
-        yield from hands.lead(right, left, 1, speed)
+def ramp(value: float, first: float, last: float) -> float:
+    """0 at ``first`` and before, 1 at ``last`` and beyond, linear between."""
+    return min(1.0, max(0.0, (value - first) / (last - first)))
 
 
-def middle(hands: HandController) -> Tensor:
-    """Horizontal place between the hands, (2,)."""
-    return 0.5 * (hands.at("right") + hands.at("left"))[:2]
+class Between:
+    """Both hands and a thing that they take, as they are now."""
 
+    def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
+        """``room``: of each hand's point at most so far from the thing before they close, metres."""
+        right, left = (min(take.apart, each) for each in room)
+        self.take, self.apart = take, 0.5 * (right + left)
+        self.right, self.left = (point(hands.at(side)) for side in SIDES)
+        self.thing = x, y, z = point(hands.where(f"{thing}/position"))
+        self.half = 0.5 * (self.right[1] - self.left[1])
+        self.middle = tuple(0.5 * (a + b) for a, b in zip(self.right, self.left, strict=True))
+        aside = 0.5 * (right - left) * ramp(self.half, self.apart - 0.02, self.apart - 0.005)
+        self.way = x + take.ahead - self.middle[0], y + aside - self.middle[1]
+        self.off, self.over = math.hypot(*self.way), self.middle[2] - z - take.above
+        self.firm = min(
+            (float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free)
+            for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True)
+        )
+        near = (
+            ramp(self.off, 0.05, 0.03)
+            * ramp(abs(self.over), 0.05, 0.035)
+            * ramp(self.half, self.apart + 0.01, self.apart)
+        )
+        self.held = near * ramp(self.firm, 0.15, 0.35)
 
-def clamp(
-    hands: HandController, place: Tensor, height: float, steps: int = 1, ahead: float = 0.0, press: float = PRESS
-) -> Actions:
-    """Presses the hands together, whatever lies between them, and moves their middle to a place."""
-    x, y = float(place[0]) + ahead, float(place[1])
-    for _ in range(steps):
-        right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
-        way = y - 0.5 * (right + left)
-        now = 0.5 * float(hands.at("right")[2] + hands.at("left")[2])
-        z = max(now - 0.04, min(now + 0.04, height))  # lead slows a faster hand down, press and all
-        yield from hands.lead((x, right + way - press, z), (x, left + way + press, z))
+    def far(self, goal: Tensor) -> float:
+        """Horizontal distance of the thing from a place, metres."""
+        return math.hypot(float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1])
+
+    def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
+        """Where the hands go to take the thing to a place, at a height ``carried``, and to set it down at another."""
+        aside, held = self._get(), self._bring(goal, carried, lowered)
+        x, y, z, half = (a + self.held * (b - a) for a, b in zip(aside, held, strict=True))
+        return self._points(x, y, z, half)
+
+    def leave(self) -> tuple[Point, Point]:
+        """Where the hands go to let go of what they hold, and up."""
+        x, y, _ = self.middle
+        return self._points(x, y, self._rise(self.take.high), self.apart)
+
+    @staticmethod
+    def _points(x: float, y: float, z: float, half: float) -> tuple[Point, Point]:
+        return (x, y + half, z), (x, y - half, z)
+
+    def _rise(self, height: float) -> float:
+        """A height to go to; upwards only once the hands are apart, since else they take along what they touch."""
+        way = height - self.middle[2]
+        apart = ramp(self.half, self.apart - 0.02, self.apart - 0.005)
+        return self.middle[2] + way * (apart if way > 0.0 else 1.0)
+
+    def _close(self) -> float:
+        """Half the distance to which the hands are led to hold the thing firmly."""
+        return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
+
+    def _get(self) -> tuple[float, float, float, float]:
+        """From above to both sides of the thing, and closer until it is held."""
+        take, (x, y, height) = self.take, self.middle
+        near = max(ramp(self.off, 0.06, 0.04), ramp(height, take.high - 0.03, take.high - 0.01))
+        low = self.thing[2] + take.above
+        over = self._rise(low + (take.high - low) * ramp(self.off, take.aim, take.aim + 0.03))
+        close = ramp(self.off, take.aim + 0.018, take.aim + 0.003) * ramp(self.over, 0.035, 0.015)
+        half = self.apart + close * (self._close() - self.apart)
+        return x + near * self.way[0], y + near * self.way[1], over, half
+
+    def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
+        """Up first, then over the place, then down."""
+        x, y, height = self.middle
+        way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
+        far, up = math.hypot(*way), self.thing[2]
+        share = max(ramp(up, carried - 0.012, carried - 0.004), ramp(far, 0.02, 0.012)) * min(1.0, 0.04 / (far + 1e-9))
+        wanted = lowered + (carried - lowered) * ramp(far, 0.007, 0.018)
+        rise = max(-0.03, min(0.03, wanted - up)) * ramp(self.firm, 0.4, 0.8)
+        return x + share * way[0], y + share * way[1], height + rise, self._close()

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, Point, point
+from bidex_meta.witness.scripts.between import ramp
 
 _LEVER = 0.035  # from a rocker's hinge to its button, metres
 
@@ -51,39 +52,37 @@ def _tip(hands: HandController, side: str, target: Tensor, height: float, finger
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
 
+_ENDS = {"right": "pen/cap_position", "left": "pen/body_position"}
+
+
 def open_pen(hands: HandController) -> Actions:
     """Both hands close around the pen, at body and cap, and move apart to the gap asked for."""
     gap = float(hands.frozen("gap"))
-    along = hands.where("pen/cap_position") - hands.where("pen/body_position")
-    yaw = math.atan2(-float(along[0]), float(along[1]))
-    ends = {"right": "pen/cap_position", "left": "pen/body_position"}
-
-    def above(height: float, steps: int, speed: float) -> Actions:
-        for _ in range(steps):
-            yield from hands.lead_each((_over(hands.where(ends[side]), height) for side in SIDES), speed)
-
-    def bend(knuckles: float, middles: float) -> None:
-        for side in SIDES:
-            hands.bend(side, knuckles, middles, THJ3=0.6, THJ4=0.6)
-            hands.hold(side, yaw=yaw)
-
-    bend(0.6, 0.6)
-    yield from above(0.06, 20, 1.6)
-    bend(0.9, 1.0)
-    yield from above(0.025, 8, 0.6)
-    bend(1.5, 1.57)
-    yield from above(0.02, 12, 0.4)
     while hands.steps_left:
-        body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
-        out = (cap - body) / (cap - body).norm()
-        way = max(-0.04, min(0.04, 0.6 * (gap - float((cap - body).norm()))))
-        right, left = hands.at("right") + way * out, hands.at("left") - way * out
-        yield from hands.lead((float(right[0]), float(right[1]), 0.65), (float(left[0]), float(left[1]), 0.65))
+        out = hands.where(_ENDS["right"]) - hands.where(_ENDS["left"])
+        now = float(out.norm())
+        yaw = math.atan2(-float(out[0]), float(out[1]))
+        closed = min(ramp(float(hands.where(f"{side}/MFJ2_position")), 1.0, 1.15) for side in SIDES)
+        way = closed * max(-0.04, min(0.04, 0.6 * (gap - now)))
+        points = []
+        for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+            hands.hold(side, yaw=yaw)
+            points.append(_around(hands, side, out / now, sign * way, closed))
+        yield from hands.lead_each(points, 1.6)
 
 
-def _over(place: Tensor, height: float) -> Point:
-    """The hand's point whose fingers close around a pen at this place."""
-    return float(place[0]) - 0.008, float(place[1]), float(place[2]) + height
+def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
+    """Goes down to an end of the pen, closes around it, and then goes so far along it."""
+    end, at = hands.where(_ENDS[side]).clone(), hands.at(side)
+    end[0] -= 0.008
+    over = float(at[2] - end[2])
+    off = float((end - at)[:2].norm())
+    near = ramp(off, 0.04, 0.015)
+    fist = max(ramp(float(hands.where(f"{side}/MFJ2_position")), 1.05, 1.2), near * ramp(over, 0.054, 0.046))
+    hands.bend(side, 0.6 + 0.3 * near + 0.6 * fist, 0.6 + 0.4 * near + 0.57 * fist, THJ3=0.6, THJ4=0.6)
+    goal = at + way * along + (1.0 - closed) * (end - at)
+    above = float(end[2]) + 0.06 - 0.04 * near
+    return float(goal[0]), float(goal[1]), above + closed * (0.65 - above)
 
 
 _HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
