@@ -101,6 +101,10 @@ _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
 
 
+_DROPPED = 0.25
+"""Height of the bottle below which it no longer lies in the hand, metres: half of where it starts."""
+
+
 class BottleCap(OwnObjectClass):
     """Pull the cap off a bottle that lies in the right hand, with the left.
 
@@ -177,6 +181,11 @@ class BottleCap(OwnObjectClass):
 
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state)) if self.rules.wide else state["bottle/slide"][:, 0] > 0.03
+
+    def failed(self, state: TaskState) -> Tensor:
+        """With wide variation: the bottle was dropped. On the table it may spin so fast that it gains energy."""
+        dropped = state["bottle/position"][:, 2] < _DROPPED
+        return dropped & self.rules.wide
 
 
 _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
