@@ -16,7 +16,7 @@ from tests.algos.families import PointClass, PointGoals, circle, everyone, playe
 
 SMALL = ICLConfig(
     hidden=(32,), memory=64, head=(32,), init_std=0.3, try_steps=4, episodes_per_trial=2, updates_per_iteration=40,
-    batch_size=256, batch_trials=32, trials=320, learning_rate=6e-3, teacher_steps=10_000,
+    batch_size=256, batch_trials=32, goals=3, trials=320, learning_rate=6e-3, teacher_steps=10_000,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 
