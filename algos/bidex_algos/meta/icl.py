@@ -184,7 +184,7 @@ class ICL(TrialLearner):
         weights = list(actor.parameters())
         self.adam.zero_grad()
         losses.mean(1).sum().backward()
-        losses = sum_gradients(weights, losses.detach())
+        losses = sum_gradients(weights, losses.detach().flatten()).view_as(losses)
         memory = nn.ModuleList([actor.encoder, actor.weigh, actor.note, actor.belief])
         for part in (actor.head, actor.doubt, memory):  # of one loss each
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
