@@ -43,6 +43,7 @@ TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
     ("mappo", {"popart": True, "value_heads": False}, "leave per_task_values and value_heads on"),
+    ("icl", {"memory": 20, "heads": 8}, "memory to be a multiple of heads"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
 ]
 HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))

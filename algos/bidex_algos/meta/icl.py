@@ -62,15 +62,16 @@ class ICLConfig(MemoryConfig):
     """Environment steps over which the share of trials that the teacher plays falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.memory % self.heads:
+            raise BidexError(f"icl: expected memory to be a multiple of heads, {self.heads}, got {self.memory}.")
+
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base, for episodes of 300 steps: how long they are is not known here."""
         steps = self.episodes_per_trial * min(self.max_adapt_steps, 300)
-        memory = 4 * 4 * 3 * self.memory * (self.memory + self.hidden[-1])
-        return (
-            (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
-            + memory
-            + network_bytes((*self.hidden, *self.head), width, 1)
-        )
+        kept = (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
+        return kept + network_bytes(self.head, width, 1)
 
 
 PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
@@ -276,14 +277,14 @@ class _Pupil:
         ends = own[pairs].unflatten(1, (2, -1))
         goals[:, 1:] = torch.lerp(ends[:, 0], ends[:, 1], self._draw(torch.rand, goals.shape[1] - 1)[..., None])
 
-    def earned(self, reward: Tensor, slot: Tensor) -> None:
+    def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Keeps what the step was paid, and would have been for the other goals."""
         hidden, data = self._learner.teachers.hidden, self._data
         data.rewards[slot, self._rows, 0] = reward
         if hidden is None:
             return
         for i in range(1, data.goals.shape[1]):
-            data.rewards[slot, self._rows, i] = hidden.rewards(data.goals[:, i])
+            data.rewards[slot, self._rows, i] = hidden.rewards(data.goals[:, i]).masked_fill(~valid, 0.0)
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Of the teachers or the policy; keeps what the teachers would do."""

@@ -117,8 +117,8 @@ class Player(Protocol):
         """
         ...
 
-    def earned(self, reward: Tensor, slot: Tensor) -> None:
-        """The step's rewards (N,), 0 where it teaches nothing."""
+    def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
+        """The step's rewards (N,), 0 where it teaches nothing: where physics broke or a row waits, not ``valid``."""
 
 
 class Sampling:
@@ -136,7 +136,7 @@ class Sampling:
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
         return mean + self._policy.log_std.exp() * noise, state
 
-    def earned(self, reward: Tensor, slot: Tensor) -> None:
+    def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Nothing."""
 
 
@@ -166,7 +166,7 @@ def play(
             next_obs, reward, terminated, truncated, info = world.step(action)
             valid = ~info["unstable"]
             reward = reward.masked_fill(~(valid & playing), 0.0)
-            player.earned(reward, trials.lengths)
+            player.earned(reward, valid & playing, trials.lengths)
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
