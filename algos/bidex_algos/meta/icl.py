@@ -16,18 +16,18 @@ from torch import Tensor, nn
 from bidex_algos.learner import as_numbers
 from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
-from bidex_algos.meta.trials import MemoryConfig, Trials
+from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.evidence import BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import Layers
+from bidex_algos.nets.networks import Activation, Layers
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
-from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, Positive, Whole, Widths
+from bidex_meta.train.learner import LearnerConfig, Parts, State
+from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld
 
@@ -39,15 +39,18 @@ _ASKED = 64
 
 
 @dataclass(frozen=True)
-class ICLConfig(MemoryConfig):
+class ICLConfig(LearnerConfig):
     """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
 
     hidden: Widths = (128, 128)  # Widths of the layers that a step passes before the memory.
+    activation: Activation = "elu"  # Non-linearity of the hidden layers.
     memory: Count = 128  # Numbers that the memory holds, beside a weight for each head.
     heads: Count = 8  # Weighted means that the memory is made of; divides ``memory``.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
+    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
     max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
@@ -78,7 +81,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning by imitation: a memory infers the task from episodes and rewards, no weight changes."""
+    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348), taught by those who know it."""
 
     name, remedy = "icl", "lower learning_rate"
     config_type, presets = ICLConfig, PRESETS

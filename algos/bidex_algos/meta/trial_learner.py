@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bidex_algos.learner import Learner
 from bidex_algos.meta.memory_agent import MemoryAgent
-from bidex_algos.meta.trials import MemoryConfig, Player, Trials, play
+from bidex_algos.meta.trials import Player, Trials, play
 from bidex_algos.nets.recurrent import RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, own_seed, rank, world_size
@@ -24,7 +24,7 @@ class TrialLearner(Learner):
     adapts = independent_adaptation = True
     going_on = ("trials_played", *Learner.going_on)
 
-    def __init__(self, world: PooledWorld, config: MemoryConfig, seed: int):
+    def __init__(self, world: PooledWorld, config: Any, seed: int):
         super().__init__(world, config, seed)
         self.agent = MemoryAgent(self.policy, own_seed(seed))
         self.trials_played = 0

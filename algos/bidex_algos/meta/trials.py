@@ -20,35 +20,29 @@ from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class MemoryConfig(LearnerConfig):
-    """Networks with a memory, and trials."""
+class TrialConfig(LearnerConfig):
+    """Networks and trials of RL²."""
 
-    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory.
+    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
     activation: Activation = "elu"  # Non-linearity of the encoder.
-    memory: Count = 128  # Numbers that an environment's memory (GRU) holds.
+    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
+    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
     max_adapt_steps: Count = 150  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
     blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
+    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    chunk: Count | None = None
+    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
 
     @property
     def trial_steps(self) -> int:
         """Most steps of a trial."""
         return self.episodes_per_trial * self.max_adapt_steps
-
-
-@dataclass(frozen=True)
-class TrialConfig(MemoryConfig):
-    """Trials that PPO learns from; the critic has an encoder and a memory like the actor's."""
-
-    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
-    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
-    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
-    chunk: Count | None = None
-    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
