@@ -99,8 +99,6 @@ _LIFT, _AHEAD = 0.006, 0.015
 and along the fingers, so that it can be turned without meeting the thumb."""
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
-
-
 _DROPPED = 0.25
 """Height of the bottle below which it no longer lies in the hand, metres: half of where it starts."""
 

@@ -77,9 +77,9 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     classes = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2))
     world = PointGoals(8, classes=classes)
     learner = taught(world, rows=torch.arange(4, 8))
-    told = learner.iterate()
-    assert "Loss/imitation/Long" in told and "Loss/imitation/Short" not in told
-    assert told["Policy/teacher_share"] == pytest.approx(0.5) and learner.env_steps == 2 * 4 * (3 + 7)
+    reported = learner.iterate()
+    assert "Loss/imitation/Long" in reported and "Loss/imitation/Short" not in reported
+    assert reported["Policy/teacher_share"] == pytest.approx(0.5) and learner.env_steps == 2 * 4 * (3 + 7)
     # Labels and goals are those of the recorded states.
     data = learner.data
     assert data is not None

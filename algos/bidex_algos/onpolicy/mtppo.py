@@ -305,8 +305,8 @@ class MTPPO(OnPolicy):
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
-        own, told = self.demonstrations, self.lessons
-        parts = {} if told is None else {"teacher_adam": told.adam, "label_stats": told.label_stats}
+        own, lessons = self.demonstrations, self.lessons
+        parts = {} if lessons is None else {"teacher_adam": lessons.adam, "label_stats": lessons.label_stats}
         return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
 
     def _place(self) -> State:
