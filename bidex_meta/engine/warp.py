@@ -59,8 +59,9 @@ class WarpEngine(Engine):
         self.num, self.device = len(rows), torch.device(device)
         self._models, self._rows = list(models), list(rows)
         self._device = wp.get_device(str(self.device))
-        self._stream = wp.Stream(self._device) if self._device.is_cuda else None
-        self._lent = wp.stream_to_torch(self._stream) if self._stream is not None else None
+        # Of torch's making: CUDA's legacy stream, torch's default, waits for streams of Warp's making.
+        self._lent = torch.cuda.Stream(self.device) if self._device.is_cuda else None
+        self._stream = wp.stream_from_torch(self._lent) if self._lent is not None else None
         self._graphs: dict[str, Callable[[], None]] = {}
         with self._on_device():
             self._put(capacity)

@@ -116,9 +116,11 @@ class SideBySide:
                 job()
             return
         caller = torch.cuda.current_stream()
+        # One event before all jobs: of a later one, in the legacy stream, jobs under way might have to be waited for.
+        before = caller.record_event()
         for stream, job in zip(self._streams, jobs, strict=True):
-            stream.wait_stream(caller)
+            stream.wait_event(before)
             with torch.cuda.stream(stream):
                 job()
         for stream in self._streams:
-            caller.wait_stream(stream)
+            caller.wait_event(stream.record_event())

@@ -1,6 +1,7 @@
 """Recorded stretches of a step: a tape of operations in fixed memory, as a CUDA graph is one, against plain runs."""
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from torch.utils._pytree import tree_leaves
 from bidex_meta import Benchmark
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from bidex_meta.world.graphs import GraphCache, fresh
+from bidex_meta.world.graphs import GraphCache, SideBySide, fresh
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 from tests.world.test_masked import MaskedEngine, at_work
 
@@ -127,6 +128,38 @@ def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[...,
     assert_same(play(plain, actions[30:]), play(made, actions[30:]))
 
 
+class FakeStream:
+    """Writes down what is asked of it."""
+
+    def __init__(self, log: list[tuple[str, str, object]], name: str) -> None:
+        self._log, self.name = log, name
+
+    def record_event(self) -> str:
+        self._log.append((self.name, "records", None))
+        return f"event of {self.name}"
+
+    def wait_event(self, event: str) -> None:
+        self._log.append((self.name, "waits", event))
+
+
+def test_nothing_of_the_caller_stands_between_jobs_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An event in CUDA's legacy stream could wait for the jobs before it: there is one, before all jobs."""
+    log: list[tuple[str, str, object]] = []
+    names = iter("ab")
+    caller = FakeStream(log, "caller")
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: FakeStream(log, next(names)))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: caller)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+    SideBySide(2, torch.device("cuda")).run([lambda i=i: log.append(("job", "runs", i)) for i in range(2)])
+    assert log == [
+        ("caller", "records", None),
+        ("a", "waits", "event of caller"), ("job", "runs", 0),
+        ("b", "waits", "event of caller"), ("job", "runs", 1),
+        ("a", "records", None), ("caller", "waits", "event of a"),
+        ("b", "records", None), ("caller", "waits", "event of b"),
+    ]  # fmt: skip
+
+
 @pytest.mark.gpu
 def test_graphs_on_cuda_are_plain_steps() -> None:
     """Nearly everywhere: sums are made in any order there, and what touches something grows apart from then on."""
@@ -140,4 +173,4 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
         for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/so_far/l"):
             apart = (x[name].float() - y[name].float()).abs().flatten()
             assert apart.quantile(0.95) < 1e-2, name
-    assert graphs._graphs is not None and len(graphs._recorder._recorded) == 4
+    assert graphs._graphs is not None and len(graphs._graphs._recorded) == 4

@@ -2,7 +2,8 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,8 @@ def gpu(
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step and of its physics alone. Beside them, for each size, the suite over the
-        harmonic mean of the classes.
+        ``stages``, milliseconds of a step and of its physics, together and group by group. Beside them, for each size,
+        the suite over the harmonic mean of the classes.
     """
     machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
@@ -118,20 +119,39 @@ def _measured(
     if learning:
         kind, config = chosen_learner("mtppo", device)
         learner = kind.make(made, config, 0)
-        learner.iterate()
-        row["training_steps_per_s"] = round(learner.iterate()["Perf/steps_per_second"])
+        for _ in range(5):  # its update is recorded as a graph after a few
+            numbers = learner.iterate()
+        row["training_steps_per_s"] = round(numbers["Perf/steps_per_second"])
+        row["learning"] = {name: round(numbers[f"Perf/{name}_time"], 3) for name in ("collection", "learning")}
     made.close()
     return row
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
-    """Milliseconds of a step, and of its physics alone: the engines again, from where they stand."""
+    """Milliseconds of a step, of its physics alone, and of each group's physics with the others at rest.
+
+    ``launching`` is the host's part of the physics. ``overlap`` is 0 where groups run one after the other, and 1 where
+    all take no longer than the slowest.
+    """
     took = {"step": 1000.0 * random_steps(made, steps).wall / steps}
+    took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
+    alone = {}
+    for part in made.parts:
+        name = made.slots[part.group.members[0].slot].name
+        alone[f"physics of {name} alone"] = _milliseconds(made, steps, partial(part.advance, None))[0]
+    total, slowest = sum(alone.values()), max(alone.values())
+    if len(alone) > 1:
+        took |= alone | {"sum": total, "slowest": slowest, "overlap": (total - took["physics"]) / (total - slowest)}
+    return {name: round(value, 3) for name, value in took.items()}
+
+
+def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
+    """Of one of ``steps`` runs: until all is done, and until the host had it launched."""
     start = now(made.device)
     for _ in range(steps):
-        made.step_engines()
-    took["physics"] = 1000.0 * (now(made.device) - start) / steps
-    return {name: round(value, 3) for name, value in took.items()}
+        work()
+    launched = time.perf_counter() - start
+    return 1000.0 * (now(made.device) - start) / steps, 1000.0 * launched / steps
 
 
 def _memory(device: str) -> int:

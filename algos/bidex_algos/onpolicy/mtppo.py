@@ -26,6 +26,7 @@ from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.graphs import GraphCache, cuda_graph
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,8 @@ class MTPPO(OnPolicy):
             "famo": lambda: Famo(world.num_tasks, config.famo_rate, config.famo_decay, self.device),
         }
         self.balance = balances[config.gradient_surgery]()
+        alone = self.device.type == "cuda" and self.balance is None and world_size() == 1
+        self._graphs = GraphCache(dict, lambda _: None, cuda_graph) if alone else None
 
     def start_from(self, policy: State) -> None:
         """As in the base; deviations begin within ``std_range``, an adaptive step size at its least.
@@ -187,6 +190,7 @@ class MTPPO(OnPolicy):
         A KL is known after a step alone: the first update of a policy of DAgger's had one of 187 from 3e-4.
         """
         super().start_from(policy)
+        self._forget_graphs()
         self._bound_std()
         if self.config.adaptive_learning_rate:
             self.adams.rate.fill_(self.adams.bounds[0])
@@ -196,8 +200,13 @@ class MTPPO(OnPolicy):
         low, high = (math.log(std) for std in self.config.std_range)
         self.policy.actor.log_std.clamp_(low, high)
 
+    def _forget_graphs(self) -> None:
+        if self._graphs is not None:
+            self._graphs.forget()
+
     def learn_from_demonstrations(self, data: Joined) -> None:
         """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
+        self._graphs = None  # the weight of demonstrations is no tensor
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
         self.per_process = (*self.per_process, "demonstrated")
 
@@ -236,13 +245,13 @@ class MTPPO(OnPolicy):
         old_log_std = actor.log_std.detach().clone()
         measured = list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
-            part = batch.select(index)
-            measured.append(self._gradients(part, count, old_log_std))
-            self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
-            self._bound_std()
-            if self.balance is not None:
-                with torch.no_grad():
-                    self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
+            inputs = *vars(batch.select(index)).values(), count, old_log_std
+            work = partial(self._descend, first, critic_alone)
+            if self._graphs is None:
+                measured.append(work(*inputs))
+            else:
+                name = f"{len(index)} samples, first {first}, critic alone {critic_alone}"
+                measured.append(self._graphs.run(name, work, *inputs).clone())
         names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
         names += ["Loss/demonstrations"] * bool(self._imitated())
         means = torch.stack(measured).mean(0)
@@ -250,6 +259,19 @@ class MTPPO(OnPolicy):
         if self.demonstrations is not None:
             reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
         return reported | ({} if self.lessons is None else self._take(self.lessons))
+
+    def _descend(self, first: bool, critic_alone: bool, *inputs: Tensor) -> Tensor:
+        """One step on a mini-batch's fields, the sum of its weights and the sampling policy's log deviations."""
+        *batch, count, old_log_std = inputs
+        part = Batch(*batch)
+        numbers = self._gradients(part, count, old_log_std)
+        cfg = self.config
+        self.adams.descend(None if first else numbers[2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
+        self._bound_std()
+        if self.balance is not None:
+            with torch.no_grad():
+                self.balance.learn(lambda: self._above_least(part, count, old_log_std))
+        return numbers
 
     def _take(self, lessons: Lessons) -> dict[str, Tensor]:
         """Learns from teachers what the classes that fail need of it; nothing while the critic learns alone."""
@@ -321,6 +343,7 @@ class MTPPO(OnPolicy):
     def load_state_dict(self, state: State) -> None:
         """As in the base; with teachers that follow an episode from its start new ones begin."""
         super().load_state_dict(state)
+        self._forget_graphs()
         if self.lessons is None or self.lessons.data is None:
             return
         self.lessons.data.load_state_dict(state["data"])

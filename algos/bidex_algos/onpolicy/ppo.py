@@ -90,13 +90,19 @@ def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
 
 
 class _Adam(torch.optim.Adam):
-    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser."""
+    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser.
+
+    On CUDA its steps can be recorded in a graph.
+    """
+
+    def __init__(self, weights: list[nn.Parameter], rate: Tensor, eps: float = 1e-8) -> None:
+        super().__init__(weights, lr=rate, eps=eps, fused=True, capturable=rate.device.type == "cuda")
 
     def load_state_dict(self, state_dict: State) -> None:
-        rates = [group["lr"] for group in self.param_groups]
+        kept = [{name: group[name] for name in ("lr", "capturable")} for group in self.param_groups]
         super().load_state_dict(state_dict)
-        for group, rate in zip(self.param_groups, rates, strict=True):
-            group["lr"] = rate
+        for group, own in zip(self.param_groups, kept, strict=True):
+            group.update(own)
 
 
 class AdaptiveAdam:
@@ -113,7 +119,7 @@ class AdaptiveAdam:
         self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
         self.bounds, self.weights = config.learning_rate_range, list(parameters)
         self.rate = torch.tensor(config.learning_rate, device=device)
-        self.actor = _Adam(self.weights, lr=self.rate, eps=eps, fused=True)
+        self.actor = _Adam(self.weights, self.rate, eps)
 
     def zero_grad(self) -> None:
         """Forgets the gradients."""
@@ -145,7 +151,7 @@ class AdaptiveAdams(AdaptiveAdam):
         fixed = config.critic_learning_rate
         self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
         self.critic_weights = list(critic)
-        self.critic = _Adam(self.critic_weights, lr=self.critic_rate, fused=True)
+        self.critic = _Adam(self.critic_weights, self.critic_rate)
 
     def zero_grad(self) -> None:
         """Forgets the gradients of both."""
