@@ -20,6 +20,7 @@ from tools.bench.adapt import adapt
 from tools.bench.against import HERE
 from tools.bench.capacity import capacity
 from tools.bench.drift import judge
+from tools.bench.launches import launches
 from tools.bench.multiagent import multiagent
 from tools.bench.points import points
 from tools.bench.speed import mixing, scaling
@@ -65,6 +66,19 @@ def test_capacity_counts_what_c_and_the_warp_engine_see() -> None:
     for counts in result.values():
         assert 0 <= counts["median"] <= counts["q999"] <= counts["q9999"] <= counts["max"]
     assert 0 < result["contacts"]["max"] <= result["candidates"]["max"] < 60
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.xdist_group("warp")
+def test_launches_of_a_control_step() -> None:
+    found = launches("CatchUnderarm", num_envs=2)
+    *stages, total, iteration = found["table"]
+    assert found["substeps"] == 3 and (total["stage"], iteration["stage"]) == ("all", "iteration")
+    for name in ("kernels", "fills_and_copies", "allocations"):
+        assert total[name] == sum(row[name] for row in stages)
+    by_stage = {row["stage"]: row["kernels"] for row in stages}
+    assert by_stage["collision"] % 3 == 0 and by_stage["sensor_acc"] == 1, "forces are sensed once a control step"
+    assert 5 < iteration["kernels"] < 20 and iteration["allocations"] == 0
 
 
 @pytest.mark.parametrize(("client", "package"), [("sb3", "stable_baselines3"), ("rsl-rl", "rsl_rl")])

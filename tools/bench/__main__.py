@@ -18,6 +18,7 @@ from tools.bench.capacity import capacity
 from tools.bench.clients import clients
 from tools.bench.field import field
 from tools.bench.gpu import gpu, kernels
+from tools.bench.launches import launches
 from tools.bench.learner import learner
 from tools.bench.libraries import libraries
 from tools.bench.multiagent import multiagent
@@ -30,7 +31,7 @@ KINDS: dict[str, Callable[..., dict[str, Any]]] = {
     kind.__name__: kind
     for kind in (
         scaling, mixing, against, field, stability, soak, capacity,
-        gpu, kernels, learner, libraries, adapt, multiagent, clients, points,
+        gpu, kernels, launches, learner, libraries, adapt, multiagent, clients, points,
     )
 }  # fmt: skip
 
