@@ -3,8 +3,9 @@
     from bidex_meta import Benchmark
     world = Benchmark("MT4", seed=0).make_world("train", num_envs=1024)
 
-Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...) and shortens how long waiting OpenMP
-threads spin (docs/training.md#beside-other-work); torch and MuJoCo are loaded when a name first needs them.
+Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...), shortens how long waiting OpenMP
+threads spin (docs/training.md#beside-other-work) and asks CUDA for 32 queues; torch and MuJoCo are loaded when a name
+first needs them.
 """
 
 import os
@@ -37,6 +38,8 @@ if "OMP_WAIT_POLICY" not in os.environ:
     # spins of GNU's, milliseconds of LLVM's and Intel's.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     os.environ.setdefault("KMP_BLOCKTIME", "1")
+# Groups of classes side by side need a queue each; CUDA reads it once, before its first call.
+os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 
 set_aside_what_is_missing()
 register_ids()

@@ -226,3 +226,17 @@ def test_points_read_leaves_points_out_evenly() -> None:
     assert torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))
     changed[:, 0] += 1.0
     assert not torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))
+
+
+@pytest.mark.parametrize("width", [1, 8, 13])
+def test_columns_in_eights_change_no_product(width: int):
+    generator = torch.Generator().manual_seed(0)
+    x, weight = (torch.randn(rows, width, generator=generator, requires_grad=True) for rows in (5, 3))
+    wide_x, wide_weight = products._in_eights(x, weight)
+    assert wide_x.shape[1] == wide_weight.shape[1] == -(-width // 8) * 8
+    out = wide_x @ wide_weight.T
+    torch.testing.assert_close(out, x @ weight.T)
+    for got, expected in zip(
+        torch.autograd.grad(out.sum(), (x, weight)), torch.autograd.grad((x @ weight.T).sum(), (x, weight)), strict=True
+    ):
+        torch.testing.assert_close(got, expected)

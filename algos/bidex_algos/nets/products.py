@@ -18,10 +18,21 @@ _LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call c
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``x @ weight.T + bias``, differentiable: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
     if not _pays(x, weight):
+        if x.is_cuda and torch.is_autocast_enabled("cuda"):
+            x, weight = _in_eights(x, weight)
         return nn.functional.linear(x, weight, bias)
     rows = x.reshape(-1, x.shape[-1])
     out = cast(Tensor, _Affine.apply(rows, weight, bias)) if torch.is_grad_enabled() else _onednn(rows, weight, bias)
     return out.view(*x.shape[:-1], -1)
+
+
+def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Both with zero columns to a multiple of eight: else cuBLAS's bfloat16 product is a slow one of older GPUs.
+
+    Of 422 columns the first layer took 51 of 106 ms of MT-PPO's products on an H200, with 18 % of the multiplications.
+    """
+    missing = -x.shape[-1] % 8
+    return (nn.functional.pad(x, (0, missing)), nn.functional.pad(weight, (0, missing))) if missing else (x, weight)
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
