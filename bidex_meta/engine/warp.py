@@ -9,7 +9,8 @@ import copy
 import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -23,6 +24,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
 from bidex_meta.engine.protocol import Engine
+from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
 
 # What a step changes and later steps or readers see.
@@ -66,9 +68,10 @@ class WarpEngine(Engine):
         with self._on_device():
             self._put(capacity)
             self._bind()
-            self._substeps = 1
-            self._advance()  # compiles all kernels, which a capture must not do
-            self._begin()
+            self._substeps, self._scratch = 1, Scratch(self._device)
+            with self._from_scratch():
+                self._advance()  # compiles all kernels and asks for memory, which a capture must not do
+                self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
@@ -217,11 +220,16 @@ class WarpEngine(Engine):
                 stacklevel=2,
             )
             return work
-        with _no_garbage_collection(), wp.ScopedCapture(device=self._device, stream=self._stream) as capture:
+        scoped = wp.ScopedCapture(device=self._device, stream=self._stream)
+        with _no_garbage_collection(), self._from_scratch(), scoped as capture:
             work()
         graph = capture.graph
         assert graph is not None
         return lambda: wp.capture_launch(graph, stream=self._stream)
+
+    def _from_scratch(self) -> AbstractContextManager[Any]:
+        """Warp allocates from the engine's scratch memory, where it lets one choose: on CUDA."""
+        return wp.ScopedAllocator(self._device, self._scratch) if self._device.is_cuda else nullcontext()
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:
