@@ -23,6 +23,7 @@ from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
+from bidex_meta.engine.lean import lean
 from bidex_meta.engine.protocol import Engine
 from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
@@ -88,6 +89,7 @@ class WarpEngine(Engine):
         # this one; with 1e-10 some contacts were lost.
         self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
+        self._lean = lean(self._m)
         room = {"nconmax": capacity.contacts, "nccdmax": capacity.convex, "njmax": capacity.rows}
         d = self._d = mjw.make_data(_adapted(self._models[0]), nworld=self.num, **room)
         _put_static_frames(d, self._models, self._rows)
@@ -180,23 +182,20 @@ class WarpEngine(Engine):
     def _advance(self) -> None:
         """The substeps of a control step, then position and velocity sensors of the new state."""
         m, d = self._m, self._d
-        wanted = m.opt.disableflags
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
-            # Only the last substep's forces are read.
-            m.opt.disableflags = wanted | int(mjw.DisableBit.SENSOR) if left else wanted
-            mjw.step(m, d)
-        m.opt.disableflags = wanted
+            self._lean.step(d, last=not left)
         self._guard.watch(m, d)
         self._refresh()
 
     def _refresh(self) -> None:
         """Position and velocity sensors of the state as it stands; force sensors are left alone."""
-        mjw.fwd_kinematics(self._m, self._d)
-        mjw.com_vel(self._m, self._d)
-        mjw.sensor_pos(self._m, self._d)
-        mjw.sensor_vel(self._m, self._d)
+        m, d = self._lean.refresh, self._d
+        mjw.fwd_kinematics(m, d)
+        mjw.com_vel(m, d)
+        mjw.sensor_pos(m, d)
+        mjw.sensor_vel(m, d)
 
     def _begin(self) -> None:
         d = self._d
