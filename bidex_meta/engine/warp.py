@@ -9,7 +9,8 @@ import copy
 import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,7 +23,9 @@ from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
+from bidex_meta.engine.lean import lean
 from bidex_meta.engine.protocol import Engine
+from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
 
 # What a step changes and later steps or readers see.
@@ -67,9 +70,10 @@ class WarpEngine(Engine):
         with self._on_device():
             self._put(capacity)
             self._bind()
-            self._substeps = 1
-            self._advance()  # compiles all kernels, which a capture must not do
-            self._begin()
+            self._substeps, self._scratch = 1, Scratch(self._device)
+            with self._from_scratch():
+                self._advance()  # compiles all kernels and asks for memory, which a capture must not do
+                self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
@@ -86,6 +90,7 @@ class WarpEngine(Engine):
         # this one; with 1e-10 some contacts were lost.
         self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
+        self._lean = lean(self._m)
         room = {"nconmax": capacity.contacts, "nccdmax": capacity.convex, "njmax": capacity.rows}
         d = self._d = mjw.make_data(_adapted(self._models[0]), nworld=self.num, **room)
         _put_static_frames(d, self._models, self._rows)
@@ -137,6 +142,8 @@ class WarpEngine(Engine):
     def recapture(self) -> None:
         """Forgets the graphs; the next calls record new ones."""
         self._graphs.clear()
+        with self._on_device():
+            self._lean = lean(self._m)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The state may be of the C engine. Refreshes position and velocity sensors."""
@@ -178,23 +185,20 @@ class WarpEngine(Engine):
     def _advance(self) -> None:
         """The substeps of a control step, then position and velocity sensors of the new state."""
         m, d = self._m, self._d
-        wanted = m.opt.disableflags
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
-            # Only the last substep's forces are read.
-            m.opt.disableflags = wanted | int(mjw.DisableBit.SENSOR) if left else wanted
-            mjw.step(m, d)
-        m.opt.disableflags = wanted
+            self._lean.step(d, last=not left)
         self._guard.watch(m, d)
         self._refresh()
 
     def _refresh(self) -> None:
         """Position and velocity sensors of the state as it stands; force sensors are left alone."""
-        mjw.fwd_kinematics(self._m, self._d)
-        mjw.com_vel(self._m, self._d)
-        mjw.sensor_pos(self._m, self._d)
-        mjw.sensor_vel(self._m, self._d)
+        m, d = self._lean.refresh, self._d
+        mjw.fwd_kinematics(m, d)
+        mjw.com_vel(m, d)
+        mjw.sensor_pos(m, d)
+        mjw.sensor_vel(m, d)
 
     def _begin(self) -> None:
         d = self._d
@@ -218,11 +222,16 @@ class WarpEngine(Engine):
                 stacklevel=2,
             )
             return work
-        with _no_garbage_collection(), wp.ScopedCapture(device=self._device, stream=self._stream) as capture:
+        scoped = wp.ScopedCapture(device=self._device, stream=self._stream)
+        with _no_garbage_collection(), self._from_scratch(), scoped as capture:
             work()
         graph = capture.graph
         assert graph is not None
         return lambda: wp.capture_launch(graph, stream=self._stream)
+
+    def _from_scratch(self) -> AbstractContextManager[Any]:
+        """Warp allocates from the engine's scratch memory, where it lets one choose: on CUDA."""
+        return wp.ScopedAllocator(self._device, self._scratch) if self._device.is_cuda else nullcontext()
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:

@@ -23,8 +23,9 @@ _AROUND = {
 def launches(task: str = "BottleCap", num_envs: int = 4) -> dict[str, Any]:
     """Counts what the graph of a class's control step holds, on the Warp CPU device.
 
-    What is launched over nothing is left out, as Warp does. An allocation in a graph is two nodes there: it is freed
-    too. Graphs of CUDA hold the same kernels (of the sparse solver that all classes have), wider or narrower.
+    What is launched over nothing is left out, as Warp does. Allocations are in no graph of CUDA, where the engine has
+    memory for them. Graphs of CUDA hold the same kernels (of the sparse solver that all classes have), wider or
+    narrower.
 
     Args:
         task: Task class.

@@ -1,0 +1,129 @@
+"""A substep on mujoco_warp without what does nothing for the model at hand.
+
+mujoco_warp launches a kernel for each feature that a model may use, whether or not it does. Nothing is launched over
+nothing, so copies of the model whose counts say zero leave such kernels out. The state is that of ``mjw.step``, bit for
+bit.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+
+from bidex_meta.engine import kernels
+
+_IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
+
+
+@dataclass
+class Lean:
+    """The model as parts of a control step see it; the copies share its arrays.
+
+    Attributes:
+        whole: All of it.
+        early: For the forward dynamics of substeps but the last.
+        last: For those of the last substep, which gives the sensors of forces.
+        integration: For the implicit integration of all substeps, if any.
+        refresh: For positions, velocities and their sensors after the last substep.
+    """
+
+    whole: mjw.Model
+    early: mjw.Model
+    last: mjw.Model
+    integration: mjw.Model | None
+    refresh: mjw.Model
+
+    def step(self, d: mjw.Data, last: bool) -> None:
+        """``mjw.step``; sensors are computed by the last substep alone, those of forces only."""
+        model = self.last if last else self.early
+        if self.integration is None:
+            mjw.step(model, d)
+            return
+        if not model.ntendon:  # else the forward dynamics do it
+            mjw.tendon(self.whole, d)
+        if model.callback.passive is not self.whole.callback.passive:  # ours; it puts gravity back
+            model.opt.disableflags |= int(mjw.DisableBit.GRAVITY)
+        mjw.forward(model, d)
+        mjw.implicit(self.integration, d)
+
+
+def lean(m: mjw.Model) -> Lean:
+    """Looks through the arrays of a model; they must not be given a feature later that they lack now."""
+    implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
+    none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
+    early, last, integration, refresh = "early", "last", "integration", "refresh"
+    everywhere = (early, last, integration, refresh)
+    # For which parts, what is left out, and whether that does nothing.
+    table: list[tuple[tuple[str, ...], dict[str, Any], bool]] = [
+        # Lights serve pictures alone.
+        (everywhere, {"nlight": 0}, True),
+        # Limits and equalities read what mjw.tendon found, by lists of their own; all else would add zeros.
+        (everywhere, {"ntendon": 0, "nJten": 0}, implicit and _tendons_limit_only(m)),
+        # Without friction of joints and tendons there are no rows.
+        (everywhere, {"disable": mjw.DisableBit.FRICTIONLOSS}, not _any(m.dof_frictionloss, m.tendon_frictionloss)),
+        # Only the last substep's sensors are read, of which the refresh redoes those of positions and velocities.
+        # mujoco_warp asks every body for its share of every degree of freedom; few bodies have one.
+        ((early, last), {"callback": replace(m.callback, passive=_carrier(m))}, implicit and _gravity_apart(m)),
+        ((early,), {"disable": mjw.DisableBit.SENSOR}, True),
+        ((early,), {"nsite": 0}, not _sites_act(m)),
+        ((last,), {"sensor_pos_adr": none, "sensor_vel_adr": none}, True),
+        # The derivative of actuators' forces by velocity is zero, and no activation moves on.
+        ((integration,), {"nactuator": 0}, not _actuators_damp(m)),
+    ]
+    parts: dict[str, mjw.Model] = dict.fromkeys(everywhere, m)
+    for names, changes, allowed in table:
+        for name in names if allowed else ():
+            parts[name] = _without(parts[name], **changes)
+    return Lean(m, parts[early], parts[last], parts[integration] if implicit else None, parts[refresh])
+
+
+def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
+    """What mujoco_warp calls at the end of passive forces, for which gravity was off and after which it must be on."""
+    bodies = wp.array(np.flatnonzero(m.body_gravcomp.numpy().any(axis=0)), dtype=int, device=m.body_gravcomp.device)
+    constants = [m.opt.gravity, m.body_rootid, m.body_mass, m.body_gravcomp, m.body_isdofancestor, bodies]
+
+    def carry(model: mjw.Model, d: mjw.Data) -> None:
+        model.opt.disableflags &= ~int(mjw.DisableBit.GRAVITY)
+        state = [d.xipos, d.subtree_com, d.cdof]
+        wp.launch(kernels.carry, dim=d.qvel.shape, inputs=[*constants, *state], outputs=[d.qfrc_passive])
+
+    return carry
+
+
+def _gravity_apart(m: mjw.Model) -> bool:
+    """Whether gravity compensation is the last of the passive forces, and they are computed at all."""
+    off = m.opt.disableflags
+    none = mjw.DisableBit.SPRING | mjw.DisableBit.DAMPER
+    last = not (m.has_fluid or m.flg_adhesion or _any(m.jnt_actgravcomp) or m.callback.passive)
+    return last and not off & mjw.DisableBit.GRAVITY and off & none != none
+
+
+def _without(m: mjw.Model, disable: int = 0, **fields: Any) -> mjw.Model:
+    return replace(m, opt=replace(m.opt, disableflags=m.opt.disableflags | int(disable)), **fields)
+
+
+def _any(*arrays: wp.array) -> bool:
+    return any(bool(array.numpy().any()) for array in arrays)
+
+
+def _tendons_limit_only(m: mjw.Model) -> bool:
+    """Whether tendons are sums of joint positions, with no forces but those of limits and equalities."""
+    forces = (m.tendon_stiffness, m.tendon_stiffnesspoly, m.tendon_damping, m.tendon_dampingpoly)
+    driven = mjw.TrnType.TENDON in m.actuator_trntype.numpy()
+    return m.wrap_jnt_adr.size == m.nwrap and not driven and not _any(*forces, m.tendon_armature, m.tendon_frictionloss)
+
+
+def _sites_act(m: mjw.Model) -> bool:
+    """Whether motion depends on where sites are: by actuators, equalities or tendons."""
+    by_joint = (mjw.TrnType.JOINT, mjw.TrnType.JOINTINPARENT, mjw.TrnType.TENDON)
+    return not np.isin(m.actuator_trntype.numpy(), by_joint).all() or m.neq > 0 or m.wrap_jnt_adr.size < m.nwrap
+
+
+def _actuators_damp(m: mjw.Model) -> bool:
+    """Whether an actuator's force may depend on velocity or on an activation."""
+    fixed = (m.actuator_gaintype.numpy() == mjw.GainType.FIXED).all()
+    linear = np.isin(m.actuator_biastype.numpy(), (mjw.BiasType.NONE, mjw.BiasType.AFFINE)).all()
+    return m.na > 0 or not (fixed and linear) or bool(m.actuator_biasprm.numpy()[..., 2].any())
