@@ -1,4 +1,4 @@
-"""The Warp engine's own kernels: health and starts. One thread a world, or a number of a world; and their launches.
+"""The Warp engine's own kernels, one thread a world or a number of a world: health and its launches, starts, weight.
 
 Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
 """
@@ -131,6 +131,25 @@ def place(
         mocap_quat[world, i] = wp.quat(
             start[world, k + 3], start[world, k + 4], start[world, k + 5], start[world, k + 6]
         )
+
+
+@wp.kernel(enable_backward=False)
+def carry(
+    gravity: wp.array[wp.vec3], root: wp.array[int], mass: Numbers, share: Numbers, moved: wp.array2d[int],
+    bodies: wp.array[int], xipos: Points, subtree_com: Points, cdof: Wrenches, qfrc_passive: Numbers
+):  # fmt: skip
+    """Adds the gravity compensation of the given bodies, of which ``share`` tells how much each has."""
+    world, dof = wp.tid()
+    force = float(0.0)
+    for i in range(bodies.shape[0]):
+        body = bodies[i]
+        if moved[body, dof] != 0:
+            lift = -gravity[world % gravity.shape[0]] * mass[world % mass.shape[0], body]
+            lift = lift * share[world % share.shape[0], body]
+            arm = xipos[world, body] - subtree_com[world, root[body]]
+            axis = cdof[world, dof]
+            force += wp.dot(wp.spatial_bottom(axis) + wp.cross(wp.spatial_top(axis), arm), lift)
+    qfrc_passive[world, dof] += force
 
 
 class Guard:

@@ -5,12 +5,15 @@ nothing, so copies of the model whose counts say zero leave such kernels out. Th
 bit.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+
+from bidex_meta.engine import kernels
 
 _IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
 
@@ -41,6 +44,8 @@ class Lean:
             return
         if not model.ntendon:  # else the forward dynamics do it
             mjw.tendon(self.whole, d)
+        if model.callback.passive is not self.whole.callback.passive:  # ours; it puts gravity back
+            model.opt.disableflags |= int(mjw.DisableBit.GRAVITY)
         mjw.forward(model, d)
         mjw.implicit(self.integration, d)
 
@@ -60,6 +65,8 @@ def lean(m: mjw.Model) -> Lean:
         # Without friction of joints and tendons there are no rows.
         (everywhere, {"disable": mjw.DisableBit.FRICTIONLOSS}, not _any(m.dof_frictionloss, m.tendon_frictionloss)),
         # Only the last substep's sensors are read, of which the refresh redoes those of positions and velocities.
+        # mujoco_warp asks every body for its share of every degree of freedom; few bodies have one.
+        ((early, last), {"callback": replace(m.callback, passive=_carrier(m))}, implicit and _gravity_apart(m)),
         ((early,), {"disable": mjw.DisableBit.SENSOR}, True),
         ((early,), {"nsite": 0}, not _sites_act(m)),
         ((last,), {"sensor_pos_adr": none, "sensor_vel_adr": none}, True),
@@ -71,6 +78,27 @@ def lean(m: mjw.Model) -> Lean:
         for name in names if allowed else ():
             parts[name] = _without(parts[name], **changes)
     return Lean(m, parts[early], parts[last], parts[integration] if implicit else None, parts[refresh])
+
+
+def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
+    """What mujoco_warp calls at the end of passive forces, for which gravity was off and after which it must be on."""
+    bodies = wp.array(np.flatnonzero(m.body_gravcomp.numpy().any(axis=0)), dtype=int, device=m.body_gravcomp.device)
+    constants = [m.opt.gravity, m.body_rootid, m.body_mass, m.body_gravcomp, m.body_isdofancestor, bodies]
+
+    def carry(model: mjw.Model, d: mjw.Data) -> None:
+        model.opt.disableflags &= ~int(mjw.DisableBit.GRAVITY)
+        state = [d.xipos, d.subtree_com, d.cdof]
+        wp.launch(kernels.carry, dim=d.qvel.shape, inputs=[*constants, *state], outputs=[d.qfrc_passive])
+
+    return carry
+
+
+def _gravity_apart(m: mjw.Model) -> bool:
+    """Whether gravity compensation is the last of the passive forces, and they are computed at all."""
+    off = m.opt.disableflags
+    none = mjw.DisableBit.SPRING | mjw.DisableBit.DAMPER
+    last = not (m.has_fluid or m.flg_adhesion or _any(m.jnt_actgravcomp) or m.callback.passive)
+    return last and not off & mjw.DisableBit.GRAVITY and off & none != none
 
 
 def _without(m: mjw.Model, disable: int = 0, **fields: Any) -> mjw.Model:

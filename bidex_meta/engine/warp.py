@@ -141,6 +141,8 @@ class WarpEngine(Engine):
     def recapture(self) -> None:
         """Forgets the graphs; the next calls record new ones."""
         self._graphs.clear()
+        with self._on_device():
+            self._lean = lean(self._m)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The state may be of the C engine. Refreshes position and velocity sensors."""
