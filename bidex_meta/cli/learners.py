@@ -18,6 +18,7 @@ ALGOS: dict[str, str] = {
     "mttd3": "bidex_algos.offpolicy.td3:TD3",
     "fasttd3": "bidex_algos.offpolicy.fasttd3:FastTD3",
     "brc": "bidex_algos.offpolicy.brc:BRC",
+    "flashsac": "bidex_algos.offpolicy.flashsac:FlashSAC",
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",

@@ -63,8 +63,3 @@ class FastTD3(Categorical, TD3):
 
     def _climbed(self, values: Tensor) -> Tensor:
         return self._pooled(values)
-
-    def _reward_scale(self) -> Tensor:
-        if not self.config.per_task_rewards:
-            return super()._reward_scale()
-        return torch.maximum(self.returns.deviation(), self.returns.bound / self.config.value_bound)
