@@ -191,7 +191,11 @@ class Categorical(OffPolicy):
 
     def _reward_scale(self) -> Tensor:
         scale = super()._reward_scale()
-        return torch.maximum(scale, self.returns.bound / self.config.value_bound) if self.config.per_task_rewards else scale
+        return (
+            torch.maximum(scale, self.returns.bound / self.config.value_bound)
+            if self.config.per_task_rewards
+            else scale
+        )
 
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         log_probs = self._log_probs(self.critic, obs, actions)[:, : len(target)]

@@ -119,8 +119,8 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
     value_bound: Positive = 5.0  # The atoms lie evenly from minus this to this, in scaled rewards.
     target_entropy_per_action: Finite = -0.478
-    """Entropy of the squashed policy that each temperature aims at, for each action: log(sigma sqrt(2 pi e)) of a normal
-    distribution of deviation sigma, here 0.15; uniform actions have 0.69."""
+    """Entropy of the squashed policy that each temperature aims at, for each action: that of a normal distribution of
+    deviation 0.15, log(0.15 sqrt(2 pi e)); uniform actions have 0.69."""
     noise_repeats: Count = 16
     """Most steps for which an environment keeps the noise of its actions; n of them as often as n^-2; 1: none."""
 
