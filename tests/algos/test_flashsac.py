@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from bidex_algos.offpolicy.flashsac import FlashSAC, FlashSACConfig, InvertedBlock, UnitMLP, by_batch
-from tests.algos.problems import OFF_POLICY, a_draw, opposite_bandits, shake, trained
+from tests.algos.problems import OFF_POLICY, PointMass, a_draw, discounted_return, opposite_bandits, shake, trained
 from tests.algos.test_fasttd3_brc import projected
+from tests.algos.test_offpolicy import FLASH
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (32, 32), "atoms": 51, "updates_per_step": 2}
@@ -151,6 +152,14 @@ def test_without_repeats_noise_is_new_at_every_step() -> None:
     learner = FlashSAC(opposite_bandits(rows=8), replace(CONFIG, noise_repeats=1), seed=0)
     obs = torch.zeros(16, 3)
     assert (learner._explore(obs) != learner._explore(obs)).all()
+
+
+def test_a_point_is_brought_to_its_goal() -> None:
+    # In the LQR the largest return is that of the worst states: all others share an atom.
+    learner = trained(FlashSAC, PointMass(), FLASH, 14)
+    best = discounted_return(PointMass(rows=256), learner.world.best, 0.8, 40)
+    assert discounted_return(PointMass(rows=256), lambda obs: torch.zeros(len(obs), 2), 0.8, 40) < 2.5 * best
+    assert discounted_return(PointMass(rows=256), learner.eval_action, 0.8, 40) > 1.3 * best
 
 
 def test_a_loaded_policy_acts_by_the_running_statistics() -> None:
