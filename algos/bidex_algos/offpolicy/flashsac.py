@@ -96,6 +96,10 @@ class UnitMLP(MLP):
                     weight.div_(size)
 
 
+def _of(module: nn.Module) -> list[UnitMLP]:
+    return [each for each in module.modules() if isinstance(each, UnitMLP)]
+
+
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
     """Within it batch norms go by the statistics of what they are given, and take them into the running ones."""
@@ -168,7 +172,7 @@ class FlashSAC(Categorical, MTSAC):
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         critics = super()._make_critics(inputs, heads)
         # Weights of length 1 could not outweigh the biases of a narrow start, of up to 50.
-        for net in critics.nets:
+        for net in _of(critics):
             nn.init.zeros_(net.head.bias)
         return critics
 
@@ -205,9 +209,8 @@ class FlashSAC(Categorical, MTSAC):
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
         numbers = super()._descend(loss, numbers, clipped, **parameters)
-        for module in {"actor": self.policy.actor, "critic": self.critic}[clipped].modules():
-            if isinstance(module, UnitMLP):
-                module.to_sphere()
+        for net in _of({"actor": self.policy.actor, "critic": self.critic}[clipped]):
+            net.to_sphere()
         return numbers
 
     @torch.no_grad()
@@ -215,10 +218,10 @@ class FlashSAC(Categorical, MTSAC):
         """Running statistics become the mean of all processes', of which each goes by its own batch."""
         if world_size() == 1:
             return
-        norms = [m for net in (self.policy.actor, self.critic, self.target_critic) for m in net.modules()]
-        stats = [x for m in norms if isinstance(m, nn.BatchNorm1d) for x in (m.running_mean, m.running_var)]
-        sizes = [len(x) for x in stats]
-        for x, mean in zip(stats, (all_sum(torch.cat(stats)) / world_size()).split(sizes), strict=True):
+        buffers = [each for net in (self.policy.actor, self.critic, self.target_critic) for each in net.named_buffers()]
+        running = [x for name, x in buffers if name.endswith(("running_mean", "running_var"))]
+        means = (all_sum(torch.cat(running)) / world_size()).split([len(x) for x in running])
+        for x, mean in zip(running, means, strict=True):
             x.copy_(mean)
 
     def _own_parts(self) -> Parts:
