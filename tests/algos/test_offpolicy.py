@@ -39,7 +39,7 @@ FAST = FastTD3Config(**ATOMS, critic_layer_norm=False, squash_price=0.0)
 LARGE = BRCConfig(
     **ATOMS, updates_per_step=2, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0
 )  # fmt: skip
-# Rows of length 1 let narrow networks give no sharp distribution of many atoms; steps turn them, of whatever size.
+# With weights of length 1 a narrow network can give a sharp distribution of few atoms only.
 FLASH = FlashSACConfig(
     **ATOMS | {"critic_hidden": (64, 64), "atoms": 21, "learning_rate": 2e-3, "critic_learning_rate": 2e-3},
     value_bound=10.0, updates_per_step=4, policy_delay=1, init_alpha=0.01, target_entropy_per_action=-2.0,
