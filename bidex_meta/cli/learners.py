@@ -18,6 +18,7 @@ ALGOS: dict[str, str] = {
     "mttd3": "bidex_algos.offpolicy.td3:TD3",
     "fasttd3": "bidex_algos.offpolicy.fasttd3:FastTD3",
     "brc": "bidex_algos.offpolicy.brc:BRC",
+    "flashsac": "bidex_algos.offpolicy.flashsac:FlashSAC",
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",
@@ -110,13 +111,14 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
     if first is not None and first[0] in kind.presets:
         return first
-    if not {"laptop", "paper"} <= kind.presets.keys():
+    on_gpu = next((name for name in ("paper", "gpu") if name in kind.presets), None)
+    if on_gpu is None or "laptop" not in kind.presets:
         return next(iter(kind.presets)), "it is the learner's first"
     if device.startswith("cpu"):
         return "laptop", "the device is a CPU"
     if "tuned" in kind.presets:
         return "laptop", "paper is known not to be best, and tuned goes on from what another run has learned"
-    return "paper", "the device is a GPU"
+    return on_gpu, "the device is a GPU"
 
 
 def resolve_device(asked: str, on_gpu: bool) -> str:

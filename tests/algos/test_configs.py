@@ -24,6 +24,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "td3": {"target_std": -0.1, "target_bound": float("nan"), "policy_delay": 0, "exploration_std": (-0.1, 0.1)},
     "fasttd3": {"atoms": 1, "value_bound": 0.0, "n_steps": 0, "weight_decay": -0.1},
     "brc": {"critic_hidden": (8, 16), "hidden": (), "atoms": 1},
+    "flashsac": {"critic_hidden": (8, 16), "hidden": (), "noise_repeats": 0, "policy_delay": 0},
     "promp": {"inner_steps": 0, "gamma": 2.0, "init_std": 0.0, "std_range": (1.0, 0.5), "outer_epochs": 0},
     "maml": {"backtracks": 0, "slice_steps": 0},
     "rl2": {"chunk": 0, "gamma": 1.5, "blind_share": -0.1, "reward_unit": 0.0, "hidden": ()},

@@ -20,6 +20,7 @@ from bidex_algos.multiagent.hatrpo import HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPOConfig
 from bidex_algos.multiagent.mappo import MAPPOConfig
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
+from bidex_algos.offpolicy.flashsac import FlashSAC, FlashSACConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
@@ -51,6 +52,7 @@ REPLAYED: dict[str, Any] = {
     "autocast": "off",
 }  # fmt: skip
 SAC, ATOMS = MTSACConfig(**REPLAYED), BRCConfig(**REPLAYED, critic_hidden=(16, 16), atoms=51)
+FLASH = FlashSACConfig(**REPLAYED, critic_hidden=(16, 16), atoms=51)
 # Steps in proportion to the gradient: Adam as such would not see a sum in the place of a mean.
 PLAIN_SAC = replace(
     SAC, adam_eps=10.0, max_grad_norm=1e9, learning_rate=0.5, critic_learning_rate=0.5, alpha_learning_rate=0.5
@@ -213,9 +215,15 @@ def rl2_tells() -> torch.Tensor:
 
 TWINS: dict[str, Callable[[], torch.Tensor]] = {"mtsac": mtsac_moves, "rl2": rl2_tells}
 OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2, "dagger": dagger}
-OTHERS["icl"] = icl
+OTHERS |= {"icl": icl, "flashsac": partial(mtsac, FLASH, FlashSAC)}
 REPLAYING = 2 * 3 * SAC.steps_per_iteration * 8
-STEPS = {"mtppo": 4 * ITERATION, "mtsac": REPLAYING, "brc": REPLAYING, "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7)}
+STEPS = {
+    "mtppo": 4 * ITERATION,
+    "mtsac": REPLAYING,
+    "brc": REPLAYING,
+    "flashsac": REPLAYING,
+    "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7),
+}
 STEPS["icl"] = STEPS["rl2"]
 STEPS["dagger"] = 2 * 3 * TAUGHT.rollout_steps * 8
 
@@ -286,7 +294,15 @@ def test_an_update_of_twins_is_that_of_one(found, name):
         assert_close(twin, alone, rtol=1e-3, atol=tolerance)
 
 
-KINDS = [("mtppo", MTPPO), ("mtsac", MTSAC), ("brc", BRC), ("rl2", RL2), ("dagger", DAgger), ("icl", ICL)]
+KINDS = [
+    ("mtppo", MTPPO),
+    ("mtsac", MTSAC),
+    ("brc", BRC),
+    ("flashsac", FlashSAC),
+    ("rl2", RL2),
+    ("dagger", DAgger),
+    ("icl", ICL),
+]
 
 
 @pytest.mark.parametrize(("name", "make"), KINDS)

@@ -45,6 +45,7 @@ FLAGS = {
     "maddpg": f"{_REPLAY} {_PAIR}",
     "fasttd3": f"{_REPLAY} --learner.critic-hidden 8 --learner.atoms 5",
     "brc": f"{_REPLAY} --learner.critic-hidden 8 --learner.atoms 5 --learner.task-embedding 2",
+    "flashsac": f"{_REPLAY} --learner.critic-hidden 8 --learner.atoms 5",
     **dict.fromkeys(("promp", "maml"), f"{_ADAPTS} --learner.tasks-per-class 2"),
     "rl2": f"{_ADAPTS} --learner.memory 8 --learner.chunk 4 --learner.episodes-per-trial 2",
     **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),

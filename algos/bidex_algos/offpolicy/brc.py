@@ -17,10 +17,9 @@ from bidex_algos.advantages import discounts
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Layers, linear
 from bidex_algos.nets.policy import squashed_policy
-from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
+from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig, check_residual
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Transitions
-from bidex_meta.errors import BidexError
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Share, Whole
 
 
@@ -74,12 +73,7 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.shares_a_trunk:
-            raise BidexError(f"{self.algo}: its networks are residual; architecture must be shared or multi_head.")
-        for name in ("hidden", "critic_hidden"):
-            widths = vars(self)[name]
-            if len(set(widths)) != 1:
-                raise BidexError(f"{self.algo}: {name} must be one width, once or more often, got {widths}.")
+        check_residual(self)
 
 
 PRESETS: dict[str, BRCConfig] = {

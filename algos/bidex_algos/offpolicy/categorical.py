@@ -1,4 +1,4 @@
-"""What FastTD3 and BRC share: critics that give a distribution of the return, taught by cross-entropy.
+"""What FastTD3, BRC and FlashSAC share: critics that give a distribution of the return, taught by cross-entropy.
 
 Z(s, a) has probabilities of fixed values ("atoms"); targets r + gamma (1 - terminated) Z'(s', a') are projected back on
 them (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike a regression's, its gradient does not grow with the scale of
@@ -17,6 +17,7 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, Layers, MakeNetwork, autocast
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
 from bidex_algos.replay import Transitions
+from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_max
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import MOST, Positive
@@ -64,6 +65,15 @@ class CategoricalConfig(OffPolicyConfig):
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base, where ``hidden`` is of all networks, and the critics'."""
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
+
+
+def check_residual(config: CategoricalConfig) -> None:
+    """Raises BidexError where residual networks cannot be made of a config's layers."""
+    if not config.shares_a_trunk:
+        raise BidexError(f"{config.algo}: its networks are residual; architecture must be shared or multi_head.")
+    for name, widths in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
+        if len(set(widths)) != 1:
+            raise BidexError(f"{config.algo}: {name} must be one width, once or more often, got {widths}.")
 
 
 class CategoricalCritics(nn.Module):
@@ -159,8 +169,9 @@ class Categorical(OffPolicy):
         return CategoricalCritics(inputs, heads, self.config, self.initial, self.num_critics, network)
 
     def _log_probs(self, critic: CategoricalCritics, obs: Tensor, actions: Tensor) -> Tensor:
+        tasks = self.task_of_draw.repeat(len(obs) // len(self.task_of_draw))
         with autocast(self.device, self.low_precision):
-            return critic.log_probs(obs, actions, self.task_of_draw)
+            return critic.log_probs(obs, actions, tasks)
 
     def _pooled(self, values: Tensor) -> Tensor:
         return values.amin(0) if self.config.clipped_double_q else values.mean(0)
@@ -178,7 +189,15 @@ class Categorical(OffPolicy):
         factor = (self.gamma_of_draw**draw.steps) * (~draw.terminated).to(shift.dtype)
         return self.critic.atoms.projected(following, shift, factor)
 
+    def _reward_scale(self) -> Tensor:
+        scale = super()._reward_scale()
+        return (
+            torch.maximum(scale, self.returns.bound / self.config.value_bound)
+            if self.config.per_task_rewards
+            else scale
+        )
+
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        log_probs = self._log_probs(self.critic, obs, actions)
+        log_probs = self._log_probs(self.critic, obs, actions)[:, : len(target)]
         values = self.critic.atoms.mean(log_probs[0].detach().exp())
         return -(target * log_probs).sum(2), values

@@ -30,12 +30,13 @@ PRESETS: dict[str, FastTD3Config] = {
     # The authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py, 2025), since the paper
     # has no table of all: replay, discount, steps, bound and scaled rewards of its class for several tasks
     # (MTBenchArgs, MetaWorldMT10Args), the rest its defaults (BaseArgs), whose 0 for the gradient's norm means no
-    # limit.
+    # limit. replay_memory holds those steps of its 4,096 environments, of 441 columns.
     "paper": FastTD3Config(
         hidden=(512, 256, 128), critic_hidden=(1024, 512, 256), critic_layer_norm=False, task_embedding=32,
-        replay_steps=2048, warmup_steps=10, updates_per_step=2, batch_size=32_768, gamma=0.97, n_steps=8, tau=0.1,
-        learning_rate=3e-4, critic_learning_rate=3e-4, weight_decay=0.1, max_grad_norm=1e9, atoms=101, value_bound=10.0,
-        exploration_std=(0.001, 0.4), target_std=0.001, target_bound=0.5, policy_delay=2, squash_price=0.0,
+        replay_steps=2048, replay_memory=18.0, warmup_steps=10, updates_per_step=2, batch_size=32_768, gamma=0.97,
+        n_steps=8, tau=0.1, learning_rate=3e-4, critic_learning_rate=3e-4, weight_decay=0.1, max_grad_norm=1e9,
+        atoms=101, value_bound=10.0, exploration_std=(0.001, 0.4), target_std=0.001, target_bound=0.5, policy_delay=2,
+        squash_price=0.0,
     ),
     "laptop": FastTD3Config(),
     # Meta-World's suites on one core: discount, steps and bound of the authors' class for them, narrower layers, one
@@ -63,8 +64,3 @@ class FastTD3(Categorical, TD3):
 
     def _climbed(self, values: Tensor) -> Tensor:
         return self._pooled(values)
-
-    def _reward_scale(self) -> Tensor:
-        if not self.config.per_task_rewards:
-            return super()._reward_scale()
-        return torch.maximum(self.returns.deviation(), self.returns.bound / self.config.value_bound)

@@ -101,7 +101,7 @@ class MTSAC(OffPolicy):
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        reported |= self._policy_step(obs, weights, counts)
+        reported |= self._policy_step(obs, *self.policy.sample(obs, self.generator), weights, counts)
         follow(self.target_critic, self.critic, self.config.tau)
         return reported
 
@@ -111,9 +111,10 @@ class MTSAC(OffPolicy):
         following = self._pooled(self._values(self.target_critic, next_obs, next_actions))
         return self._bootstrapped(draw, following - self.log_alpha.exp()[self.task_of_draw] * log_prob)
 
-    def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
+    def _policy_step(
+        self, obs: Tensor, actions: Tensor, log_prob: Tensor, weights: Tensor, counts: Tensor
+    ) -> dict[str, Tensor]:
         weight = weights / counts.sum().clamp_min(1.0)
-        actions, log_prob = self.policy.sample(obs, self.generator)
         alpha = self.log_alpha.detach().exp()[self.task_of_draw]
         actor_loss = (weight * (alpha * log_prob - self._pooled(self._values(self.critic, obs, actions)))).sum()
         gap = self._per_task(weights * (log_prob.detach() + self.target_entropy)) / counts.clamp_min(1.0)
