@@ -53,7 +53,7 @@ goldens: .venv/.installed-dev
 # interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
 DEVICE ?= cuda:0
 OUT ?= gpu-results
-SIZES ?= 1024 4096 16384 32768
+SIZES ?= 1024 8192 32768 131072
 ROWS ?= 8192
 TRAIN_STEPS ?= 60000000
 CLI ?= $(BIN)/python -m bidex_meta.cli

@@ -16,7 +16,7 @@ from bidex_meta.world import World
 from tools.bench.soak import chosen_learner, resident
 from tools.bench.timing import now, random_steps
 
-_SIZES = (1024, 4096, 16384, 32768)
+_SIZES = (1024, 8192, 32768, 131072)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
 """A thrown egg, a jointed object and a movable fixture."""
 
@@ -47,7 +47,7 @@ def gpu(
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step and of its physics, together and group by group. Beside them, for each size,
+        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning. Beside them, for each size,
         the suite over the harmonic mean of the classes.
     """
     machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
@@ -122,19 +122,20 @@ def _measured(
         for _ in range(5):  # its update is recorded as a graph after a few
             numbers = learner.iterate()
         row["training_steps_per_s"] = round(numbers["Perf/steps_per_second"])
-        row["learning"] = {name: round(numbers[f"Perf/{name}_time"], 3) for name in ("collection", "learning")}
+        row["stages"]["learning"] = round(1000.0 * size / row["training_steps_per_s"] - row["stages"]["step"], 3)
     made.close()
     return row
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
-    """Milliseconds of a step, of its physics alone, and of each group's physics with the others at rest.
+    """Milliseconds of a step, of its physics, of the rest (``torch``), and of each group with the others at rest.
 
     ``launching`` is the host's part of the physics. ``overlap`` is 0 where groups run one after the other, and 1 where
     all take no longer than the slowest.
     """
     took = {"step": 1000.0 * random_steps(made, steps).wall / steps}
     took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
+    took["torch"] = took["step"] - took["physics"]
     alone = {}
     for part in made.parts:
         name = made.slots[part.group.members[0].slot].name
