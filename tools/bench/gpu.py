@@ -47,8 +47,8 @@ def gpu(
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning. Beside them, for each size,
-        the suite over the harmonic mean of the classes.
+        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning. Beside them,
+        for each size, the suite over the harmonic mean of the classes.
     """
     machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
