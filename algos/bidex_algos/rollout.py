@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from bidex_algos.nets import products
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum
 from bidex_meta.utils.maths import check_precision
@@ -96,7 +97,7 @@ def collect(
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
         values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
-        if not may_look(cut.device):
+        if not products.may_look(cut.device):
             # A forward of all environments is cheaper than the wait for which rows there are.
             there = cut.view(-1, *[1] * (values.dim() - 1))
             values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
@@ -116,8 +117,3 @@ def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
             f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
             f'autoreset_mode="{expected}".'
         )
-
-
-def may_look(device: torch.device) -> bool:
-    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
-    return device.type == "cpu"

@@ -240,3 +240,21 @@ def test_columns_in_eights_change_no_product(width: int):
         torch.autograd.grad(out.sum(), (x, weight)), torch.autograd.grad((x @ weight.T).sum(), (x, weight)), strict=True
     ):
         torch.testing.assert_close(got, expected)
+
+
+def test_own_heads_are_those_of_all_heads():
+    generator = torch.Generator().manual_seed(0)
+    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.5, generator, heads=2)
+    x = torch.randn(6, 5, generator=generator)
+    x[:, 3:] = torch.eye(2)[torch.tensor([1, 0, 1, 1, 1, 0])]
+
+    def found(own: bool) -> list[Tensor]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(products, "may_look", lambda device: own)
+            out = actor(x)
+            return [out, *torch.autograd.grad(out.square().sum(), list(actor.mean.parameters()))]
+
+    for one, other in zip(found(True), found(False), strict=True):
+        assert_close(one, other)
+    alone = x[1:2]
+    assert_close(actor(alone), actor(x)[1:2])

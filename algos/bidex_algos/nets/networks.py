@@ -8,6 +8,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
+from bidex_algos.nets import products
 from bidex_algos.nets.inputs import GroupEncoder, Inputs
 from bidex_algos.nets.products import Linear, affine, stacked_affine
 from bidex_meta.utils.validation import Width
@@ -75,6 +76,13 @@ class MLP(Headed):
         with torch.autocast(x.device.type, enabled=False):
             return self.head(features.to(self.head.weight.dtype))
 
+    def of_head(self, x: Tensor, index: Tensor, heads: int) -> Tensor:
+        """The same (batch, outputs / heads), of the head that int64 (batch,) names."""
+        features = self.body(self.encoder(x))
+        with torch.autocast(x.device.type, enabled=False):
+            weight, bias = self.head.weight, self.head.bias
+            return products.own_head(features.to(weight.dtype), weight, bias, index, heads)
+
 
 def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor, own: str = "") -> Tensor:
     """The outputs of M networks of one form on a batch each: (M, B, inputs) to (M, B, outputs).
@@ -140,6 +148,8 @@ class GaussianActor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
+        if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, MLP) and products.may_look(x.device):
+            return self.mean.of_head(x, self.one_hot(x).argmax(-1), self.heads)
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
