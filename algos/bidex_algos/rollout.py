@@ -5,10 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from bidex_algos.nets import products
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum
-from bidex_meta.utils.maths import check_precision
+from bidex_meta.utils import maths
 from bidex_meta.world.contract import Info, VectorWorld
 
 
@@ -97,7 +96,7 @@ def collect(
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
         values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
-        if not products.may_look(cut.device):
+        if not maths.may_look(cut.device):
             # A forward of all environments is cheaper than the wait for which rows there are.
             there = cut.view(-1, *[1] * (values.dim() - 1))
             values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
@@ -110,7 +109,7 @@ def collect(
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
     """Refuses, by a BidexError, another autoreset mode than the learner's, or another default precision than single."""
-    check_precision()
+    maths.check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:
         raise BidexError(

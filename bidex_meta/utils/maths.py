@@ -156,3 +156,8 @@ def quaternion_product(
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
     )
+
+
+def may_look(device: torch.device) -> bool:
+    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
+    return device.type == "cpu"

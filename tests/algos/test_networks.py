@@ -17,6 +17,7 @@ from bidex_algos.nets.normalise import RunningStats, TaskNormaliser
 from bidex_algos.nets.point_net import PointNet
 from bidex_algos.nets.policy import SquashedActor, sample_squashed
 from bidex_algos.nets.products import affine
+from bidex_meta.utils import maths
 from bidex_meta.world.contract import plain_groups
 
 TASKS_LAST = Inputs(plain_groups(5, 2))
@@ -250,7 +251,7 @@ def test_own_heads_are_those_of_all_heads():
 
     def found(own: bool) -> list[Tensor]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(products, "may_look", lambda device: own)
+            patch.setattr(maths, "may_look", lambda device: own)
             out = actor(x)
             return [out, *torch.autograd.grad(out.square().sum(), list(actor.mean.parameters()))]
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from bidex_algos import rollout
-from bidex_algos.nets import products
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta import Benchmark
+from bidex_meta.utils import maths
 from tests.world.play import suite_world
 from tests.world.test_masked import masked, no_looks
 
@@ -27,7 +27,7 @@ OPTIONS = {
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_collecting_and_learning_look_at_no_number(masked, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]):
-    monkeypatch.setattr(products, "may_look", lambda device: False)
+    monkeypatch.setattr(maths, "may_look", lambda device: False)
     learner = MTPPO(suite_world("MT4", 8), replace(CONFIG, **options), seed=0)
     learner.iterate()  # constants are brought to the device once
     obs = learner.obs

@@ -14,7 +14,6 @@ from bidex_algos.learner import Learner, as_numbers
 from bidex_algos.meta.adaptation import Adapter, Objective, Params, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig, OuterConfig
 from bidex_algos.meta.stage import Outcome, Stage, TaskRows, moments, task_batch
-from bidex_algos.nets import products
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
@@ -23,6 +22,7 @@ from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
 from bidex_meta.train.learner import AutoresetMode, Parts, State
+from bidex_meta.utils import maths
 from bidex_meta.world.contract import PooledWorld
 
 
@@ -253,7 +253,7 @@ class MetaLearner(Learner):
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
             if self.config.slice_steps is None:
                 running = running & ~over
-                if products.may_look(self.device) and not running.any():
+                if maths.may_look(self.device) and not running.any():
                     break
         self.obs = obs
         self.steps_with_tasks += len(stage)

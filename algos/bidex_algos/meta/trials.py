@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from bidex_algos.advantages import explained_variance, gae, normalise_per_task, task_moments
-from bidex_algos.nets import products
 from bidex_algos.nets.networks import Activation, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.utils import maths
 from bidex_meta.utils.validation import Count, Fraction, Positive, Widths
 from bidex_meta.world.contract import VectorWorld
 
@@ -176,7 +176,7 @@ def play(
             earned, whole = earned + reward, whole & (valid | ~playing)
             success = success | (info["success"] & playing)
             playing = playing & ~ended
-            if products.may_look(device) and not playing.any():
+            if maths.may_look(device) and not playing.any():
                 break
         found = {"r": earned, "l": elapsed, "success": success}
         for each in statistics[episode]:

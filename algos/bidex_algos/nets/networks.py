@@ -8,9 +8,9 @@ import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.nets import products
 from bidex_algos.nets.inputs import GroupEncoder, Inputs
-from bidex_algos.nets.products import Linear, affine, stacked_affine
+from bidex_algos.nets.products import Linear, affine, own_head, stacked_affine
+from bidex_meta.utils import maths
 from bidex_meta.utils.validation import Width
 
 Activation = Literal["elu", "relu", "tanh"]
@@ -81,7 +81,7 @@ class MLP(Headed):
         features = self.body(self.encoder(x))
         with torch.autocast(x.device.type, enabled=False):
             weight, bias = self.head.weight, self.head.bias
-            return products.own_head(features.to(weight.dtype), weight, bias, index, heads)
+            return own_head(features.to(weight.dtype), weight, bias, index, heads)
 
 
 def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor, own: str = "") -> Tensor:
@@ -148,7 +148,7 @@ class GaussianActor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
-        if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, MLP) and products.may_look(x.device):
+        if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, MLP) and maths.may_look(x.device):
             return self.mean.of_head(x, self.one_hot(x).argmax(-1), self.heads)
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 

@@ -15,11 +15,6 @@ from torch import Tensor, nn
 _LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call costs is more than what it saves
 
 
-def may_look(device: torch.device) -> bool:
-    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
-    return device.type == "cpu"
-
-
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``x @ weight.T + bias``, differentiable: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
     if not _pays(x, weight):
