@@ -64,9 +64,9 @@ def lean(m: mjw.Model) -> Lean:
         (everywhere, {"ntendon": 0, "nJten": 0}, implicit and _tendons_limit_only(m)),
         # Without friction of joints and tendons there are no rows.
         (everywhere, {"disable": mjw.DisableBit.FRICTIONLOSS}, not _any(m.dof_frictionloss, m.tendon_frictionloss)),
-        # Only the last substep's sensors are read, of which the refresh redoes those of positions and velocities.
         # mujoco_warp asks every body for its share of every degree of freedom; few bodies have one.
         ((early, last), {"callback": replace(m.callback, passive=_carrier(m))}, implicit and _gravity_apart(m)),
+        # Only the last substep's sensors are read, of which the refresh redoes those of positions and velocities.
         ((early,), {"disable": mjw.DisableBit.SENSOR}, True),
         ((early,), {"nsite": 0}, not _sites_act(m)),
         ((last,), {"sensor_pos_adr": none, "sensor_vel_adr": none}, True),

@@ -89,16 +89,18 @@ def test_ppo_starts_from_a_student_has_its_teachers_and_is_resumed(student: Path
 
 
 def test_teachers_that_do_not_fit_are_refused(student: Path, refused: Command) -> None:
-    def told(*words: object) -> str:
+    def message(*words: object) -> str:
         return refused("run", "--device", "cpu", *words)
 
-    assert "Add --teacher scripts" in told("--suite", "MT4-v2", "--algo", "dagger")
-    assert "goes with mtppo, ppo, dagger, icl" in told("--suite", "MT4-v2", "--algo", "mtsac", "--teacher", "scripts")
-    assert "No class of MT1 has" in told("--suite", "MT1", "--algo", "dagger", "--teacher", "scripts")
-    assert "that ML20-v2 hides" in told("--suite", "ML20-v2", "--algo", "dagger", "--teacher", "scripts")
+    assert "Add --teacher scripts" in message("--suite", "MT4-v2", "--algo", "dagger")
+    assert "goes with mtppo, ppo, dagger, icl" in message(
+        "--suite", "MT4-v2", "--algo", "mtsac", "--teacher", "scripts"
+    )
+    assert "No class of MT1 has" in message("--suite", "MT1", "--algo", "dagger", "--teacher", "scripts")
+    assert "that ML20-v2 hides" in message("--suite", "ML20-v2", "--algo", "dagger", "--teacher", "scripts")
     for words in (("--suite", "MT4-v2"), ("--task", "Switch")):
-        assert "in the same form" in told(*words, "--algo", "dagger", "--teacher", student)
+        assert "in the same form" in message(*words, "--algo", "dagger", "--teacher", student)
     fixed = "--task", "Switch-v2", "--base", "fixed", "--algo", "dagger", "--teacher", "scripts"
-    assert "Add --base moving" in told(*fixed)
+    assert "Add --base moving" in message(*fixed)
     warp = "--task", "Switch-v2", "--engine", "warp", "--algo", "dagger", "--teacher", "scripts"
-    assert "leave --engine out" in told(*warp)
+    assert "leave --engine out" in message(*warp)
