@@ -86,10 +86,11 @@ CASES = {
     "icl": Case("icl", {"hidden": (8,), "memory": 8, "head": (8,), "updates_per_iteration": 2, "trials": 32}),
 }  # fmt: skip
 SHARING = {
-    f"{algo} {name}": Case(algo, more | shared | {"hidden": (16, 8)})
+    f"{algo} {name}": Case(algo, more | {"hidden": (16, 8)} | shared)
     for algo, more in (("mtppo", ON), ("mttrpo", ON), ("mtsac", OFF), ("td3", OFF))
     for name, shared in (
-        *((trunk, {"architecture": trunk, "modules": 2}) for trunk in ("soft_modules", "paco", "moore")),
+        *((trunk, {"architecture": trunk, "modules": 2}) for trunk in ("soft_modules", "paco", "moore", "towers")),
+        ("transformer", {"architecture": "transformer", "modules": 2, "hidden": (8, 8)}),
         ("embedding", {"task_embedding": 4}),
         *((way, {"gradient_surgery": way}) for way in ("pcgrad", "cagrad", "famo") if algo == "mtppo"),
     )

@@ -84,6 +84,15 @@ def test_teachers_play_fewer_and_fewer_episodes_and_label_all() -> None:
     assert teacher.asked == 12 * 8 and teacher.begun == 8 + sum(12 * 8 // 4 for _ in range(8))
 
 
+def test_the_learning_rate_falls_in_a_line_and_stays_at_a_twentieth() -> None:
+    learner = taught(two_tasks(), replace(SMALL, decay_steps=8 * 16 * 4), Constant(0.3, 0.3))
+    rates = []
+    for _ in range(6):
+        learner.iterate()
+        rates.append(learner.lessons.adam.param_groups[0]["lr"] / SMALL.learning_rate)
+    assert rates == pytest.approx([1.0, 0.7625, 0.525, 0.2875, 0.05, 0.05])
+
+
 def test_a_class_without_a_teacher_is_played_by_the_student_and_not_learned() -> None:
     learner = taught(two_tasks(), CLONED, Constant(0.3, 0.3))
     reported = learner.iterate()

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,13 +15,14 @@ from torch.testing import assert_close
 from bidex_algos.balancing import Famo, conflict_averse, project_conflicting, worst_served
 from bidex_algos.nets.architecture import network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, gram_schmidt
+from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, Towers, Transformer, gram_schmidt
 from bidex_algos.nets.networks import MLP
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
 
-TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
+TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer}
+TRUNKS |= {"towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0)}
 # The task id stands in the middle: nothing may assume that it is last.
 GROUPS = (ObservationGroup("state", (slice(0, 3), slice(6, 9))), ObservationGroup("task_id", (slice(3, 6),)))
 TASKS = torch.arange(8) % 3
@@ -30,7 +32,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def made(name: str, hidden: tuple[int, ...] = (16, 12, 10), modules: int = 4, **options: Any) -> Any:
+def made(name: str, hidden: tuple[int, ...] = (16, 12, 12), modules: int = 4, **options: Any) -> Any:
     return TRUNKS[name](Inputs(GROUPS), hidden, 5, 1.0, generator(), modules=modules, **options)
 
 
@@ -75,8 +77,8 @@ def test_moores_experts_are_orthogonal_and_mixed_by_the_tasks_weights():
     experts = network.experts(x)
     assert_close(torch.einsum("ibn,jbn->bij", experts, experts), torch.eye(4).expand(8, -1, -1), rtol=0, atol=1e-5)
     weights = network.weights.rows[TASKS]
-    together = sum((weights[:, k, None] * experts[k] for k in range(4)), torch.zeros(8, 10))
-    hidden = torch.nn.functional.elu(10**0.5 * together)
+    together = sum((weights[:, k, None] * experts[k] for k in range(4)), torch.zeros(8, 12))
+    hidden = torch.nn.functional.elu(12**0.5 * together)
     assert_close(network(x), network.head(hidden))
 
 
@@ -98,6 +100,23 @@ def test_soft_routes_sum_to_one_and_follow_the_paper(hidden: tuple[int, ...]):
         if number < len(network.up):
             logits = network.down[number + 1]((network.up[number](logits) * both).relu())
     assert_close(network.head(given[0]), network(x)[row])
+
+
+@pytest.mark.parametrize("name", ["towers", "separate"])
+def test_a_tower_reads_and_learns_its_own_task_alone(name: str, monkeypatch: pytest.MonkeyPatch):
+    network, x = made(name, (16, 12)), observations()
+    state = x[:, [0, 1, 2, 6, 7, 8]]
+    for layer in network.common:
+        state = torch.nn.functional.elu(layer(state))
+    for layer in network.own:
+        rows = zip(state, layer.weight[TASKS], layer.bias[TASKS], strict=True)
+        state = torch.stack([torch.nn.functional.elu(w @ row + b) for row, w, b in rows])
+    out = network(x)
+    assert_close(out, network.head(state))
+    out[TASKS == 1].sum().backward()
+    assert all((layer.weight.grad.abs().sum((1, 2)) > 0).tolist() == [False, True, False] for layer in network.own)
+    monkeypatch.setattr("bidex_meta.utils.maths.may_look", lambda device: False)  # as on a GPU
+    assert_close(network(x), out)
 
 
 def test_pacos_layers_are_those_of_the_composed_parameters():

@@ -32,6 +32,7 @@ class DAggerConfig(NetworkConfig):
     batch_size: Count = 1024  # Labelled observations of an update, split evenly over the classes with a teacher.
     samples: Count = 1_500_000  # Labelled observations that each process keeps; the oldest go first.
     learning_rate: Positive = 5e-4  # Adam's step size.
+    decay_steps: Whole = 0  # Environment steps over which it falls in a line to a twentieth of that; 0: it stays.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
     teacher_steps: Whole = 500_000
     """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0. Drawn for each
@@ -87,6 +88,7 @@ class DAgger(Learner):
             for _ in range(self.config.rollout_steps):
                 unstable += self._step(share)
         self.lessons.take_moments(self.config.rollout_steps)
+        self.lessons.adam.param_groups[0]["lr"] = self._learning_rate()
         losses = self.lessons.learn(self.config.updates_per_iteration, self.generator)
         self.env_steps += self.config.rollout_steps * self.world.num_envs * world_size()
         return self.episodes.metrics() | as_numbers({"Train/unstable": all_sum(unstable), **losses}) | self._played()
@@ -95,6 +97,10 @@ class DAgger(Learner):
         """Of the episodes that begin now: those that the teacher plays."""
         steps = self.config.teacher_steps
         return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
+
+    def _learning_rate(self) -> float:
+        done = min(1.0, self.env_steps / self.config.decay_steps) if self.config.decay_steps else 0.0
+        return self.config.learning_rate * (1.0 - 0.95 * done)
 
     def _begin_all(self, obs: Tensor, share: float) -> None:
         everyone = torch.ones_like(self.teacher_plays)

@@ -8,15 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.multitask import Moore, PaCo, SoftModules
+from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, Towers, Transformer
 from bidex_algos.nets.networks import MLP, Activation, Layers, MakeNetwork
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Whole, Widths
 
 Options = dict[str, Any]  # fields of a config by name
-Architecture = Literal["shared", "multi_head", "soft_modules", "paco", "moore"]
-_TRUNKS: dict[str, MakeNetwork] = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
+Architecture = Literal["shared", "multi_head", "towers", "separate", "soft_modules", "paco", "moore", "transformer"]
+_TRUNKS: dict[str, MakeNetwork] = {
+    "soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer,
+    "towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -24,9 +27,10 @@ class ArchitectureConfig(LearnerConfig):
     """Layers of actor and critics, and how they share weights between tasks."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. soft_modules, paco, moore:
-    other trunks, each with or without heads; for MT suites, whose observations show the task."""
-    modules: Count = 4  # Modules of a layer of soft_modules, parameter sets of paco, experts of moore.
+    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
+    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
+    heads. All but shared for MT suites, whose observations show the task."""
+    modules: Count = 4  # Modules of a layer of soft_modules, parameter sets of paco, experts of moore, attention heads.
     hidden: Layers = (256, 256)  # Widths of the hidden layers, of actor and critics alike.
     activation: Activation = "relu"  # Non-linearity of the hidden layers.
 
@@ -49,7 +53,7 @@ class NetworkConfig(ArchitectureConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.architecture == "multi_head":
+        if self.architecture in ("multi_head", "towers", "separate"):
             for heads in ("policy_heads", "value_heads"):
                 object.__setattr__(self, heads, True)  # so that a checkpoint's config has them too
         if self.shares_a_trunk:
@@ -57,7 +61,7 @@ class NetworkConfig(ArchitectureConfig):
         if self.task_embedding:
             raise BidexError(
                 f"{self.algo}: task_embedding goes with architecture shared or multi_head, got {self.architecture}, "
-                "which has task weights of its own. Leave task_embedding off."
+                "which reads the task its own way. Leave task_embedding off."
             )
         layers = {name: widths for name, widths in vars(self).items() if name in ("hidden", "critic_hidden")}
         for name, widths in layers.items():
@@ -70,6 +74,11 @@ class NetworkConfig(ArchitectureConfig):
                 raise BidexError(
                     f"{self.algo}: moore needs no more modules than the last width of {name}, since no more "
                     f"directions are orthogonal there; got {self.modules} and {widths}."
+                )
+            if self.architecture == "transformer" and (len({*widths}) != 1 or widths[0] % self.modules):
+                raise BidexError(
+                    f"{self.algo}: transformer needs one width for all of {name}, a multiple of modules; got {widths} "
+                    f"and {self.modules}."
                 )
 
 

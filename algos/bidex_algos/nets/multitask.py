@@ -1,15 +1,18 @@
-"""Trunks that share weights between tasks: MOORE, PaCo and soft modules, in the place of an ``MLP``."""
+"""Trunks in the place of an ``MLP``: MOORE, PaCo, soft modules and towers divide weights among tasks; a transformer."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from bidex_algos.nets.inputs import GroupEncoder, Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, Activation, Headed, linear
-from bidex_algos.nets.products import affine, stacked_affine
+from bidex_algos.nets.products import affine, by_own, stacked_affine
+from bidex_meta.utils import maths
 
 
 class StackedLinear(nn.Module):
@@ -23,6 +26,11 @@ class StackedLinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(count, outputs)) if bias else None
         for layer in self.weight.detach():
             nn.init.orthogonal_(layer, gain, generator=generator)
+
+    def each(self) -> list[Callable[[Tensor], Tensor]]:
+        """The layers one by one: (batch, inputs) to (batch, outputs)."""
+        biases = [None] * len(self.weight) if self.bias is None else self.bias.unbind()
+        return [partial(affine, weight=w, bias=b) for w, b in zip(self.weight.unbind(), biases, strict=True)]
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (batch, inputs), the same for all, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
@@ -109,11 +117,11 @@ class Moore(Headed):
         with torch.autocast(x.device.type, enabled=False):
             return gram_schmidt(raw.to(self.head.weight.dtype))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs) to float32 (batch, outputs)."""
+    def features(self, x: Tensor) -> Tensor:
+        """As in the base; float32."""
         experts = self.experts(x)
         with torch.autocast(x.device.type, enabled=False):
-            return self.head(self.activation(self.scale * mixed(self.weights(x), experts)))
+            return self.activation(self.scale * mixed(self.weights(x), experts))
 
 
 class PaCo(nn.Module):
@@ -192,10 +200,82 @@ class SoftModules(Headed):
         """Embeddings of the states of observations (batch, inputs): (batch, width)."""
         return self.between(self.state(self.encoder(x)))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs) to float32 (batch, outputs)."""
+    def features(self, x: Tensor) -> Tensor:
+        """As in the base."""
         features = state = self.embedded(x)
         for layer, shares in zip(self.layers, self.routes(x, state), strict=True):
             features = torch.einsum("bij,jbn->ibn", shares, self.between(layer(features)))
-        with torch.autocast(x.device.type, enabled=False):
-            return self.head(features[0].to(self.head.weight.dtype))
+        return features[0]
+
+
+class Towers(Headed):
+    """Behind ``shared`` common layers those of each task alone; 0: a network for each task, in one.
+
+    The task's one-hot chooses and is not fed to the layers.
+    """
+
+    def __init__(
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = False, *, modules: int, shared: int
+    ):  # fmt: skip
+        super().__init__()
+        inputs, gain = Inputs.of(inputs), math.sqrt(2.0)
+        self.one_hot = inputs.columns("task_id")
+        self.encoder = GroupEncoder(inputs.without("task_id"), generator)
+        widths = list(pairwise([self.encoder.size, *hidden]))
+        self.between = nn.Sequential(PlainNorm(layer_norm), ACTIVATIONS[activation]())
+        self.common = nn.ModuleList(linear(*pair, gain, generator) for pair in widths[:shared])
+        self.own = nn.ModuleList(StackedLinear(self.one_hot.size, *pair, gain, generator) for pair in widths[shared:])
+        self.head = linear(hidden[-1], outputs, output_gain, generator)
+
+    def features(self, x: Tensor) -> Tensor:
+        """As in the base."""
+        one_hot, features = self.one_hot(x), self.encoder(x)
+        for layer in self.common:
+            features = self.between(layer(features))
+        if maths.may_look(x.device):
+            parts = zip(*(layer.each() for layer in self.own), strict=True)
+            return by_own(features, one_hot.argmax(-1), [self._tower(layers) for layers in parts])
+        for layer in self.own:
+            features = self.between(layer(features))
+        return mixed(one_hot, features)
+
+    def _tower(self, layers: Sequence[Callable[[Tensor], Tensor]]) -> Callable[[Tensor], Tensor]:
+        return lambda x: reduce(lambda x, layer: self.between(layer(x)), layers, x)
+
+
+class Transformer(Headed):
+    """A token of each group of the observation, all attending to all (Vaswani et al. 2017, arXiv 1706.03762).
+
+    A block for each entry of ``hidden``, which are one width, with ``modules`` heads of attention. Tokens are
+    normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745) whatever ``layer_norm`` says. The
+    output layer reads the mean of the tokens.
+    """
+
+    def __init__(
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = False, *, modules: int
+    ):  # fmt: skip
+        super().__init__()
+        inputs, width = Inputs.of(inputs), hidden[-1]
+        shown = [group.name for group in inputs.groups if group.name not in inputs.hidden]
+        self.encoders = nn.ModuleList(GroupEncoder(inputs.only(name), generator) for name in shown)
+        self.tokens = nn.ModuleList(linear(part.size, width, 1.0, generator) for part in self.encoders)
+        with torch.random.fork_rng(devices=[]):  # PyTorch's layers draw from the global generator
+            torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device="cpu")))
+            self.blocks = nn.Sequential(
+                *(
+                    nn.TransformerEncoderLayer(
+                        width, modules, 2 * width, 0.0, ACTIVATIONS[activation](), batch_first=True, norm_first=True
+                    )
+                    for _ in hidden
+                )
+            )
+        self.norm = nn.LayerNorm(width)
+        self.head = linear(width, outputs, output_gain, generator)
+
+    def features(self, x: Tensor) -> Tensor:
+        """As in the base."""
+        tokens = [token(encoder(x)) for encoder, token in zip(self.encoders, self.tokens, strict=True)]
+        with sdpa_kernel(SDPBackend.MATH):  # the others have no gradient of their gradient, which TRPO needs
+            return self.norm(self.blocks(torch.stack(tokens, dim=1)).mean(1))

@@ -38,7 +38,11 @@ def autocast(device: torch.device, enabled: bool) -> torch.autocast:
 
 
 class Headed(nn.Module):
-    """A network whose output layer is ``head``."""
+    """A network whose output layer is ``head``, on :meth:`features`.
+
+    These follow an enclosing autocast; the output layer is always float32: in bfloat16 a mean of 1 would be rounded by
+    0.004, enough to move the likelihood ratio of 52 actions.
+    """
 
     head: nn.Linear
 
@@ -47,13 +51,26 @@ class Headed(nn.Module):
         """As in :data:`MakeNetwork`."""
         return self.head.bias
 
+    def features(self, x: Tensor) -> Tensor:
+        """What the output layer reads of (batch, inputs): (batch, width)."""
+        raise NotImplementedError
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        features = self.features(x)
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head(features.to(self.head.weight.dtype))
+
+    def of_head(self, x: Tensor, index: Tensor, heads: int) -> Tensor:
+        """The same (batch, outputs / heads), of the head that int64 (batch,) names."""
+        features = self.features(x)
+        with torch.autocast(x.device.type, enabled=False):
+            weight, bias = self.head.weight, self.head.bias
+            return own_head(features.to(weight.dtype), weight, bias, index, heads)
+
 
 class MLP(Headed):
-    """Fully connected network; orthogonal weights with gain sqrt 2, of the output ``output_gain``, and zero biases.
-
-    The hidden layers follow an enclosing autocast; the output layer is always float32: in bfloat16 a mean of 1 would be
-    rounded by 0.004, enough to move the likelihood ratio of 52 actions.
-    """
+    """Fully connected network; orthogonal weights with gain sqrt 2, of the output ``output_gain``, and zero biases."""
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
@@ -70,18 +87,9 @@ class MLP(Headed):
         self.body = nn.Sequential(*layers)
         self.head = linear(before, outputs, output_gain, generator)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs) to float32 (batch, outputs)."""
-        features = self.body(self.encoder(x))
-        with torch.autocast(x.device.type, enabled=False):
-            return self.head(features.to(self.head.weight.dtype))
-
-    def of_head(self, x: Tensor, index: Tensor, heads: int) -> Tensor:
-        """The same (batch, outputs / heads), of the head that int64 (batch,) names."""
-        features = self.body(self.encoder(x))
-        with torch.autocast(x.device.type, enabled=False):
-            weight, bias = self.head.weight, self.head.bias
-            return own_head(features.to(weight.dtype), weight, bias, index, heads)
+    def features(self, x: Tensor) -> Tensor:
+        """As in the base."""
+        return self.body(self.encoder(x))
 
 
 def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor, own: str = "") -> Tensor:
@@ -148,7 +156,7 @@ class GaussianActor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
-        if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, MLP) and maths.may_look(x.device):
+        if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, Headed) and maths.may_look(x.device):
             return self.mean.of_head(x, self.one_hot(x).argmax(-1), self.heads)
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 

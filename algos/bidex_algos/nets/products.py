@@ -5,7 +5,8 @@ as fast there (docs/results/speed.md). ``torch.backends.mkldnn.flags(enabled=Fal
 """
 
 import platform
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -45,16 +46,21 @@ def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Ten
     return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
 
 
+def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]]) -> Tensor:
+    """Each row (B, inputs) by the one of ``layers`` that int64 (B,) names: (B, outputs). Looks at numbers."""
+    order = index.argsort(stable=True)
+    parts = x[order].split(torch.bincount(index, minlength=len(layers)).tolist())
+    out = torch.cat([layer(part) for layer, part in zip(layers, parts, strict=True) if len(part)])
+    return out[order.argsort()]
+
+
 def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int) -> Tensor:
     """Each row by a layer of its own: (B, inputs), (heads * n, inputs), (heads * n,), int64 (B,) to (B, n).
 
     Looks at numbers. With twenty heads of 52 actions it takes a twentieth of what all heads of all rows take.
     """
-    order = index.argsort(stable=True)
-    parts = x[order].split(torch.bincount(index, minlength=heads).tolist())
-    layers = zip(parts, weight.unflatten(0, (heads, -1)), bias.unflatten(0, (heads, -1)), strict=True)
-    out = torch.cat([affine(*each) for each in layers if len(each[0])])
-    return out[order.argsort()]
+    layers = zip(weight.unflatten(0, (heads, -1)), bias.unflatten(0, (heads, -1)), strict=True)
+    return by_own(x, index, [partial(affine, weight=each, bias=offset) for each, offset in layers])
 
 
 class Linear(nn.Linear):
