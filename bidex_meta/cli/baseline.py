@@ -44,7 +44,7 @@ class BaselineFlags:
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
     witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
-    the whole state (seven classes have one)."""
+    the whole state (eight classes have one)."""
     suite: str = "MT20"  # Suite whose train tasks are played.
     episodes: Few = 4  # Episodes of each task.
     seed: Seed = 0  # Seed of tasks, starts and actions.

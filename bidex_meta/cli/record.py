@@ -71,7 +71,7 @@ class RecordFlags:
     class, from their starts, where it succeeds less often but shows more."""
     script: Switch = False
     """demonstrations, --starts tasks: play a scripted policy in place of the witness, computed anew from each start
-    (about a second for 500 steps): seven classes have one, and it succeeds more often."""
+    (about a second for 500 steps): eight classes have one, and it succeeds more often."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
     num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.

@@ -19,6 +19,7 @@ from bidex_meta.witness.scripts.turning import turn_cubes
 Script = Callable[[HandController], Actions]
 
 SCRIPTS: dict[str, Script] = {
+    "DoorCloseInward": push,
     "DoorCloseOutward": close_outward,
     "DoorOpenInward": open_inward,
     "GraspAndPlace": place_in_bucket,
@@ -31,7 +32,6 @@ SCRIPTS: dict[str, Script] = {
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "BottleCap": pull_cap,
     "CatchUnderarm": carry_egg,
-    "DoorCloseInward": push,
     "DoorOpenOutward": push,
     "HandOver": carry_egg,
     "OpenPenCap": open_pen,

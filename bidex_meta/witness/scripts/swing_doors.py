@@ -96,7 +96,7 @@ def push(hands: HandController) -> Actions:
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
-    goals = [sign * goal for goal in hands.frozen("leaves").tolist()]
+    goals = [sign * goal for goal in _goals(hands, -0.1 if inward else 1.35)]  # inward they are shut
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
         """Fists before leaves that stand open towards the hands by these angles, ``back`` from them."""
