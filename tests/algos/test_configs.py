@@ -34,7 +34,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
     "td3bc": {"alpha": -1.0, "policy_delay": 0},
     "dagger": {"teacher_steps": -1, "noise_std": -0.1, "samples": 0, "updates_per_iteration": 0, "max_grad_norm": 0.0},
-    "icl": {"reward_unit": 0.0, "batch_trials": 0, "batch_size": 0, "trials": 0, "head": (0,)},
+    "icl": {"reward_unit": 0.0, "candidates": 0, "batch_size": 0, "trials": 0, "head": (0,)},
 }  # fmt: skip
 TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("mtppo", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
@@ -47,7 +47,6 @@ TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
     ("mappo", {"popart": True, "value_heads": False}, "leave per_task_values and value_heads on"),
-    ("icl", {"memory": 20, "heads": 8}, "memory to be a multiple of heads"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
 ]
 HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))

@@ -83,7 +83,7 @@ CASES = {
     "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
     "dagger": Case("dagger", DATA),
-    "icl": Case("icl", {"hidden": (8,), "memory": 8, "head": (8,), "updates_per_iteration": 2, "trials": 32}),
+    "icl": Case("icl", {"hidden": (8,), "candidates": 8, "head": (8,), "updates_per_iteration": 2, "trials": 32}),
 }  # fmt: skip
 SHARING = {
     f"{algo} {name}": Case(algo, more | {"hidden": (16, 8)} | shared)

@@ -60,7 +60,7 @@ PLAIN_SAC = replace(
 RECURRENT = RL2Config(hidden=(8,), memory=8, episodes_per_trial=2, chunk=5, num_minibatches=2, epochs=2)
 TAUGHT = DAggerConfig(hidden=(8,), batch_size=32, updates_per_iteration=3, teacher_steps=800, autocast="off")
 CONTEXT = ICLConfig(
-    hidden=(8,), memory=8, heads=2, head=(8,), episodes_per_trial=2, updates_per_iteration=3, batch_trials=4, trials=12,
+    hidden=(8,), candidates=8, head=(8,), episodes_per_trial=2, updates_per_iteration=3, trials=12,
     teacher_steps=100,
 )  # fmt: skip
 UPDATES = (ONE_BATCH, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)

@@ -1,9 +1,9 @@
 """In-context learning: a memory that infers the goal, and an actor that is taught as if it were shown it.
 
 An iteration plays one trial, a few episodes of one task with one memory, in every environment. Teachers, to which the
-goal is shown, say what they would do in each of its states (DAgger); the actor learns that for the true goal. The
-memory learns to tell the goal, mean and deviation, from what was seen and earned so far. The policy acts on the mean,
-and where it explores, on a goal drawn from its belief for the episode (posterior sampling).
+goal is shown, say what they would do in each of its states (DAgger); the actor learns that for the true goal. A model
+learns what any goal would have paid there, which makes a belief of what was seen and earned. The policy acts on its
+mean, and where it explores, on a goal drawn from it (posterior sampling).
 """
 
 import math
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
-from bidex_algos.meta.taught_trials import TaughtTrials
+from bidex_algos.meta.taught_trials import Steps, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.architecture import network_bytes
@@ -30,22 +30,20 @@ from bidex_meta.train.learner import LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.hidden_parts import HiddenParts
 
-# Added to deviations, in which errors count: 1.5 % of an action's range, and 1 cm of a goal.
-_ACTION_FLOOR, _GOAL_FLOOR = 0.03, 0.01
-
-_ASKED = 64
-"""Steps of a trial after which the memory is asked for the goal, in each update."""
+# Added to the deviations of actions, in which errors count: 1.5 % of an action's range.
+_FLOOR = 0.03
 
 
 @dataclass(frozen=True)
 class ICLConfig(LearnerConfig):
     """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
 
-    hidden: Widths = (128, 128)  # Widths of the layers that a step passes before the memory.
+    hidden: Widths = (256, 128)  # Widths of the layers that an observation passes in the model of rewards.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
-    memory: Count = 128  # Numbers that the memory holds, beside a weight for each head.
-    heads: Count = 8  # Weighted means that the memory is made of; divides ``memory``.
+    candidates: Count = 512  # Goals between which belief is divided.
+    trust: Fraction = 0.2  # What a step's log-likelihood counts: the model's errors in neighbouring steps are alike.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
@@ -55,20 +53,14 @@ class ICLConfig(LearnerConfig):
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
-    batch_size: Count = 1024  # Labelled steps of an update, split evenly over the classes with a teacher.
-    batch_trials: Count = 16  # Trials of an update whose evidence the memory adds up, split likewise.
+    batch_size: Count = 1024  # Steps of an update, split evenly over the classes with a teacher.
     goals: Count = 8  # Goals for which each trial's steps are rewarded in hindsight, beside the task's own.
     trials: Count = 1024  # Trials that each process keeps; the oldest go first.
     learning_rate: Positive = 1e-3  # Adam's step size.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and memory apart.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and model apart.
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of trials that the teacher plays falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.memory % self.heads:
-            raise BidexError(f"icl: expected memory to be a multiple of heads, {self.heads}, got {self.memory}.")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base, for episodes of 300 steps: how long they are is not known here."""
@@ -95,7 +87,6 @@ class ICL(TrialLearner):
         super().__init__(world, config, seed)
         self.every_pool = dict(zip(world.task_names, world.pools, strict=True))
         self.pools.clear()  # tasks are mixed instead of taking turns
-        self.goal_stats = RunningStats((world.num_tasks, max(1, self.shape.hidden))).to(self.device)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
 
@@ -105,12 +96,11 @@ class ICL(TrialLearner):
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                seen, config.hidden, config.heads, config.memory // config.heads, config.head, goals,
-                shape.actions, init, config.activation
+                seen, config.hidden, config.candidates, config.head, goals, shape.actions, init, config.activation
             )  # fmt: skip
 
         return BeliefPolicy(
-            seen, shape.actions, config.heads + config.memory, goals, config.try_steps, config.init_std,
+            seen, shape.actions, config.candidates, goals, config.try_steps, config.trust, config.init_std,
             config.reward_unit, config.normalise_observations, actor
         ).to(device)  # fmt: skip
 
@@ -120,15 +110,17 @@ class ICL(TrialLearner):
         rows = teachers.known.nonzero().squeeze(1)
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows, self.first = rows, self.count.cumsum(0) - self.count
-        size = self.goal_stats.mean.shape[1]
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
-        self.data = TaughtTrials(trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, size)
+        self.data = TaughtTrials(
+            trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, max(1, self.shape.hidden)
+        )
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
         if data is None:
             raise BidexError(f"{self.name}: has nobody to learn from. Call learn_from_teachers first.")
-        self._play(data.trials, _Pupil(self, data))
+        pupil = _Pupil(self, data)
+        self._play(data.trials, pupil)
         data.keep()
         share = all_sum(data.taught.double().mean()) / world_size()
         t, filled = data.trials, data.trials.filled()
@@ -136,7 +128,7 @@ class ICL(TrialLearner):
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
         self.policy.goals.update(data.goals[:, 0])
-        losses = self._learn(data)
+        losses = self._learn(data) | {"Loss/goal": all_sum(pupil.missed().double()) / world_size()}
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
         return self._episodes_metrics() | as_numbers(tensors)
@@ -162,35 +154,34 @@ class ICL(TrialLearner):
 
     @torch.no_grad()
     def _take_moments(self, data: TaughtTrials) -> None:
-        """Takes labels and goals of the trials into the statistics of their classes."""
+        """Takes the labels of the trials into the statistics of their classes."""
         filled = data.trials.filled()
-        goals = data.goals[:, 0].expand(len(filled), -1, -1)
-        for stats, values in ((self.label_stats, data.labels), (self.goal_stats, goals)):
-            mean, var, count = torch.zeros(3, *stats.mean.shape, dtype=torch.float64, device=self.device)
-            for task in self.tasks.tolist():
-                mine = self.rows[self.world.task_id[self.rows] == task]
-                found = values[:, mine][filled[:, mine]].double()
-                var[task], mean[task] = torch.var_mean(found, dim=0, correction=0)
-                count[task] = len(found)
-            stats.merge(*pool_moments(mean, var, count))
+        mean, var, count = torch.zeros(3, *self.label_stats.mean.shape, dtype=torch.float64, device=self.device)
+        for task in self.tasks.tolist():
+            mine = self.rows[self.world.task_id[self.rows] == task]
+            found = data.labels[:, mine][filled[:, mine]].double()
+            var[task], mean[task] = torch.var_mean(found, dim=0, correction=0)
+            count[task] = len(found)
+        self.label_stats.merge(*pool_moments(mean, var, count))
 
     def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
         losses = [self._descend(data) for _ in range(self.config.updates_per_iteration)]
-        imitation, goal, doubt = torch.stack(losses).mean(0)
+        imitation, _, reward = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
-        return {"Loss/imitation": imitation.mean(), "Loss/goal": goal.mean(), "Loss/doubt": doubt.mean(), **found}
+        return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), **found}
 
     def _descend(self, data: TaughtTrials) -> Tensor:
-        """A step down the mean of the classes' losses (3, K), which are those of all processes."""
-        losses = torch.stack([self._imitation(data), *self._belief(data)]) / world_size()
+        """A step down the mean of the classes' losses; these and the model's squared errors, of all processes (3, K)."""
+        *drawn, task = self._drawn(data, self.config.batch_size)
+        steps = data.steps(*drawn, torch.rand(len(task), generator=self.generator, device=self.device))
+        losses = torch.stack([self._imitation(steps, task), *self._model(steps)]) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())
         self.adam.zero_grad()
-        losses.mean(1).sum().backward()
+        losses[:2].mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach().flatten()).view_as(losses)
-        memory = nn.ModuleList([actor.encoder, actor.weigh, actor.note, actor.belief])
-        for part in (actor.head, actor.doubt, memory):  # of one loss each
+        for part in (actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])):  # of one loss each
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
         return losses
@@ -204,38 +195,30 @@ class ICL(TrialLearner):
         rows = self.rows[self.first[:, None] + row]
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
-    def _imitation(self, data: TaughtTrials) -> Tensor:
+    def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
         """Squared errors of actions in units of their deviation in the class (1: no better than a constant), (K,)."""
-        trial, row, task = self._drawn(data, self.config.batch_size)
-        share = torch.rand(len(row), generator=self.generator, device=self.device)
-        obs, labels, goals = data.steps(trial, row, share)
-        actions = self.policy.actor.act(self.policy.observations(obs), self.policy.goals(goals))
-        off = (actions - labels) / self.label_stats.std(_ACTION_FLOOR).float()[task]
-        return off.square().mean(1).view(len(self.tasks), -1).mean(1)
+        actions = self.policy.actor.act(self.policy.observations(steps.obs), self.policy.goals(steps.goals[:, 0]))
+        off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
+        return self._of_class(off.square().mean(1))
 
-    def _belief(self, data: TaughtTrials) -> tuple[Tensor, Tensor]:
-        """Squared errors of believed goals in such units, and minus the log-density by the believed deviation, (K,).
+    def _model(self, steps: Steps) -> tuple[Tensor, Tensor]:
+        """Minus the log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
 
-        The latter teaches the deviation alone.
+        The former is weighted by the deviation (Seitzer et al. 2022, arXiv 2203.09168): else a model that is unsure
+        somewhere learns nothing there.
         """
-        trial, row, task = self._drawn(data, self.config.batch_trials)
-        goal = torch.randint(1 + self.config.goals, row.shape, generator=self.generator, device=self.device)
-        policy, shown = self.policy, data.evidence(trial, row, goal, self.policy.actor.noted)
-        memory = policy.evidence(shown.noted, shown.reward, shown.known).cumsum(0)
-        asked = torch.randint(len(memory), (_ASKED,), generator=self.generator, device=self.device)
-        mean, std = policy.actor.believe(memory[asked])
-        missed = mean - policy.goals(shown.goals)
-        unit = self.goal_stats.std(_GOAL_FLOOR).float()[task] * policy.goals.scale
-        doubt = 0.5 * (missed.detach() / std).square() + std.log()
-        count = shown.counts[asked].float()
-        total = count.sum(0).view(len(self.tasks), -1).sum(1).clamp_min(1.0)
-        each = [(e.mean(2) * count).sum(0).view(len(self.tasks), -1).sum(1) for e in ((missed / unit).square(), doubt)]
-        return each[0] / total, each[1] / total
+        policy, paid = self.policy, steps.paid[:, None].float()
+        mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals))
+        off = (mean - policy.earned(steps.rewards)).square()
+        unlikely = (0.5 * off * torch.exp(-2.0 * log_std) + log_std) * log_std.detach().exp()
+        return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))
+
+    def _of_class(self, values: Tensor) -> Tensor:
+        return values.view(len(self.tasks), -1).mean(1)
 
     def _parts(self) -> Parts:
-        statistics = {"label_stats": self.label_stats, "goal_stats": self.goal_stats}
         counts = [self.episodes, self.firsts, self.lasts]
-        return {"adam": self.adam, "generator": self.generator, "episodes": counts, **statistics}
+        return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
         """As in the base; the data set makes its own copy, since two of it at once may not fit."""
@@ -266,24 +249,27 @@ class _Pupil:
         self._shown = shown[:, None]
         learner.teachers.reset(torch.ones_like(shown))
         if self._tried is None and learner.teachers.hidden is not None:
-            self._draw_goals(learner.teachers.hidden.values())
+            self._draw_goals(learner.teachers.hidden)
 
     def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
-    def _draw_goals(self, own: Tensor) -> None:
-        """The tasks' own (N, k), and goals between those of two tasks of the same class."""
-        goals, task_id = self._data.goals, self._learner.world.task_id
-        goals[:, 0] = own
-        same = (task_id[:, None] == task_id).double()
-        pairs = same.multinomial(2 * (goals.shape[1] - 1), replacement=True, generator=self._learner.generator)
-        ends = own[pairs].unflatten(1, (2, -1))
-        goals[:, 1:] = torch.lerp(ends[:, 0], ends[:, 1], self._draw(torch.rand, goals.shape[1] - 1)[..., None])
+    def _draw_goals(self, hidden: HiddenParts) -> None:
+        """The tasks' own (N, k), and any others of their range. What a class has no use for is drawn too."""
+        goals, world = self._data.goals, self._learner.world
+        goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
+        sizes = torch.tensor([len(hidden.variations[name]) for name in world.task_names], device=goals.device)
+        used = torch.arange(goals.shape[2], device=goals.device) < sizes[world.task_id][:, None]
+        goals[:, 0] = torch.where(used, hidden.values(), goals[:, 0])
+
+    def missed(self) -> Tensor:
+        """Squared distance of what is believed from what the tasks hide, 1/3 for a guess; mean of entries and rows."""
+        return (self._learner.policy.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Keeps what the step was paid, and would have been for the other goals."""
         hidden, data = self._learner.teachers.hidden, self._data
-        data.rewards[slot, self._rows, 0] = reward
+        data.rewards[slot, self._rows] = reward[:, None]
         if hidden is None:
             return
         for i in range(1, data.goals.shape[1]):
@@ -295,6 +281,7 @@ class _Pupil:
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
-        mean, state = learner.policy.step(obs, memory, self._tried * self._shown)
+        tried = self._tried.masked_fill(~self._shown, -1.0)
+        mean, self._state = learner.policy.step(obs, memory, tried)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._shown
-        return torch.where(data.taught[:, None], labels, action), state
+        return torch.where(data.taught[:, None], labels, action), self._state

@@ -10,24 +10,23 @@ import torch
 from torch import Tensor
 
 from bidex_algos.meta.trials import Trials
-from bidex_algos.nets.inputs import Columns
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import State
 
 
-class Evidence(NamedTuple):
-    """What the memory was shown in some trials: S slots of B rows."""
+class Steps(NamedTuple):
+    """Steps of trials, with what each of g goals would have paid for getting there."""
 
-    noted: Tensor
-    """Columns of raw observations (S, B, n)."""
-    reward: Tensor
-    """Rewards that led there (S, B)."""
-    known: Tensor
-    """Whether they were shown, bool (S, B)."""
+    obs: Tensor
+    """Raw observations (B, d)."""
+    labels: Tensor
+    """What teachers would have done there (B, a)."""
     goals: Tensor
-    """What the tasks hide (B, k)."""
-    counts: Tensor
-    """Steps that count, bool (S, B): not where a teacher went to the goal, which rewards shall tell."""
+    """What the tasks hide, and other goals (B, g, k)."""
+    rewards: Tensor
+    """For each goal (B, g)."""
+    paid: Tensor
+    """Whether there was a reward: not where an episode begins, bool (B,)."""
 
 
 class TaughtTrials:
@@ -52,7 +51,7 @@ class TaughtTrials:
 
         self._ring = {
             "obs": empty(trials.obs.shape[2]), "labels": empty(actions), "rewards": empty(goals, dtype=torch.float32),
-            "known": empty(dtype=torch.bool),
+            "paid": empty(dtype=torch.bool),
             "goals": torch.empty(kept, rows, goals, size, device=device),
             "taught": torch.empty(kept, rows, dtype=torch.bool, device=device),
             "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
@@ -66,32 +65,21 @@ class TaughtTrials:
     def keep(self) -> None:
         """Takes the trials that were played."""
         t = self.trials
-        *_, known, _ = t.previous(len(t.obs))
-        # Behind an action as ``previous`` has it, so that a reward stands beside what it led to.
-        rewards = torch.cat([torch.zeros_like(self.rewards[:1]), self.rewards[:-1]])
-        new = {"obs": t.obs, "rewards": rewards, "known": known, "labels": self.labels, "goals": self.goals}
+        # One slot later, so that a reward stands beside what it led to; an episode's last one led nowhere.
+        rewards, paid = (torch.cat([torch.zeros_like(x[:1]), x[:-1]]) for x in (self.rewards, t.valid & ~t.ended))
+        new = {"obs": t.obs, "rewards": rewards, "paid": paid, "labels": self.labels, "goals": self.goals}
         for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():
             self._ring[name][self.added % self.kept] = value
         self.added += 1
 
-    def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Raw observations (B, d), labels (B, a) and goals (B, k) of a step of each of some trials.
-
-        Of trials (B,), numbers below ``filled``, of environments (B,), at a share in [0, 1) of their lengths (B,).
-        """
+    def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
+        """A step of each of some trials: numbers (B,) below ``filled``, of environments (B,), at a share in [0, 1) (B,)
+        of their lengths."""
         slot = (share * self._ring["lengths"][trial, row]).long()
-        obs, labels = (self._ring[name][trial, slot, row].float() for name in ("obs", "labels"))
-        return obs, labels, self._ring["goals"][trial, row, 0]
-
-    def evidence(self, trial: Tensor, row: Tensor, goal: Tensor, columns: Columns) -> Evidence:
-        """Of trials (B,) of environments (B,), rewarded for one of the goals (B,)."""
-        lengths, taught = (self._ring[name][trial, row] for name in ("lengths", "taught"))
-        slots = int(lengths.max())
-        obs, known = (self._ring[name][trial, :slots, row] for name in ("obs", "known"))
-        rewards = self._ring["rewards"][trial, :slots, row, goal]
-        counts = (torch.arange(slots, device=lengths.device)[:, None] < lengths) & ~(taught & (goal == 0))
-        noted = columns(obs).transpose(0, 1).float()
-        return Evidence(noted, rewards.T, known.T, self._ring["goals"][trial, row, goal], counts)
+        obs, labels, rewards, paid = (
+            self._ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid")
+        )
+        return Steps(obs.float(), labels.float(), self._ring["goals"][trial, row], rewards, paid)
 
     def state_dict(self) -> State:
         """A copy of all that is kept."""

@@ -1,8 +1,8 @@
-"""A memory that adds up evidence, what it lets believe of a goal, and a policy that acts on that.
+"""What rewards tell of a goal: a model of what any goal would have paid, candidates, and a policy that acts on them.
 
-What a trial hides does not change in it, so the order of its steps does not matter: as log-likelihoods add up, so do a
-step's notes. The memory holds weighted means of them, one for each head, as linear attention does (Katharopoulos et al.
-2020, arXiv 2006.16236); all steps of a trial pass at once.
+The model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348) for a goal in numbers that are known
+in training. With it belief is Bayes' rule: the memory holds the log-likelihood of each of some fixed candidates, to
+which every rewarded step adds its own.
 """
 
 from collections.abc import Sequence
@@ -16,45 +16,39 @@ from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, linear
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 
-_NO_EVIDENCE = ("right_hand", "left_hand", "padding", "task_id")
-"""Groups of an observation that are not noted: with the hands a memory learns fifty tasks by heart, not the rewards."""
+_TAIL = 4.0  # degrees of freedom of the Student distribution that errors of the model are taken to have
+
+
+def spread(count: int, size: int) -> Tensor:
+    """Points (count, size) spread evenly over [-1, 1]: an additive recurrence (R_d of Roberts 2018)."""
+    root = 1.5
+    for _ in range(50):  # x^(size + 1) = x + 1
+        root = (1.0 + root) ** (1.0 / (size + 1.0))
+    steps = torch.tensor([root ** -(axis + 1.0) for axis in range(size)], dtype=torch.float64)
+    return (2.0 * ((0.5 + torch.arange(1.0, count + 1.0)[:, None] * steps) % 1.0) - 1.0).float()
 
 
 class BeliefNet(nn.Module):
-    """Notes of steps, belief of the normalised goal from their sum, and an actor that is given a goal."""
+    """A model of rewards, and an actor that is given a goal. ``hidden``: layers that an observation passes there."""
 
     def __init__(
-        self, seen: Inputs, hidden: Sequence[int], heads: int, size: int, head: Sequence[int],
-        goals: int, actions: int, generator: torch.Generator, activation: Activation = "elu"
+        self, seen: Inputs, hidden: Sequence[int], candidates: int, head: Sequence[int], goals: int, actions: int,
+        generator: torch.Generator, activation: Activation = "elu"
     ):  # fmt: skip
         super().__init__()
-        self.noted = seen.columns(*(group.name for group in seen.groups if group.name not in _NO_EVIDENCE))
-        self.heads, self.size = heads, size
-        features = MLP(self.noted.size + 1, hidden[:-1], hidden[-1], 1.0, generator, activation)
-        self.encoder = nn.Sequential(features, ACTIVATIONS[activation]())
-        self.weigh, self.note = (linear(hidden[-1], n, 1.0, generator) for n in (heads, heads * size))
-        memory, middle = heads * (size + 1), hidden[-1]
-        self.belief, self.doubt = (MLP(memory, (middle,), goals, 0.01, generator, activation) for _ in range(2))
+        width = hidden[-1]
+        self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
+        self.goal, self.activation = linear(goals, width, 1.0, generator), ACTIVATIONS[activation]()
+        self.paid = MLP(width, (max(1, width // 2),), 2, 0.01, generator, activation)
         self.head = MLP(seen.extended("believed", goals), head, actions, 0.01, generator, activation)
+        self.candidates: Tensor
+        self.register_buffer("candidates", spread(candidates, goals))
 
-    def evidence(self, noted: Tensor, earned: Tensor, known: Tensor) -> Tensor:
-        """What steps add to the memory, (..., heads * (1 + size)); nothing where no reward is known.
-
-        Of normalised columns of the observation (..., n), the normalised reward that led there (...), and whether it is
-        known.
-        """
-        features = self.encoder(torch.cat([noted, earned[..., None]], dim=-1))
-        weight = self.weigh(features).clamp(-8.0, 8.0).exp() * known[..., None]
-        notes = weight[..., None] * self.note(features).unflatten(-1, (self.heads, self.size))
-        return torch.cat([weight, notes.flatten(-2)], dim=-1)
-
-    def believe(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of the goal, (..., goals) each, for memories (..., heads * (1 + size))."""
-        weight, notes = memory[..., : self.heads] + 1e-6, memory[..., self.heads :]
-        means = notes.unflatten(-1, (self.heads, self.size)) / weight[..., None]
-        known = torch.cat([weight.log() / 3.0, means.flatten(-2)], dim=-1)
-        # The deviation learns from what the memory is good for, and does not shape it.
-        return self.belief(known), self.doubt(known.detach()).clamp(-5.0, 1.0).exp()
+    def pays(self, seen: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-deviation (..., g) of the reward in a state (..., d) for goals (..., g, n); all normalised."""
+        both = self.activation(self.encoder(seen)[..., None, :] + self.goal(goals))
+        mean, log_std = self.paid(both).unbind(-1)
+        return mean, log_std.clamp(-6.0, 2.0)
 
     def act(self, seen: Tensor, goal: Tensor) -> Tensor:
         """Mean actions (..., actions) for normalised observations and goals."""
@@ -62,37 +56,48 @@ class BeliefNet(nn.Module):
 
 
 class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on what it believes of the goal; where it explores, on one drawn from its belief.
+    """A policy that acts on the mean of its belief of the goal, and where it explores, on a candidate drawn from it.
 
-    ``actor`` is a :class:`BeliefNet`; a goal is tried for ``try_steps`` steps in the mean.
+    ``actor`` is a :class:`BeliefNet`. Its memory (N, candidates) adds up log-likelihoods, each counted ``trust`` times:
+    the model's errors in neighbouring steps are alike. A candidate is tried for ``try_steps`` steps in the mean.
     """
 
     actor: BeliefNet
 
-    def __init__(self, inputs: Inputs, actions: int, memory: int, goals: int, try_steps: int, *rest: Any):
+    def __init__(
+        self, inputs: Inputs, actions: int, candidates: int, goals: int, try_steps: int, trust: float, *rest: Any
+    ):
         """``goals``: numbers of a goal; the others as of :class:`RecurrentPolicy`."""
-        super().__init__(inputs, actions, memory, *rest)
-        self.goals, self.try_steps = ObservationNormaliser(goals), try_steps
+        super().__init__(inputs, actions, candidates, *rest)
+        self.goals, self.try_steps, self.trust = ObservationNormaliser(goals), try_steps, trust
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
-        """Standard normals (rows, goals): deviations of the goal that is tried from the mean, in deviations."""
+        """Which candidate is tried: the place (rows, 1) in [0, 1) of the sum of their probabilities."""
         device = self.log_std.device
-        new = torch.randn(rows, self.goals.shift.numel(), generator=generator, device=device)
-        again = torch.rand(rows, 1, generator=generator, device=device) < 1.0 / self.try_steps
-        return new if last is None else torch.where(again, new, last)
+        new, again = torch.rand(2, rows, 1, generator=generator, device=device)
+        return new if last is None else torch.where(again < 1.0 / self.try_steps, new, last)
 
-    def evidence(self, noted: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """As of :class:`BeliefNet`, for raw columns and rewards."""
-        columns = self.actor.noted
-        return self.actor.evidence(
-            self.observations.some(noted, columns), self.rewards(self._compressed(reward)).squeeze(-1), known
-        )
+    def earned(self, reward: Tensor) -> Tensor:
+        """Raw rewards (...) as the model knows them."""
+        return self.rewards(self._compressed(reward)).squeeze(-1)
+
+    def evidence(self, obs: Tensor, reward: Tensor) -> Tensor:
+        """Log-likelihoods (N, candidates) of the rewards (N,) that led to raw observations (N, d)."""
+        mean, log_std = self.actor.pays(self.observations(obs), self.goals(self.actor.candidates))
+        off = (self.earned(reward)[:, None] - mean) / log_std.exp()
+        return self.trust * (-0.5 * (_TAIL + 1.0) * torch.log1p(off.square() / _TAIL) - log_std)
+
+    def believed(self, state: Tensor) -> Tensor:
+        """Means (N, n) of the beliefs in memories (N, candidates)."""
+        return state.softmax(-1) @ self.actor.candidates
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As in the base."""
-        state = memory.state + self.evidence(self.actor.noted(obs), memory.reward, memory.known)
-        goal, std = self.actor.believe(state)
+        """As in the base; where ``drawn`` is negative nothing is tried. The step that ended an episode tells nothing."""
+        known = memory.known & ~memory.done  # what it led to was not seen
+        state = memory.state + self.evidence(obs, memory.reward).masked_fill(~known[:, None], 0.0)
+        goal = self.believed(state)
         if drawn is not None:
-            goal = goal + std * drawn
-        return self.actor.act(self.observations(obs), goal), state
+            place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
+            goal = torch.where(drawn < 0.0, goal, self.actor.candidates[place])
+        return self.actor.act(self.observations(obs), self.goals(goal)), state
