@@ -3,11 +3,11 @@
 import contextlib
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.cli.parsing import LookFlags, Switch, parse
-from bidex_meta.utils import gl_backend
+from bidex_meta.utils import gl_backend, paths
 from bidex_meta.utils.validation import NonNegative, Port, Positive
 
 if TYPE_CHECKING:
@@ -20,7 +20,8 @@ class PlayFlags(LookFlags):
 
     Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
 
-    bidex-meta play --task SwingCup --policy random needs no run.
+    bidex-meta play alone shows the policy that comes with bidex-meta in MT20, an episode of each class after another.
+    bidex-meta play --task SwingCup --policy random needs no run either.
     """
 
     speed: Positive = 1.0  # Of the clock; 0.5 is slow motion.
@@ -33,12 +34,16 @@ class PlayFlags(LookFlags):
 def main(arguments: Sequence[str]) -> None:
     """Play until it is closed."""
     flags = parse(PlayFlags, arguments, "play")
+    tour = not (flags.run or flags.task or flags.suite) and flags.policy == PlayFlags.policy
+    if tour:
+        flags = replace(flags, run=paths.assets_dir() / "policies" / "MT20")
     from bidex_meta.cli.policies import acting, looked_at
     from bidex_meta.viewer.playback import Stage, play
 
     source, slots, task = looked_at(flags)
     world: Any = source.world("train", len(slots))
-    stage = Stage(world, acting(flags.actor, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
+    agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
+    stage = Stage(world, agent, slots.index(task), flags.seed, tour)
     screen = _screen(flags, stage)
     with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
         play(stage, screen, flags.seconds)

@@ -87,6 +87,7 @@ class Browser:
         gui = self._server.gui
         self._text = gui.add_markdown("")
         self._class = gui.add_dropdown("Class", options=stage.names, initial_value=stage.names[stage.row])
+        self._tour = gui.add_checkbox("One class after another", stage.tour)
         self._pause = gui.add_checkbox("Pause", False)
         self._pace = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=min(2.0, max(0.1, self.speed)))
         for label in ("Another episode", "Next task"):
@@ -99,16 +100,16 @@ class Browser:
 
     def obey(self, stage: Stage) -> None:
         """The controls."""
-        self.paused, self.speed = bool(self._pause.value), float(self._pace.value)
-        if self._class.value != stage.names[stage.row]:
+        self.paused, self.speed, stage.tour = bool(self._pause.value), float(self._pace.value), bool(self._tour.value)
+        if self._class.value != self._chosen:
             stage.row = stage.names.index(self._class.value)
-            self._set_the_scene(stage)
             self.show(stage)
         while self._asked:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
         scene, self._model = self._server.scene, stage.model()
+        self._chosen = self._class.value = stage.names[stage.row]
         for handle in (*self._shapes.values(), *self._ghosts):
             handle.remove()
         self._shapes, self._ghosts = {}, []
@@ -129,6 +130,8 @@ class Browser:
 
     def show(self, stage: Stage) -> None:
         """Poses of all shapes and goals, and the status."""
+        if stage.names[stage.row] != self._chosen:
+            self._set_the_scene(stage)
         data, turned = stage.data(), np.empty(4)
         with self._server.atomic():
             for geom, handle in self._shapes.items():

@@ -19,6 +19,10 @@ class Desktop:
         """Opens the window, or raises BidexError."""
         self.paused, self.speed = False, speed
         self._asked: list[int] = []
+        self._open(stage)
+
+    def _open(self, stage: Stage) -> None:
+        self._row = stage.row
         self._model = stage.model()
         self._data = mujoco.MjData(self._model)
         try:
@@ -54,7 +58,10 @@ class Desktop:
                 self.speed = min(4.0, max(1.0 / 16.0, self.speed * (2.0 if key == _EQUAL else 0.5)))
 
     def show(self, stage: Stage) -> None:
-        """State, goals and status."""
+        """State, goals and status; of another class in a window of its own."""
+        if stage.row != self._row:
+            self._viewer.close()
+            self._open(stage)
         now = stage.data()
         with self._viewer.lock():
             self._data.time = now.time

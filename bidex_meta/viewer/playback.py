@@ -14,11 +14,14 @@ from bidex_meta.world.rendering import Ghost, ghosts, simulation
 
 
 class Stage:
-    """Episodes in all environments of a world in mode DISABLED, one a slot; ``row``, which may be set, is shown."""
+    """Episodes in all environments of a world in mode DISABLED, one a slot.
 
-    def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0) -> None:
+    ``row``, which may be set, is shown; on a ``tour`` the next one after each of its episodes.
+    """
+
+    def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0, tour: bool = False) -> None:
         self.names: list[str] = [world.task_names[int(slot)] for slot in world.task_id]
-        self.row, self._world, self._agent, self._seed = row, world, agent, seed
+        self.row, self.tour, self._world, self._agent, self._seed = row, tour, world, agent, seed
         size = len(self.names)
         self._episodes, self._solved, self._steps = np.zeros((3, size), int)
         self._returns, self._success = np.zeros(size), np.zeros(size, bool)
@@ -45,6 +48,9 @@ class Stage:
             over = ended.cpu().numpy()
             self._episodes += over
             self._solved += over & self._success
+            if self.tour and over[self.row]:
+                self.row = (self.row + 1) % len(self.names)
+                ended[self.row] = True
             self._restart(ended)
 
     def restart(self) -> None:

@@ -53,6 +53,19 @@ def test_a_stage_plays_on_and_counts_episodes(stage, world, monkeypatch):
     assert (stage.status()["class"], stage.status()["episodes"]) == (world.task_names[0], "0 of 3 solved")
 
 
+def test_a_tour_goes_to_the_next_class_after_each_episode(world):
+    stage = Stage(world, ZeroAgent(world.action_space), row=3, tour=True)
+    lengths = [int(most) for most in world.max_episode_steps]
+    for _ in range(lengths[3]):
+        assert stage.row == 3
+        stage.step()
+    assert (stage.row, stage.status()["step"]) == (0, f"0 of {lengths[0]}")
+    stage.tour = False
+    for _ in range(lengths[0]):
+        stage.step()
+    assert stage.row == 0
+
+
 def test_the_next_task_moves_the_goal(stage):
     first = stage.ghosts()[0][0].copy()
     stage.next_task()
@@ -136,6 +149,9 @@ def test_the_page_shows_the_row_and_obeys(stage):
         assert (stage.row, page.paused, page.speed) == (3, True, 0.5)
         assert len(page._ghosts) == len(stage.ghosts())
         assert f"| class | {stage.names[3]} |" in page._text.content
+        stage.row = 0  # as on a tour
+        page.show(stage)
+        assert page._class.value == stage.names[0] and list(page._shapes) == visible(stage.model())
     finally:
         page.close()
 

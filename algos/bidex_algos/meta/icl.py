@@ -172,7 +172,7 @@ class ICL(TrialLearner):
         return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), **found}
 
     def _descend(self, data: TaughtTrials) -> Tensor:
-        """A step down the mean of the classes' losses; these and the model's squared errors, of all processes (3, K)."""
+        """A step down the mean of the classes' losses; they and the model's squared errors, of all processes (3, K)."""
         *drawn, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(*drawn, torch.rand(len(task), generator=self.generator, device=self.device))
         losses = torch.stack([self._imitation(steps, task), *self._model(steps)]) / world_size()

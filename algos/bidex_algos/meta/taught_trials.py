@@ -73,13 +73,13 @@ class TaughtTrials:
         self.added += 1
 
     def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
-        """A step of each of some trials: numbers (B,) below ``filled``, of environments (B,), at a share in [0, 1) (B,)
-        of their lengths."""
-        slot = (share * self._ring["lengths"][trial, row]).long()
-        obs, labels, rewards, paid = (
-            self._ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid")
-        )
-        return Steps(obs.float(), labels.float(), self._ring["goals"][trial, row], rewards, paid)
+        """A step of each of some trials (B,), numbers below ``filled``, of environments (B,).
+
+        It stands at a share in [0, 1) of their lengths (B,).
+        """
+        slot, ring = (share * self._ring["lengths"][trial, row]).long(), self._ring
+        obs, labels, rewards, paid = (ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid"))
+        return Steps(obs.float(), labels.float(), ring["goals"][trial, row], rewards, paid)
 
     def state_dict(self) -> State:
         """A copy of all that is kept."""

@@ -93,8 +93,8 @@ class BeliefPolicy(RecurrentPolicy):
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As in the base; where ``drawn`` is negative nothing is tried. The step that ended an episode tells nothing."""
-        known = memory.known & ~memory.done  # what it led to was not seen
+        """As in the base; where ``drawn`` is negative nothing is tried."""
+        known = memory.known & ~memory.done  # what the last step of an episode led to was not seen
         state = memory.state + self.evidence(obs, memory.reward).masked_fill(~known[:, None], 0.0)
         goal = self.believed(state)
         if drawn is not None:
