@@ -43,7 +43,7 @@ class ICLConfig(LearnerConfig):
     hidden: Widths = (256, 128)  # Widths of the layers that an observation passes in the model of rewards.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
     candidates: Count = 512  # Goals between which belief is divided.
-    trust: Fraction = 0.2  # What a step's log-likelihood counts: the model's errors in neighbouring steps are alike.
+    trust: Fraction = 0.05  # What a step's log-likelihood counts: the model's errors in neighbouring steps are alike.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
