@@ -19,7 +19,7 @@ from PIL import Image
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
-from tools.pages.gained import gains_table
+from tools.pages.gained import gains_table, shots_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import curves_figure, points_figure, read_studies
@@ -30,6 +30,7 @@ _TABLES = {
     "table": tables.arms_table,
     "classes": tables.classes_table,
     "gains": gains_table,
+    "shots": shots_table,
     "offline": offline_table,
     "rows": rows_table,
 }

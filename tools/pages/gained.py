@@ -1,14 +1,16 @@
-"""Gain from adaptation in each run's meta-test, and its difference to a control without meta-training."""
+"""Meta-tests: success after each shot, and each run's gain beside that of a control without meta-training."""
 
 from collections.abc import Iterator
 from math import hypot
 from typing import Any
 
+import numpy as np
+
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study
-from tools.pages.tables import table
+from tools.pages.tables import mean_and_range, table
 
 CONTROL = "control"
 """The arm that others are compared with: same starting policy and adaptation, no meta-training."""
@@ -48,6 +50,29 @@ def gains_table(study: Study) -> Iterator[str]:
                 _bold(gain), "" if control is None else _bold(_over(gain, _gain(control[1], name))),
             ])  # fmt: skip
     return table(_HEAD, rows)
+
+
+def shots_table(study: Study) -> Iterator[str]:
+    """One row per class and arm: success after each shot, mean over seeds (least to most).
+
+    Args:
+        study: Runs with a meta-test; the test split if the study names none.
+    """
+    split, found = study.split or "test", dict[tuple[str, str], list[list[float]]]()
+    steps: dict[str, list[int]] = {}
+    for run in study.runs:
+        steps.setdefault(run.arm, []).append(run.content["steps"])
+        by_shot = run.evaluation()["splits"][split]["by_shot"]
+        for name in by_shot[0]["classes"]:
+            shares = [shot["classes"][name]["success"] for shot in by_shot]
+            found.setdefault((name, run.arm), []).append(shares)
+    most = max(len(shares[0]) for shares in found.values())
+    rows = []
+    for (name, arm), seeds in found.items():
+        shown = [mean_and_range(100.0 * np.array(each), unit=" %") for each in zip(*seeds, strict=True)]
+        shown += [""] * (most - len(shown))
+        rows.append([name, arm, str(len(seeds)), f"{int(np.mean(steps[arm])):,}", *shown])
+    return table(["class", "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most))], rows)
 
 
 def _gain(part: dict[str, Any], name: str) -> Estimate:

@@ -1,0 +1,84 @@
+"""``python -m tools.ladder RUN``: the lines between which a learner that infers hidden goals stands."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import Tensor
+
+from bidex_algos.meta.icl import ICL
+from bidex_algos.nets.evidence import spread
+from bidex_meta.cli.policies import load_policy
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
+from bidex_meta.runs import RunFolder
+from bidex_meta.witness.demonstrators import Scripted
+from bidex_meta.world.hidden_parts import HiddenParts
+from bidex_meta.worlds import Worlds
+
+# Of the known formula: candidates, each of which is asked for in each step, and a deviation of rewards for goals that lie
+# between them.
+_CANDIDATES, _EXACT = 128, 0.02
+
+
+def ladder(run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, out: Path | None = None) -> None:
+    """Success at the end, on test tasks, of a run of icl and of the same actor with other knowledge of the goal.
+
+    Example: python -m tools.ladder runs/ML1-v2/icl/<run> --out results/data/ml1-v2/ladder.json
+
+    Args:
+        run: Folder of a run of icl.
+        shots: Exploring episodes.
+        tasks: Tasks of each class.
+        out: File that takes the numbers too.
+    """
+    folder = RunFolder.open(run)
+    if folder.config().algo != ICL.name:
+        raise BidexError(f"Expected a run of icl, got one of {folder.config().algo}.")
+    worlds = Worlds.open(folder.config().to_json())
+    world: Any = worlds.world("test", tasks * len(worlds.tasks("test")))
+    hidden, found = HiddenParts(world), dict[str, list[float]]()
+
+    def agent() -> Any:
+        return load_policy(folder, "cpu")[0]
+
+    def play(name: str, agent: Any, shots: int) -> None:
+        found[name] = success(meta_evaluate(agent, world, shots, rollouts=1, episodes_per_task=1, tasks=tasks))
+        print(f"{name}: {', '.join(f'{100 * share:.0f} %' for share in found[name])}", flush=True)
+
+    play("learned model of rewards", agent(), shots)
+    inferring = agent()
+    inferring.policy.actor.candidates = spread(_CANDIDATES, hidden.values().shape[1])
+    inferring.policy.memory = _CANDIDATES
+    inferring.policy.evidence = _Known(hidden, inferring.policy.actor.candidates).evidence
+    play("known rewards", inferring, shots)
+    seeing = agent()
+    seeing.policy.believed = lambda state: hidden.values()
+    play("shown the goal", seeing, 0)
+    play("script that is shown the goal", Scripted(world), 0)
+    if out is not None:
+        out.write_text(json.dumps(found, indent=2) + "\n")
+
+
+def success(evaluation: MetaEvaluation) -> list[float]:
+    """Mean success over classes before and after each shot."""
+    return [float(each.to_json()["aggregate"]["success"]["mean"]) for each in evaluation.by_shot]
+
+
+class _Known:
+    """Log-likelihoods of candidates by the classes' own formulas of the reward."""
+
+    def __init__(self, hidden: HiddenParts, candidates: Sequence[Tensor]):
+        self._hidden, self._candidates = hidden, candidates
+
+    def evidence(self, obs: Tensor, reward: Tensor) -> Tensor:
+        """As of ``BeliefPolicy``; of the step that the world has just made."""
+        paid = [self._hidden.rewards(goal.expand(len(obs), -1)) for goal in self._candidates]
+        return -0.5 * ((reward[:, None] - torch.stack(paid, dim=1)) / _EXACT).square()
+
+
+if __name__ == "__main__":
+    tyro.cli(ladder)
