@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> None:
         left = [cell.run for cell in cells if state_of(cell.run).state != "done"]
         say(f"{len(cells) - len(left)} of {len(cells)} runs are done; {len(cores)} at a time.")
         failed = work(left, cores, say)
-    _report(flags, worlds.name, [cell for cell in cells if state_of(cell.run).state == "done"])
+    _report(flags, worlds.name, cells)
     if failed:
         say(f"{failed} failed. Started again, it tries them anew.")
         raise SystemExit(EXIT_FAILED)
@@ -101,14 +101,17 @@ def _cells(
 
 
 def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
-    """A table of each track, transfer.json with both and, with matplotlib, a figure of each."""
+    """Of runs that are done a table of each track, transfer.json with both and, with matplotlib, a figure of each."""
     groups: dict[tuple[str, str, int | None], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.task, cell.arm, cell.demonstrations), []).append(cell)
     steps, shots = list[Json](), list[Json]()
     for (task, arm, count), members in groups.items():
-        row: Json = {"class": task, "from": arm, "seeds": [cell.run.seed for cell in members]}
-        folders = [cell.run.folder for cell in members]
+        done = [cell.run for cell in members if state_of(cell.run).state == "done"]
+        row: Json = {"class": task, "from": arm, "seeds": [run.seed for run in done]}
+        folders = [run.folder for run in done]
+        if not done:
+            continue
         if count is None:
             steps.append(row | by_reinforcement(folders, flags.steps))
         else:
