@@ -25,7 +25,7 @@ from bidex_meta.config import Several, Steps
 from bidex_meta.data import part_files
 from bidex_meta.errors import EXIT_FAILED
 from bidex_meta.evaluation.statistics import Estimate
-from bidex_meta.evaluation.transfer import TAG, add_over_nothing, at_the_end, by_reinforcement
+from bidex_meta.evaluation.transfer_measures import TAG, add_over_nothing, at_the_end, by_reinforcement
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions

@@ -17,7 +17,7 @@ from bidex_meta.cli.tables import say
 from bidex_meta.data import Dataset, open_dataset, part_files, writer
 from bidex_meta.data.collect import collect_successes, progress, resumed_writer
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.evaluation.transfer import NOTHING
+from bidex_meta.evaluation.transfer_measures import NOTHING
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.suite import Suite, SuiteClass
@@ -141,7 +141,7 @@ def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path,
     folder = folder / f"{short_name(name)}-script-v0"
     if _is_complete(folder):
         return open_dataset(folder)
-    say(f"{name}: recording {count} episodes of its script.")
+    say(f"{name}: its script plays until {count} of its episodes have succeeded.")
     plan = {"kind": "demonstrations", "suite": str(file), "size": count}
     with writer.claimed(folder, plan):
         world: Any = worlds.world("train")

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,21 @@ from gymnasium.spaces import Box
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.cli import main, transfer
-from bidex_meta.cli.transfer_plan import arms_of, demonstrations_of, held_out, some_of, suite_file
+from bidex_meta.cli.sweep import state_of
+from bidex_meta.cli.transfer_plan import (
+    Arm,
+    arms_of,
+    cells_of,
+    demonstrations_of,
+    held_out,
+    shared_words,
+    some_of,
+    suite_file,
+)
 from bidex_meta.data import Episode, open_dataset, part_files
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.suite import load_suite
 from bidex_meta.worlds import WorldConfig, Worlds
@@ -44,7 +56,7 @@ classes = [
 """
 
 
-def opened(suite: str | Path, seed: int = 0) -> Worlds:
+def opened(suite: str | Path, seed: int = 0) -> Any:
     return Worlds.open(WorldConfig(suite=str(suite), seed=seed, threads=1))
 
 
@@ -100,8 +112,9 @@ def demonstrations(folder: Path, success: str = "1101") -> Path:
     writer = DatasetWriter(folder)
     for number, solved in enumerate(success):
         steps, last = number + 1, np.arange(number + 1) == number
-        arrays = [np.full((n, k), number, np.float32) for n, k in ((steps + 1, 5), (steps, 2))]
-        writer.add(Episode(*arrays, np.ones(steps, np.float32), last, ~last & last, success=solved == "1"))
+        states, actions = np.zeros((steps + 1, 5), np.float32), np.zeros((steps, 2), np.float32)
+        rewards, never = np.ones(steps, np.float32), np.zeros(steps, bool)
+        writer.add(Episode(states, actions, rewards, last, never, success=solved == "1"))
     writer.commit()
     about = ABOUT | {"tasks": ["DoorCloseOutward-v2"], "reward_scales": {}, "observation_groups": [["state", [[0, 5]]]]}
     finish(folder, folder.name, Box(-9.0, 9.0, (5,)), Box(-1.0, 1.0, (2,)), about)
@@ -125,6 +138,24 @@ def test_fewer_demonstrations_are_among_more_and_all_have_succeeded(tmp_path: Pa
     other = open_dataset(demonstrations(tmp_path / "other-v0"))
     with pytest.raises(BidexError, match="was drawn from"):
         some_of(other, "DoorCloseOutward", 3, 0, tmp_path)
+
+
+def test_a_policy_is_cloned_from_one_episode_of_a_script(pair: Path, tmp_path: Path) -> None:
+    """For real: the data go into the suite's form, and the run ends with its evaluation."""
+    pytest.importorskip("h5py", reason="needs the extra data")
+    file = suite_file(opened(pair), "DoorCloseOutward", tmp_path)
+    found = demonstrations_of(file, "DoorCloseOutward", [], tmp_path, 1)
+    words = shared_words(2, ["--device", "cpu", "--episodes", "1", "--learner.demonstration-cloning", "20"])
+    (tmp_path / "data").mkdir()
+    fresh = Arm("nothing", None, ["--learner.hidden", "8"])
+    (cell,) = cells_of(file, "DoorCloseOutward", [fresh], 0, words, tmp_path, [], [1], found)
+    assert cell.run.config.demonstrations == (str(tmp_path / "data" / "DoorCloseOutward-1-seed0-v0"),)
+    assert main(list(cell.run.begin)) == 0 and state_of(cell.run).state == "done"
+    assert len(at_the_end([cell.run.folder])["success"]["of_seeds"]) == 1
+    state = cell.run.folder.checkpoints.load()
+    assert state and state[0]["learner"]["policy"]["weights"]["observations.stats.count"].max() == 250, (
+        "of the episode alone"
+    )
 
 
 def test_scripts_demonstrate_where_no_data_are_given(pair: Path, tmp_path: Path) -> None:
@@ -191,7 +222,7 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
 
 
 def test_what_no_demonstration_shows_plays_the_policy_itself(trained: Path, shown) -> None:
-    shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE)
+    shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2])
     before = weights(trained)
     for name, weight in weights(Path("t/runs/TwoCatchUnderarm-start-0-demonstrations-seed0")).items():
         assert torch.equal(weight, before[name]), name

@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bidex_meta.evaluation.transfer import add_over_nothing, area, by_reinforcement, estimate, median_steps, steps_to
+from bidex_meta.evaluation.transfer_measures import (
+    add_over_nothing,
+    area,
+    by_reinforcement,
+    estimate,
+    median_steps,
+    steps_to,
+)
 from bidex_meta.runs import RunFolder
 from tests.fakes import log, run_config
 
