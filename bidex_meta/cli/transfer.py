@@ -130,23 +130,25 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
 
 def _steps_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[str]]]:
     columns = ["class", "from", "seeds", *(f"at {int(at):,} (%)" for at in rows[0]["at"]), "at the end (%)"]
-    columns += ["area (%)", "area over nothing", "steps to 50 %"]
+    columns += ["return", "area (%)", "area over nothing", "steps to 50 %"]
     cells = []
     for row in rows:
-        measures = [_text(each) for each in (*row["at"].values(), row["success"], row["area"])]
+        measures = [*map(_text, (*row["at"].values(), row["success"])), _text(row["return"], 1.0), _text(row["area"])]
         median, seeds = row["half"]["median"], row["half"]["of_seeds"]
         half = f"> {end:,}" if median is None else f"{median:,}"
         half += f" ({sum(each is not None for each in seeds)} of {len(seeds)})"
-        cells.append([row["class"], row["from"], *_seeds(row), *measures, _text(row["over_nothing"], "+.1f"), half])
+        cells.append(
+            [row["class"], row["from"], *_seeds(row), *measures, _text(row["over_nothing"], form="+.1f"), half]
+        )
     return columns, cells
 
 
 def _shots_table(rows: Sequence[Json]) -> tuple[list[str], list[list[str]]]:
-    columns = ["class", "from", "seeds", "demonstrations", "success (%)", "over nothing"]
-    cells = [
-        [row["class"], row["from"], *_seeds(row), str(row["demonstrations"]), _text(row["success"]), over]
-        for row, over in ((row, _text(row["over_nothing"], "+.1f")) for row in rows)
-    ]
+    columns = ["class", "from", "seeds", "demonstrations", "success (%)", "return", "success over nothing"]
+    cells = []
+    for row in rows:
+        measures = [_text(row["success"]), _text(row["return"], 1.0), _text(row["over_nothing"], form="+.1f")]
+        cells.append([row["class"], row["from"], *_seeds(row), str(row["demonstrations"]), *measures])
     return columns, cells
 
 
@@ -154,8 +156,8 @@ def _seeds(row: Json) -> list[str]:
     return [", ".join(map(str, row["seeds"]))]
 
 
-def _text(found: Json | None, form: str = ".1f") -> str:
-    return NONE if found is None else Estimate(found["value"], found["interval"]).text(100.0, form=form)
+def _text(found: Json | None, factor: float = 100.0, form: str = ".1f") -> str:
+    return NONE if found is None else Estimate(found["value"], found["interval"]).text(factor, form=form)
 
 
 def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:
@@ -164,14 +166,20 @@ def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:
         return
     curves = {(row["class"], row["from"]): _curve(**row["curve"]) for row in steps}
     if curves:
-        plots.save(plots.draw_panels(_panels(curves), TAG, "success"), out / "reinforcement.png")
+        _save(plots.draw_panels(_panels(curves), TAG, "success"), out / "reinforcement.png")
     of_shots: dict[tuple[str, str], list[Json]] = {}
     for row in sorted(shots, key=lambda row: row["demonstrations"]):
         of_shots.setdefault((row["class"], row["from"]), []).append(row)
     if of_shots:
         panels = _panels({key: _curve_of_shots(rows) for key, rows in of_shots.items()})
         unit = (1.0, "demonstrations")
-        plots.save(plots.draw_panels(panels, TAG, "success", unit), out / "demonstrations.png")
+        _save(plots.draw_panels(panels, TAG, "success", unit), out / "demonstrations.png")
+
+
+def _save(figure: plots.Figure, out: Path) -> None:
+    for axis in figure.axes:
+        axis.set_ylim(-0.02, 1.02)
+    plots.save(figure, out)
 
 
 def _panels(curves: dict[tuple[str, str], plots.Curve]) -> dict[str, list[plots.Group]]:

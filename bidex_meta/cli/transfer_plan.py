@@ -80,7 +80,7 @@ def held_out(worlds: Worlds, asked: Sequence[str]) -> list[str]:
             f"Expected a run on a suite with classes that are not trained on (ML4-v2, ML20-v2), got one on "
             f"{worlds.name}. Name another run."
         )
-    return [known_name(f"held-out class of {worlds.name}", name, found) for name in asked] or found
+    return list(dict.fromkeys(known_name(f"held-out class of {worlds.name}", name, found) for name in asked)) or found
 
 
 def suite_file(worlds: Any, name: str, folder: Path) -> Path:

@@ -42,9 +42,10 @@ def median_steps(found: Sequence[int | None]) -> int | None:
 
 
 def at_the_end(folders: Sequence[RunFolder]) -> Json:
-    """Success of runs that differ in the seed alone, in their final evaluation (4 episodes of each task)."""
+    """Success and return of runs that differ in the seed alone, in their final evaluation (4 episodes of each task)."""
     classes = [folder.evaluation()["policy"]["classes"].values() for folder in folders]
-    return {"success": estimate([float(np.mean([row["success"] for row in rows])) for rows in classes])}
+    measures = ("success", "return")
+    return {name: estimate([float(np.mean([row[name] for row in rows])) for rows in classes]) for name in measures}
 
 
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:

@@ -60,6 +60,7 @@ def test_runs_become_measures_of_each_seed_and_of_all(tmp_path):
     assert found["area"]["interval"] == pytest.approx((0.0, 0.58))
     assert found["half"] == {"of_seeds": [None, None], "median": None}
     assert (found["success"]["value"], found["success"]["of_seeds"]) == (0.75, [0.75, 0.75])
+    assert found["return"]["value"] == 1.0
     assert found["at"] == {} and found["curve"]["steps"][0] == 100 and found["curve"]["mean"][-1] == 0.5
     json.dumps(found)
 
