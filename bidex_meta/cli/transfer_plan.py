@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.transfer_measures import NOTHING
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
-from bidex_meta.suite import Suite, SuiteClass
+from bidex_meta.suite import V1, Suite, SuiteClass
 from bidex_meta.tasks.registry import plain_name
 from bidex_meta.utils.files import absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
@@ -130,12 +130,21 @@ def _toml(value: object) -> str:
 
 
 def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path, count: int) -> Dataset | None:
-    """Episodes of a class: a data set that was given, else its script's, at least ``count``; None without either."""
-    for dataset in map(open_dataset, given):
-        if [plain_name(slot.partition("/")[0]) for slot in dataset.metadata["tasks"]] == [name]:
-            return dataset
+    """Episodes of a class: a data set that was given, else its script's, at least ``count``; None without either.
+
+    Raises BidexError for a data set of other rules: what succeeds by these may fail here.
+    """
     worlds = Worlds.open(WorldConfig(suite=str(file)))
     task = worlds.task_classes()[name]
+    for dataset in map(open_dataset, given):
+        if [plain_name(slot.partition("/")[0]) for slot in dataset.metadata["tasks"]] != [name]:
+            continue
+        if dataset.metadata.get("rules", asdict(V1)) != asdict(task.rules):
+            raise BidexError(
+                f"--data {dataset.name} has {name} by other rules than {file.stem}. Record it by the suite's version "
+                "(docs/versions.md)."
+            )
+        return dataset
     if not task.moving_base or task.name not in scripts_of(task.rules):
         return None
     folder = folder / f"{short_name(name)}-script-v0"

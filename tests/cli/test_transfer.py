@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.runs import RunFolder, plots
-from bidex_meta.suite import load_suite
+from bidex_meta.suite import V2, Rules, load_suite
 from bidex_meta.worlds import WorldConfig, Worlds
 from tests.data.worlds import ABOUT
 from tests.fakes import run_config
@@ -107,7 +107,7 @@ def test_points_and_objects_of_a_suite_are_kept(pair: Path, tmp_path: Path) -> N
     assert [entry.name for entry in suite.split_classes("test")][-1] == "CatchUnderarm-block"
 
 
-def demonstrations(folder: Path, success: str = "1101") -> Path:
+def demonstrations(folder: Path, success: str = "1101", rules: Rules | None = V2) -> Path:
     """A data set of a class alone; episode n is of n + 1 steps."""
     writer = DatasetWriter(folder)
     for number, solved in enumerate(success):
@@ -117,6 +117,7 @@ def demonstrations(folder: Path, success: str = "1101") -> Path:
         writer.add(Episode(states, actions, rewards, last, never, success=solved == "1"))
     writer.commit()
     about = ABOUT | {"tasks": ["DoorCloseOutward-v2"], "reward_scales": {}, "observation_groups": [["state", [[0, 5]]]]}
+    about |= {} if rules is None else {"rules": asdict(rules)}
     finish(folder, folder.name, Box(-9.0, 9.0, (5,)), Box(-1.0, 1.0, (2,)), about)
     return folder
 
@@ -168,6 +169,8 @@ def test_scripts_demonstrate_where_no_data_are_given(pair: Path, tmp_path: Path)
     given = demonstrations(tmp_path / "mine-v0")
     own = demonstrations_of(file, "DoorCloseOutward", [str(given)], tmp_path, 1)
     assert own and own.folder == given / "data"
+    with pytest.raises(BidexError, match="has DoorCloseOutward by other rules than pair-DoorCloseOutward"):
+        demonstrations_of(file, "DoorCloseOutward", [str(demonstrations(tmp_path / "v1-v0", rules=None))], tmp_path, 1)
     pair.write_text(SUITE.replace("DoorCloseOutward", "CatchAbreast"))
     file = suite_file(opened(pair), "CatchAbreast", tmp_path)
     assert demonstrations_of(file, "CatchAbreast", [str(given)], tmp_path, 1) is None
