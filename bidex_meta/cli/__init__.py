@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
     "verify": Command("bidex_meta.cli.verify", "evaluate a run again and compare with what it recorded"),
     "compare": Command("bidex_meta.cli.compare", "several runs beside each other, intervals over seeds"),
     "control": Command("bidex_meta.cli.control", "held-out tasks, adapted to their own data and to others'"),
+    "transfer": Command("bidex_meta.cli.transfer", "held-out classes: learned from a run's policy and from nothing"),
     "record": Command("bidex_meta.cli.record", "record a data set: episodes of a policy, for offline learners"),
     "data": Command("bidex_meta.cli.data", "the data sets there are, one of them, or a check of it"),
     "list": Command("bidex_meta.cli.listing", "the suites, tasks, algos or objects there are"),

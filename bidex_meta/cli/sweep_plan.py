@@ -162,11 +162,11 @@ def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, list[str]]]:
     for values in itertools.product(*grid.values()):
         chosen = dict(zip(grid, values, strict=True))
         label = "".join(f" {flag.rpartition('.')[2]}={_named(value)}" for flag, value in chosen.items())
-        yield label, [word for flag, value in {**shared, **chosen, **own}.items() for word in _words(flag, value)]
+        yield label, [word for flag, value in {**shared, **chosen, **own}.items() for word in words_of(flag, value)]
 
 
-def _words(flag: str, value: object) -> list[str]:
-    """A value as words of the command line."""
+def words_of(flag: str, value: object) -> list[str]:
+    """A flag of ``bidex-meta run`` with its value, as words of the command line."""
     flag = flag.replace("_", "-")
     if isinstance(value, bool):
         before, dot, last = flag.rpartition(".")

@@ -221,7 +221,7 @@ def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
     """Of each tag that one of the runs has logged: see :func:`over_runs`."""
     logged = [run.metrics() for run in runs]
     tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
-    curves = {tag: over_runs([_series(rows, tag) for rows in logged]) for tag in tags}
+    curves = {tag: over_runs([series(rows, tag) for rows in logged]) for tag in tags}
     return {tag: curve for tag, curve in curves.items() if curve is not None}
 
 
@@ -244,7 +244,8 @@ def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
     return Curve(grid, table.mean(axis=0), low, high)
 
 
-def _series(rows: list[Json], tag: str) -> tuple[np.ndarray, np.ndarray]:
+def series(rows: list[Json], tag: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and values (points,) of a tag in the rows of a run's metrics that have it."""
     points = [(row["step"], row[tag]) for row in rows if row.get(tag) is not None]
     steps, values = zip(*points, strict=True) if points else ((), ())
     return np.array(steps, float), np.array(values, float)

@@ -38,6 +38,7 @@ _STYLES = ("-", "--")
 _FEW = 60  # evaluations up to which each is a dot: more of them would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
+_MILLIONS = (1e6, _STEPS)  # of an axis: what is counted as one, and what it is called
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
@@ -79,13 +80,18 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
     return figure
 
 
-def draw_panels(panels: Mapping[str, Sequence[Group]], tag: str, title: str) -> Figure:
-    """A metric, labelled ``title``, against environment steps; a panel for each name's groups, all on one scale."""
+def draw_panels(
+    panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
+) -> Figure:
+    """A metric, labelled ``title``, against environment steps; a panel for each name's groups, all on one scale.
+
+    ``unit``: what of ``Curve.steps`` is counted as one, and what it is called.
+    """
     labels = list(dict.fromkeys(label for groups in panels.values() for label, _ in groups))
     figure = _figure(5.2 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axis, (name, groups) in zip(axes, panels.items(), strict=True):
-        _draw_groups(axis, groups, tag, [labels.index(label) for label, _ in groups])
+        _draw_groups(axis, groups, tag, [labels.index(label) for label, _ in groups], unit)
         axis.set_title(_plain(name))
     axes[0].set_ylabel(title)
     _add_legend(figure, labels)
@@ -209,21 +215,23 @@ def svg(figure: Figure) -> bytes:
     return out.getvalue()
 
 
-def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style: str) -> None:
+def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style: str, one: float = 1e6) -> None:
     if curve is None:
         return
-    steps, colour = curve.steps / 1e6, _colour(number)
+    steps, colour = curve.steps / one, _colour(number)
     marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:
         axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)
 
 
-def _draw_groups(axis: Axes, groups: Sequence[Group], tag: str, numbers: Sequence[int]) -> None:
+def _draw_groups(
+    axis: Axes, groups: Sequence[Group], tag: str, numbers: Sequence[int], unit: tuple[float, str] = _MILLIONS
+) -> None:
     for (label, curves), number in zip(groups, numbers, strict=True):
-        _draw_curve(axis, curves.get(tag), label, number, "-")
+        _draw_curve(axis, curves.get(tag), label, number, "-", unit[0])
     axis.grid(alpha=0.3)
-    axis.set_xlabel(_STEPS)
+    axis.set_xlabel(unit[1])
 
 
 def _colour(number: int) -> Any:
