@@ -16,7 +16,7 @@ from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, linear
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 
-_NO_EVIDENCE = ("right_hand", "left_hand", "padding", "task_id")
+NO_EVIDENCE = ("right_hand", "left_hand", "padding", "task_id")
 """Groups of an observation that are not noted: with the hands a memory learns fifty tasks by heart, not the rewards."""
 
 
@@ -28,7 +28,7 @@ class BeliefNet(nn.Module):
         goals: int, actions: int, generator: torch.Generator, activation: Activation = "elu"
     ):  # fmt: skip
         super().__init__()
-        self.noted = seen.columns(*(group.name for group in seen.groups if group.name not in _NO_EVIDENCE))
+        self.noted = seen.columns(*(group.name for group in seen.groups if group.name not in NO_EVIDENCE))
         self.heads, self.size = heads, size
         features = MLP(self.noted.size + 1, hidden[:-1], hidden[-1], 1.0, generator, activation)
         self.encoder = nn.Sequential(features, ACTIVATIONS[activation]())
