@@ -16,7 +16,7 @@ SMALL = PEARLConfig(
     hidden=(32, 32), encoder=(32, 32), latent=2, context=20, batch_size=256, replay_steps=300, cut_share=0.2,
     warmup_steps=10, steps_per_iteration=20, updates_per_step=2, gamma=0.0, learning_rate=3e-3, init_alpha=0.1,
     critic_learning_rate=3e-3, target_entropy_per_action=0.0, critic_layer_norm=False, episodes_per_trial=2,
-    autocast="off",
+    kl_weight=0.1, autocast="off",
 )  # fmt: skip
 TINY = replace(SMALL, hidden=(8,), encoder=(8,), batch_size=16, context=64, warmup_steps=1000, episodes_per_trial=3)
 UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2))
@@ -107,7 +107,8 @@ def test_an_episode_keeps_its_latent_variable() -> None:
 
 def test_an_update_learns_from_all_environments_of_the_chosen_tasks() -> None:
     learner = learner_on(rows=14, config=replace(TINY, warmup_steps=1, tasks_per_update=4, steps_per_iteration=5))
-    world, draws = learner.world, []
+    world: Any = learner.world
+    draws: list[Any] = []
     learner._infer = lambda rows, draw, *_: draws.append((rows, draw)) or {"Loss/critic": torch.zeros(())}  # type: ignore[func-returns-value, method-assign]
     learner.iterate()
     # Of two classes two tasks each; distances to their goals tell them apart.
