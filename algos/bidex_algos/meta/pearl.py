@@ -40,7 +40,7 @@ class PEARLConfig(MTSACConfig):
     encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
     context: Count = 64  # Transitions from which an update, or an episode, estimates what a task has shown.
     tasks_per_update: Count = 16  # Environments whose tasks an update learns from, split evenly over the classes.
-    kl_weight: NonNegative = 0.001
+    kl_weight: NonNegative = 1e-4
     """Factor of the posterior's divergence from the unit Gaussian in the encoder's loss. Where it weighs more than what
     the critics gain by knowing the task, the posterior stays the prior; Loss/divergence shows it."""
     episodes_per_trial: Annotated[int, Meta(ge=2, le=1000)] = 3
