@@ -108,8 +108,11 @@ class Replay:
 
         # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
         row = self._rows_of_task[self._first[:, None] + uniform(2**40) % self._count[:, None]]
-        slot = (self.added - 1 - uniform(self.filled)) % self.slots
-        return (slot * self.rows + row).flatten(1)
+        return self.places(row, uniform(self.filled)).flatten(1)
+
+    def places(self, rows: Tensor, ages: Tensor) -> Tensor:
+        """Places of what environments did so many vector steps ago, 0: the last; int64, shapes that broadcast."""
+        return (self.added - 1 - ages) % self.slots * self.rows + rows
 
     def weights(self, places: Tensor) -> Tensor:
         """1, or 0 where physics broke or the last observation is no longer kept. Shape of ``places``, float32."""

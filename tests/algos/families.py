@@ -134,3 +134,28 @@ class Recall(FakePools):
         sign, last = self.goal[:, 0], self._at_end()
         earned = sign * torch.where(last, action[:, 0], (self.episodes.elapsed == 0).float())
         return earned, last & (earned > 0.0), torch.zeros_like(last)
+
+
+class Slopes(FakePools):
+    """A step is paid g a - a²/2 for its action a, where g is the task's, evenly from -1 to 1; nothing is seen.
+
+    The best action is g, for g²/2; the best of all that do not know it is 0, for nothing.
+    """
+
+    def __init__(self, rows: int = 16, mode: str = "DISABLED", tasks: int = 16, steps: int = 5):
+        slopes = np.linspace(-1.0, 1.0, tasks)
+        super().__init__({"Slopes": np.stack([slopes, slopes], axis=1)}, rows, (1, 1), (steps,), mode)
+
+    def _start(self, mask: Tensor) -> None:
+        """There is no state."""
+
+    def _observe(self) -> Tensor:
+        return torch.zeros(self.num_envs, 1)
+
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        slope, a = self.goal[:, 0], action[:, 0]
+        return slope * a - 0.5 * a.square(), (a - slope).abs() < 0.1, torch.zeros_like(active)
+
+    def best(self) -> float:
+        """Highest mean return of an episode."""
+        return float((0.5 * self.goal[:, 0].square() * self.max_episode_steps).mean())

@@ -28,6 +28,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "promp": {"inner_steps": 0, "gamma": 2.0, "init_std": 0.0, "std_range": (1.0, 0.5), "outer_epochs": 0},
     "maml": {"backtracks": 0, "slice_steps": 0},
     "rl2": {"chunk": 0, "gamma": 1.5, "blind_share": -0.1, "reward_unit": 0.0, "hidden": ()},
+    "pearl": {"latent": 0, "encoder": (), "context": 0, "kl_weight": -0.1, "episodes_per_trial": 1, "reward_unit": 0.0},
     "mappo": {"huber_delta": 0.0, "value_clip": -1.0},
     "hatrpo": {"max_factor": 0.5},
     "iql": {"expectile": 1.0, "beta": -1.0, "std_range": (2.0, 1.0)},

@@ -81,6 +81,7 @@ CASES = {
     "maml slices": Case("maml", META | {"slice_steps": 7}),
     "promp sizes": Case("promp", META | {"step_sizes": "layer"}),
     "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
+    "pearl": Case("pearl", OFF | {"encoder": (8,), "context": 8, "tasks_per_update": 4, "episodes_per_trial": 2}),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
     "dagger": Case("dagger", DATA),
     "icl": Case("icl", {"hidden": (8,), "candidates": 8, "head": (8,), "updates_per_iteration": 2, "trials": 32}),

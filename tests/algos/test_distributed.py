@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from bidex_algos import learner as base
 from bidex_algos.imitation.dagger import DAgger, DAggerConfig
 from bidex_algos.meta.icl import ICL, ICLConfig
+from bidex_algos.meta.pearl import PEARL, PEARLConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.multiagent.happo import HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPOConfig
@@ -63,6 +64,7 @@ CONTEXT = ICLConfig(
     hidden=(8,), candidates=8, head=(8,), episodes_per_trial=2, updates_per_iteration=3, trials=12,
     teacher_steps=100,
 )  # fmt: skip
+LATENT = PEARLConfig(**REPLAYED, encoder=(8,), context=8, tasks_per_update=4, episodes_per_trial=2)
 UPDATES = (ONE_BATCH, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
 Learner = MTPPO | MTTRPO
 ROWS = 16
@@ -196,6 +198,11 @@ def icl() -> ICL:
     return learner
 
 
+def pearl() -> PEARL:
+    classes = (PointClass("Short", steps=4, count=3), PointClass("Long", steps=7, count=4))
+    return PEARL(PointGoals(8, classes=classes, autoreset_mode="SAME_STEP"), LATENT, seed=0)
+
+
 def mtsac_moves() -> torch.Tensor:
     learner, moved = mtsac(PLAIN_SAC), []
     for _ in range(2):
@@ -215,13 +222,14 @@ def rl2_tells() -> torch.Tensor:
 
 TWINS: dict[str, Callable[[], torch.Tensor]] = {"mtsac": mtsac_moves, "rl2": rl2_tells}
 OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2, "dagger": dagger}
-OTHERS |= {"icl": icl, "flashsac": partial(mtsac, FLASH, FlashSAC)}
+OTHERS |= {"icl": icl, "pearl": pearl, "flashsac": partial(mtsac, FLASH, FlashSAC)}
 REPLAYING = 2 * 3 * SAC.steps_per_iteration * 8
 STEPS = {
     "mtppo": 4 * ITERATION,
     "mtsac": REPLAYING,
     "brc": REPLAYING,
     "flashsac": REPLAYING,
+    "pearl": REPLAYING,
     "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7),
 }
 STEPS["icl"] = STEPS["rl2"]
@@ -302,6 +310,7 @@ KINDS = [
     ("rl2", RL2),
     ("dagger", DAgger),
     ("icl", ICL),
+    ("pearl", PEARL),
 ]
 
 

@@ -27,7 +27,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
     **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "flashsac", "ddpg", "rl2")},
     **{name: [{}] for name in ("bc", "bcq", "td3bc", "iql")},
-    "dagger": [{}], "icl": [{"trials": 32, "memory": 8}],
+    "pearl": [{"steps_per_iteration": 25}], "dagger": [{}], "icl": [{"trials": 32, "memory": 8}],
 }  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
@@ -41,7 +41,8 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = kind.presets["laptop"]
         known = {**SMALL, **options}
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
-        world = PointGoals(rows=16) if kind.make.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
+        mode, bandits = kind.make.autoreset_mode(config), [nearness(0.5), nearness(-0.5)]
+        world = PointGoals(16, autoreset_mode=mode) if kind.make.adapts else ToyWorld(bandits, rows=8)
         learner = kind.make(world, config, seed=0)
         if known.get("demonstration_weight") or kind.make.offline:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))

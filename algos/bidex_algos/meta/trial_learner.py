@@ -15,6 +15,17 @@ from bidex_meta.train.learner import AutoresetMode, State
 from bidex_meta.world.contract import PooledWorld
 
 
+def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str, float]:
+    """Metrics of the first and the last episodes of trials."""
+    metrics = {}
+    for which, statistics in (("first", firsts), ("last", lasts)):
+        found = statistics.metrics()
+        if found:
+            metrics[f"Train/return_{which}_episode"] = found["Train/mean_return"]
+            metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
+    return metrics
+
+
 class TrialLearner(Learner):
     """Base: an iteration plays one trial, a few episodes of one task with one memory, in every environment."""
 
@@ -63,13 +74,7 @@ class TrialLearner(Learner):
         self.trials_played += 1
 
     def _episodes_metrics(self) -> dict[str, float]:
-        metrics = self.episodes.metrics()
-        for which, statistics in (("first", self.firsts), ("last", self.lasts)):
-            found = statistics.metrics()
-            if found:
-                metrics[f"Train/return_{which}_episode"] = found["Train/mean_return"]
-                metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
-        return metrics
+        return self.episodes.metrics() | of_episodes(self.firsts, self.lasts)
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MemoryAgent:

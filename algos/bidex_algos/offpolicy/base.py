@@ -26,7 +26,7 @@ from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,11 @@ class OffPolicy(Learner):
         self.returns.note(reward, terminated, truncated, info["unstable"])
         self.policy.observations.update(obs)
         self.episodes.update(info)
+        self._note(reward, info)
         return info["unstable"].sum()
+
+    def _note(self, reward: Tensor, info: Info) -> None:
+        """Takes rewards (N,) and report of a step, after the replay and the statistics."""
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()
@@ -213,14 +217,18 @@ class OffPolicy(Learner):
         return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
     def _fit_critics(
-        self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor
-    ) -> dict[str, Tensor]:
-        """One step of all critics towards ``target`` (B, ...), of normalised observations (B, d)."""
+        self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor,
+        beside: Tensor | float = 0.0, also: Iterable[nn.Parameter] = ()
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """One step of all critics towards ``target`` (B, ...), of normalised observations (B, d).
+
+        What their optimiser has ``also`` goes down their loss and another one ``beside``.
+        """
         losses, values = self._critic_losses(obs, draw.actions, target)
         loss = (weights / counts.sum().clamp_min(1.0) * losses).sum()
         value = self._per_task(weights * values) / counts.clamp_min(1.0)
         numbers = torch.stack([loss.detach(), (1.0 - weights).mean() / world_size(), *value])
-        numbers = self._descend(loss, numbers, "critic", critic=list(self.critic.parameters()))
+        numbers = self._descend(loss + beside, numbers, "critic", critic=[*self.critic.parameters(), *also])
         names = [f"Value/q/{name}" for name in self.world.task_names]
         return dict(zip(["Loss/critic", "Train/weightless", *names], numbers, strict=True))
 

@@ -1,0 +1,66 @@
+"""The agent of a policy that acts on a latent variable of the task, with the posterior of that (PEARL)."""
+
+import torch
+from torch import Tensor
+
+from bidex_algos.nets.latent import LatentPolicy
+from bidex_meta.agents import Timestep
+
+
+class LatentAgent:
+    """An adapting agent (``bidex_meta.agents``) of such a policy; ``seed`` is of what it explores with.
+
+    Each environment adds up the evidence of its own exploring episodes, and draws a latent variable from the posterior
+    for the next of them; evaluation acts on the posterior's mean. No weight changes.
+    """
+
+    def __init__(self, policy: LatentPolicy, seed: int = 0):
+        self.policy = policy
+        self.device = policy.rewards.shift.device
+        self.noise = torch.Generator(self.device).manual_seed(seed)
+        self.init()
+
+    def assign(self, task_of_row: Tensor | None) -> None:
+        """Nothing: each environment learns from its own episodes."""
+
+    def init(self) -> None:
+        """The posterior of every environment is the prior."""
+        self._sums = self._latent = self._fresh = torch.zeros(0, device=self.device)
+
+    def _fit(self, rows: int) -> None:
+        if len(self._sums) != rows:
+            self._sums, self._latent = (torch.zeros(rows, n * self.policy.size, device=self.device) for n in (2, 1))
+            self._fresh = torch.ones(rows, dtype=torch.bool, device=self.device)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Episodes begin where ``env_mask`` (N,): if they explore, on a new latent variable."""
+        self._fit(len(env_mask))
+        self._fresh = self._fresh | env_mask
+
+    @torch.no_grad()
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sampled actions (N, a) in [-1, 1] for raw observations (N, d)."""
+        self._fit(len(obs))
+        mean, std = self.policy.posterior(self._sums)
+        drawn = mean + std * torch.randn(mean.shape, generator=self.noise, device=self.device)
+        self._latent = torch.where(self._fresh[:, None], drawn, self._latent)
+        self._fresh = torch.zeros_like(self._fresh)
+        return self.policy.sample(self.policy.seen(obs, self._latent), self.noise)[0], {}
+
+    @torch.no_grad()
+    def step(self, timestep: Timestep) -> None:
+        """Adds the evidence of one transition of every environment where it is valid."""
+        # Meta-World's evaluation names neither next observations nor valid environments.
+        following = timestep.observation if timestep.next_observation is None else timestep.next_observation
+        valid = torch.ones_like(timestep.terminated) if timestep.valid is None else timestep.valid
+        reward = timestep.reward.masked_fill(~valid, 0.0)
+        added = self.policy.evidence(timestep.observation, timestep.action, reward, following)
+        self._sums = self._sums + added.masked_fill(~valid[:, None], 0.0)
+
+    def adapt(self) -> None:
+        """Nothing: the evidence was added along the way."""
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Squashed mean actions (N, a) in [-1, 1] for raw observations (N, d)."""
+        self._fit(len(obs))
+        return self.policy.latent_action(obs, self.policy.posterior(self._sums)[0])

@@ -1,0 +1,203 @@
+"""PEARL: SAC conditioned on a latent variable, whose posterior is inferred from a task's transitions.
+
+An environment keeps its task and plays trials: in the first episode it acts on a latent variable drawn from the prior,
+in each further one on one drawn from the posterior of the trial so far. In an update an encoder makes a posterior of
+what some environments did last, and actor and critics learn from all that the replay has of their tasks, on a sample of
+it. The encoder goes down the critics' loss and the divergence from the prior. See docs/learners/pearl.md.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from msgspec import Meta
+from torch import Tensor
+
+from bidex_algos.meta.latent_agent import LatentAgent
+from bidex_algos.meta.trial_learner import of_episodes
+from bidex_algos.nets.architecture import follow, network_of
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.latent import LatentPolicy
+from bidex_algos.nets.networks import gaussian_kl, use_bfloat16
+from bidex_algos.nets.policy import SquashedActor
+from bidex_algos.nets.shape import Shape
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_algos.replay import Stretches, Transitions
+from bidex_algos.rollout import EpisodeStatistics
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, own_seed, world_size
+from bidex_meta.train.learner import Parts, State
+from bidex_meta.utils.validation import Count, NonNegative, Positive, Widths
+from bidex_meta.world.contract import Info, TaskWorld
+
+
+@dataclass(frozen=True)
+class PEARLConfig(MTSACConfig):
+    """Everything that can be set about PEARL; the defaults are the preset ``laptop``."""
+
+    latent: Count = 8  # Entries of the latent variable that stands for the task.
+    encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
+    context: Count = 64  # Transitions from which an update, or an episode, estimates what a task has shown.
+    tasks_per_update: Count = 16  # Environments whose tasks an update learns from, split evenly over the classes.
+    kl_weight: NonNegative = 1e-4
+    """Factor of the posterior's divergence from the unit Gaussian in the encoder's loss. Where it weighs more than what
+    the critics gain by knowing the task, the posterior stays the prior; Loss/divergence shows it."""
+    episodes_per_trial: Annotated[int, Meta(ge=2, le=1000)] = 3
+    """Episodes after which an environment forgets what its task has shown: those played to adapt, and one more."""
+    max_adapt_steps: Count = 1000  # Steps after which an exploring episode of a meta-test is cut.
+    reward_unit: Positive = 0.3  # The encoder reads asinh(reward / reward_unit), normalised by running statistics.
+    value_heads: bool = False  # Give each critic an output per class; the latent variable then need not say which.
+    replay_steps: Count = 4000  # Vector steps that the replay keeps, if replay_memory allows.
+    updates_per_step: Count = 1  # Updates of all networks after each vector step.
+
+
+PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig()}
+
+
+class PEARL(MTSAC):
+    """PEARL (Rakelly et al. 2019, arXiv 1903.08254): off-policy meta-learning with a posterior over tasks."""
+
+    name = "pearl"
+    config_type, presets = PEARLConfig, PRESETS
+    adapts = independent_adaptation = True
+    per_process = (*MTSAC.per_process, "trial")
+    config: PEARLConfig
+    policy: LatentPolicy
+
+    def __init__(self, world: TaskWorld, config: PEARLConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.agent = LatentAgent(self.policy, own_seed(seed))
+        rows, device = world.num_envs, self.device
+        trained = [*self.critic.parameters(), *self.policy.encoder.parameters()]
+        self.adams["critic"] = self._adam(trained, config.critic_learning_rate)
+        self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(2))
+        # Of each environment's trial: the latent variable it acts on, episodes that are over, and the vector steps
+        # after which it began and each of its episodes ended, of the trial before it too: (2, N, episodes + 1).
+        self.latent = torch.randn(rows, config.latent, generator=self.generator, device=device)
+        self.played = torch.zeros(rows, dtype=torch.int64, device=device)
+        self.bounds = torch.zeros(2, rows, config.episodes_per_trial + 1, dtype=torch.int64, device=device)
+        # Environments of each class: how many, and the first. In ``by_task`` those of one task stand side by side: of
+        # each environment's task how many, and where.
+        self.of_class = torch.bincount(world.task_id, minlength=world.num_tasks)
+        self.start = self.of_class.cumsum(0) - self.of_class
+        task = _tasks(world)
+        self.by_task, self.count = torch.argsort(task, stable=True), torch.bincount(task)[task]
+        self.first = torch.searchsorted(task[self.by_task], task)
+        # An update chooses so many environments of each class; ``which`` of all these each of its draws is for.
+        self.chosen = math.ceil(config.tasks_per_update / world.num_tasks)
+        within = torch.arange(self.batch_per_task, device=device) % self.chosen
+        self.which = (torch.arange(world.num_tasks, device=device)[:, None] * self.chosen + within).flatten()
+
+    @classmethod
+    def _inputs(cls, config: PEARLConfig, shape: Shape) -> Inputs:
+        """With the latent variable behind the observation."""
+        return super()._inputs(config, shape).extended("latent", config.latent)
+
+    @classmethod
+    def _make_policy(
+        cls, config: PEARLConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> LatentPolicy:
+        actor = SquashedActor(
+            cls._inputs(config, shape), config.hidden, shape.actions, 1, config.init_std, config.std_range, init,
+            config.activation, network_of(config)
+        )  # fmt: skip
+        return LatentPolicy(
+            super()._inputs(config, shape), actor, use_bfloat16(config.autocast, device), config.normalise_observations,
+            shape.actions, config.latent, config.encoder, config.reward_unit, init, config.activation
+        ).to(device)  # fmt: skip
+
+    def _explore(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(self.policy.seen(obs, self.latent), self.generator)[0]
+
+    def _note(self, reward: Tensor, info: Info) -> None:
+        self.policy.rewards.update(self.policy.compressed(reward.masked_fill(info["unstable"], 0.0)))
+        for episodes, number in ((self.firsts, 0), (self.lasts, self.config.episodes_per_trial - 1)):
+            episodes.update(info | {"counted": info["counted"] & (self.played == number)})
+        ended = info["_final_obs"]
+        self.played.add_(ended)
+        now = self.bounds[1].scatter(1, self.played[:, None], self.replay.added)
+        self.bounds[1] = torch.where(ended[:, None], now, self.bounds[1])
+        over = self.played == self.config.episodes_per_trial
+        self.bounds[0] = torch.where(over[:, None], self.bounds[1], self.bounds[0])
+        self.bounds[1] = torch.where(over[:, None], self.replay.added, self.bounds[1])
+        self.played.masked_fill_(over, 0)
+        rows = ended.nonzero().squeeze(1)
+        if len(rows):
+            mean, std = self.policy.posterior(self._shown(rows, torch.ones_like(rows), self.played[rows]))
+            self.latent[rows] = self._sample(mean, std)
+
+    def _sample(self, mean: Tensor, std: Tensor) -> Tensor:
+        return mean + std * torch.randn(mean.shape, generator=self.generator, device=self.device)
+
+    def _uniform(self, low: int, high: int, *shape: int) -> Tensor:
+        return torch.randint(low, high, shape, generator=self.generator, device=self.device)
+
+    def _below(self, counts: Tensor, *shape: int) -> Tensor:
+        """Uniform whole numbers (shape) below ``counts``, which broadcast; 0 below 0."""
+        # The remainder of a number this large favours none by more than 1 in 2^40 / count.
+        return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
+
+    def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
+        """Sum of the evidence of the first ``episodes`` (M,) of a trial (0: the last but one) of environments (M,).
+
+        By ``context`` of its transitions, whose mean stands for all: (M, 2 * latent).
+        """
+        begin, end = self.bounds[trial, rows, 0], self.bounds[trial, rows, episodes]
+        ages = (self.replay.added - end)[:, None] + self._below((end - begin)[:, None], len(rows), self.config.context)
+        places = self.replay.places(rows[:, None], ages.clamp_max(self.replay.filled - 1))
+        t, weights = self.replay.take(places.flatten()), self.replay.weights(places)[..., None]
+        evidence = self.policy.evidence(t.obs, t.actions, t.rewards, t.next_obs).unflatten(0, places.shape)
+        return (weights * evidence).sum(1) / weights.sum(1).clamp_min(1.0) * (end - begin)[:, None]
+
+    def _learn(self) -> list[dict[str, Tensor]]:
+        updates, classes = self.config.updates_per_step, self.world.num_tasks
+        within = self._below(self.of_class[:, None], updates, classes, self.chosen)
+        chosen = (self.start[:, None] + within).flatten(1)
+        drawn = chosen[:, self.which]
+        drawn = self.by_task[self.first[drawn] + self._below(self.count[drawn], *drawn.shape)]
+        places = self.replay.places(drawn, self._uniform(0, self.replay.filled, *drawn.shape))
+        stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
+        weights = self.replay.weights(stretches.last)
+        counts = all_sum(weights.view(updates, classes, -1).sum(2))
+        return [self._infer(chosen[i], stretches.take(i), weights[i], counts[i]) for i in range(updates)]
+
+    def _infer(self, rows: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """An update by transitions (B) of the tasks of some environments (M,)."""
+        episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
+        trial = (self.played[rows] >= episodes).long()
+        mean, std = self.policy.posterior(self._shown(rows, trial, episodes))
+        zero = torch.zeros_like(mean)
+        divergence = gaussian_kl(mean, std.log(), zero, zero).mean() / world_size()
+        latent = self._sample(mean, std)[self.which]
+        seen, following = (self.policy.seen(obs, latent.detach()) for obs in (draw.obs, draw.next_obs))
+        reported = self._fit_critics(
+            self.policy.seen(draw.obs, latent), draw, self._target(draw, following), weights, counts,
+            self.config.kl_weight * divergence, self.policy.encoder.parameters()
+        )  # fmt: skip
+        reported |= self._policy_step(seen, *self.policy.sample(seen, self.generator), weights, counts)
+        follow(self.target_critic, self.critic, self.config.tau)
+        return reported | {"Loss/divergence": all_sum(divergence.detach())}
+
+    def _iterate(self) -> dict[str, float]:
+        return super()._iterate() | of_episodes(self.firsts, self.lasts)
+
+    def _parts(self) -> Parts:
+        trial = {"latent": self.latent, "played": self.played, "bounds": self.bounds}
+        return super()._parts() | {"episodes": [self.episodes, self.firsts, self.lasts], "trial": trial}
+
+    @classmethod
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> LatentAgent:
+        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        return LatentAgent(super().load_policy(state, device))
+
+
+def _tasks(world: TaskWorld) -> Tensor:
+    """Numbers of the environments' tasks over all classes, (N,); a BidexError where some are played by none."""
+    for name, rows, tasks in zip(world.task_names, world.slot_rows, world.num_slot_tasks, strict=True):
+        if rows.stop - rows.start < tasks:
+            raise BidexError(
+                f"pearl: {name} has {tasks} tasks and {rows.stop - rows.start} environments, each of which keeps its "
+                f"task. Raise num_envs to {max(world.num_slot_tasks) * world.num_tasks}."
+            )
+    return world.task_id * max(world.num_slot_tasks) + world.task_index

@@ -1,0 +1,63 @@
+"""A squashed policy that acts on a latent variable of the task, and the posterior of that, which adds up evidence."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, Activation, autocast
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
+
+
+_NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
+"""Groups of an observation that the encoder is not shown: by the hands it learns fifty tasks by heart, not the rewards."""
+
+
+class LatentPolicy(SquashedPolicy):
+    """``actor`` reads normalised observations with a latent variable of ``size`` entries behind them.
+
+    The posterior is the unit Gaussian times a Gaussian factor for each transition of the task, which an ``encoder``
+    makes of (s, a, r, s'). So it is two sums, of precisions and of precisions times means, both 0 at first.
+    """
+
+    def __init__(
+        self, inputs: Inputs, actor: SquashedActor, low_precision: bool, normalise_observations: bool, actions: int,
+        size: int, hidden: Sequence[int], reward_unit: float, generator: torch.Generator, activation: Activation
+    ):  # fmt: skip
+        super().__init__(ObservationNormaliser(inputs, normalise_observations), actor, low_precision)
+        self.size, self.reward_unit = size, reward_unit
+        self.noted = inputs.columns(*(group.name for group in inputs.groups if group.name not in _NOT_NOTED))
+        self.rewards = ObservationNormaliser(1)
+        transition = 2 * self.noted.size + actions + 1
+        self.encoder = MLP(transition, hidden, 2 * size, 1.0, generator, activation)
+
+    def compressed(self, reward: Tensor) -> Tensor:
+        """Rewards (...) as ``rewards`` takes them, (..., 1): of unknown classes they differ by orders of magnitude."""
+        return torch.asinh(reward / self.reward_unit)[..., None]
+
+    def evidence(self, obs: Tensor, actions: Tensor, reward: Tensor, next_obs: Tensor) -> Tensor:
+        """What each transition adds to the sums (..., 2 * size), of raw observations (..., d) and rewards (...)."""
+        before, after = (self.observations.some(self.noted(x), self.noted) for x in (obs, next_obs))
+        seen = [before, actions, self.rewards(self.compressed(reward)), after]
+        mean, raw = self.encoder(torch.cat(seen, dim=-1)).chunk(2, dim=-1)
+        precision = softplus(raw)
+        return torch.cat([precision, precision * mean], dim=-1)
+
+    def posterior(self, sums: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and deviation (..., size) of the latent variable, of sums of evidence (..., 2 * size)."""
+        precision, weighted = sums.chunk(2, dim=-1)
+        return weighted / (1.0 + precision), (1.0 + precision).rsqrt()
+
+    def seen(self, obs: Tensor, latent: Tensor) -> Tensor:
+        """What actor and critics read, (N, d + size), of raw observations and the latent variable."""
+        return torch.cat([self.observations(obs), latent], dim=1)
+
+    @torch.no_grad()
+    def latent_action(self, obs: Tensor, latent: Tensor) -> Tensor:
+        """The squashed mean (N, a) in [-1, 1] for raw observations (N, d)."""
+        with autocast(obs.device, self.low_precision):
+            mean, _ = self.actor(self.seen(obs, latent))
+        return torch.tanh(mean)

@@ -1,0 +1,123 @@
+"""PEARL: what one episode tells, which transitions the posterior is made of, what each environment learns from."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from bidex_algos.meta.latent_agent import LatentAgent
+from bidex_algos.meta.pearl import PEARL, PEARLConfig
+from bidex_meta.errors import BidexError
+from tests.algos.families import PointClass, PointGoals, Slopes, everyone, played, shot
+
+SMALL = PEARLConfig(
+    hidden=(32, 32), encoder=(32, 32), latent=2, context=20, batch_size=256, replay_steps=300, cut_share=0.2,
+    warmup_steps=10, steps_per_iteration=20, updates_per_step=2, gamma=0.0, learning_rate=3e-3, init_alpha=0.1,
+    critic_learning_rate=3e-3, target_entropy_per_action=0.0, critic_layer_norm=False, episodes_per_trial=2,
+    kl_weight=0.1, autocast="off",
+)  # fmt: skip
+TINY = replace(SMALL, hidden=(8,), encoder=(8,), batch_size=16, context=64, warmup_steps=1000, episodes_per_trial=3)
+UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2))
+
+
+def share(agent: LatentAgent, world: Slopes) -> float:
+    """Of the best return, that of an evaluation."""
+    agent.reset(everyone(world))
+    return played(agent.eval_action, world) / world.best()  # type: ignore[arg-type]
+
+
+def test_one_episode_tells_what_is_paid() -> None:
+    learner = PEARL(Slopes(mode="SAME_STEP", steps=10), SMALL, seed=0)
+    for _ in range(10):
+        learner.iterate()
+    # Slopes between those of the training too.
+    test, agent = Slopes(33, tasks=33, steps=10), PEARL.load_policy(learner.policy_state_dict())
+    assert abs(share(agent, test)) < 0.2
+    shot(agent, test)  # type: ignore[arg-type]
+    assert share(agent, test) > 0.8
+    # It is the task's own data that does it: those of the opposite task mislead.
+    agent.init()
+    test.goal = -test.goal
+    shot(agent, test)  # type: ignore[arg-type]
+    test.goal = -test.goal
+    assert share(agent, test) < -0.8
+
+
+def learner_on(classes: Any = UNEVEN, rows: int = 7, config: PEARLConfig = TINY) -> PEARL:
+    return PEARL(PointGoals(rows, classes=classes, autoreset_mode="SAME_STEP"), config, seed=0)
+
+
+def test_the_posterior_is_made_of_the_episodes_of_a_trial() -> None:
+    learner = learner_on()
+    learner.policy.evidence = lambda obs, actions, reward, following: reward[:, None]  # type: ignore[method-assign]
+    shown: list[Any] = []
+    learner._sample = lambda mean, std: torch.zeros_like(mean)  # type: ignore[method-assign]
+    sums = learner._shown
+    learner._shown = lambda rows, *given: shown.append((rows, *given)) or torch.zeros(len(rows), 4)  # type: ignore[func-returns-value, method-assign]
+    learner.iterate()
+    # Rows 0 to 3 have ended six episodes of three steps after 20, rows 4 to 6 two of seven.
+    of_short, of_long = ([episodes[rows == row].item() for rows, _, episodes in shown if row in rows] for row in (0, 4))
+    assert of_short == [1, 2, 0, 1, 2, 0] and of_long == [1, 2]
+    assert learner.bounds[:, 0, 0].tolist() == [9, 18]
+    # The first two episodes of the last trial but one: steps 9 to 14 of those rows, by 64 of them with repetition.
+    rewards = learner.replay._steps["rewards"][9:15, :4]
+    rows = torch.arange(4)
+    found = sums(rows, torch.zeros_like(rows), torch.full_like(rows, 2))
+    assert_close(found[:, 0], rewards.sum(0), rtol=0.1, atol=0.0)
+    assert not sums(rows, torch.ones_like(rows), torch.zeros_like(rows)).any()
+
+
+def test_the_agent_adds_up_what_an_update_estimates() -> None:
+    learner = learner_on(rows=5)
+    learner.iterate()
+    policy = learner.policy
+    agent, world = LatentAgent(policy), PointGoals(5, classes=UNEVEN)
+    shot(agent, world)
+    mean, std = policy.posterior(agent._sums)
+    assert (std < 1.0).all() and mean.any()
+    # Waiting environments add nothing: of three and of seven steps.
+    precise = policy.evidence(torch.zeros(1, 4), torch.zeros(1, 2), torch.zeros(1), torch.zeros(1, 4))[0, :2]
+    count = agent._sums[:, :2] / precise
+    assert count[:3].max() < count[3:].min()
+    # Evaluation teaches nothing; the next shot goes on; at the start the posterior is the prior.
+    left = agent._sums.clone()
+    agent.reset(everyone(world))
+    played(agent.eval_action, world)
+    assert torch.equal(agent._sums, left)
+    agent.init()
+    agent.reset(everyone(world))
+    mean, std = policy.posterior(agent._sums)
+    assert not mean.any() and (std == 1.0).all()
+    assert not torch.equal(agent.adapt_action(torch.zeros(5, 4))[0][0], agent.adapt_action(torch.zeros(5, 4))[0][1])
+
+
+def test_an_episode_keeps_its_latent_variable() -> None:
+    agent, obs = LatentAgent(learner_on(rows=5).policy), torch.zeros(5, 4)
+    agent.reset(torch.ones(5, dtype=torch.bool))
+    agent.adapt_action(obs)
+    first = agent._latent
+    agent.adapt_action(obs)
+    assert torch.equal(agent._latent, first) and len(first.unique(dim=0)) == 5
+    agent.reset(torch.arange(5) == 2)
+    agent.adapt_action(obs)
+    assert (agent._latent != first).any(1).tolist() == [False, False, True, False, False]
+
+
+def test_an_update_learns_from_all_environments_of_the_chosen_tasks() -> None:
+    learner = learner_on(rows=14, config=replace(TINY, warmup_steps=1, tasks_per_update=4, steps_per_iteration=5))
+    world: Any = learner.world
+    draws: list[Any] = []
+    learner._infer = lambda rows, draw, *_: draws.append((rows, draw)) or {"Loss/critic": torch.zeros(())}  # type: ignore[func-returns-value, method-assign]
+    learner.iterate()
+    # Of two classes two tasks each; distances to their goals tell them apart.
+    for rows, draw in draws:
+        assert world.task_id[rows].tolist() == [0, 0, 1, 1]
+        goals = world.goal[rows][learner.which]
+        assert_close(-draw.rewards, (draw.next_obs[:, :2] - goals).norm(dim=1))
+
+
+def test_tasks_without_an_environment_are_refused() -> None:
+    with pytest.raises(BidexError, match=r"Short has 3 tasks and 2 environments.* Raise num_envs to 6"):
+        learner_on(rows=4)
