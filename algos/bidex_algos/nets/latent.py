@@ -11,9 +11,8 @@ from bidex_algos.nets.networks import MLP, Activation, autocast
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 
-
 _NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
-"""Groups of an observation that the encoder is not shown: by the hands it learns fifty tasks by heart, not the rewards."""
+"""Groups that the encoder is not shown: by the hands it learns fifty tasks by heart, and not the rewards."""
 
 
 class LatentPolicy(SquashedPolicy):
