@@ -1,10 +1,11 @@
 """VariBAD: RL² whose memory is a belief of the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
 
-An encoder makes a Gaussian over a latent of what a trial has shown so far, and a decoder is to tell from a sample of it
-the rewards of the whole trial. The policy reads the belief and PPO trains it, not the encoder.
+An encoder turns what a trial has shown so far into a Gaussian over a latent. From a sample of it a decoder predicts the
+rewards of the whole trial: that trains both. The policy reads the belief; PPO trains the policy and not the encoder.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +23,7 @@ from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
-# Times whose beliefs are decoded in a mini-batch, and steps whose rewards each of them is to tell.
+# Times of a trial whose beliefs a mini-batch decodes, and steps whose rewards are predicted from each.
 _TIMES, _STEPS = 16, 64
 
 
@@ -40,7 +41,9 @@ class VariBADConfig(RL2Config):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.chunk is not None:
-            raise BidexError(f"{self.algo}: a belief is learned from whole trials, got chunk {self.chunk}. Leave it out.")
+            raise BidexError(
+                f"{self.algo}: a belief is learned from whole trials, got chunk {self.chunk}. Leave it out."
+            )
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base."""
@@ -56,13 +59,9 @@ class BeliefActor(RecurrentNet):
     Of an input (..., inputs) the decoder sees the observation, its first ``seen`` entries.
     """
 
-    def __init__(
-        self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator
-    ):  # fmt: skip
+    def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
         hidden, latent, activation = config.hidden, config.latent, config.activation
-        super().__init__(
-            inputs, hidden, config.memory, 2 * latent, 1.0, generator, activation, config.trial_steps
-        )  # fmt: skip
+        super().__init__(inputs, hidden, config.memory, 2 * latent, 1.0, generator, activation, config.trial_steps)
         self.actor = MLP(inputs.extended("belief", 2 * latent), hidden, actions, 0.01, generator, activation)
         self.seen = seen
         self.state = MLP(seen, hidden[:-1], hidden[-1], 1.0, generator, activation)
@@ -100,7 +99,8 @@ class VariBAD(RL2):
 
     def __init__(self, world: PooledWorld, config: VariBADConfig, seed: int):
         super().__init__(world, config, seed)
-        self.model: list[nn.Parameter] = self.policy.actor.model()
+        self.net: Any = self.policy.actor  # a BeliefActor
+        self.model: list[nn.Parameter] = self.net.model()
         self.model_adam = torch.optim.Adam(self.model, lr=config.belief_learning_rate, fused=True)
 
     @classmethod
@@ -108,7 +108,7 @@ class VariBAD(RL2):
         return BeliefActor(inputs, inputs.width - actions - 3, config, actions, init)
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
-        """PPO's with the beliefs that the trial was played by; then those are learned."""
+        """PPO's update, with the beliefs that the trial was played by, then theirs."""
         losses, cfg = super()._update(b), self.config
         ones = torch.ones_like(b.row, dtype=torch.float32)
         batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
@@ -116,7 +116,7 @@ class VariBAD(RL2):
         return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """A step down minus the evidence's lower bound; the two parts of :meth:`_bound`, of all processes."""
+        """One step of encoder and decoder; what :meth:`_bound` returns, of all processes (2,)."""
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
@@ -126,11 +126,11 @@ class VariBAD(RL2):
         return found
 
     def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean squared error of decoded rewards, and mean KL of each belief from the one before; of one process a part.
+        """Mean squared error of decoded rewards and mean KL of each belief from the one before: this process's share.
 
-        Beliefs of some times tell rewards of some steps, before and after, of whole trials ``chosen``.
+        Of the trials ``chosen``, int64 (B,): beliefs at random times predict rewards of random steps, past and future.
         """
-        policy, net = self.policy, self.policy.actor
+        policy, net = self.policy, self.net
         previous = [b.take(each, chosen) for each in b.previous]
         x, valid = policy.see(b.take(b.obs, chosen), *previous), b.take(b.weights, chosen)
         mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
