@@ -22,6 +22,7 @@ ALGOS: dict[str, str] = {
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",
+    "varibad": "bidex_algos.meta.varibad:VariBAD",
     "pearl": "bidex_algos.meta.pearl:PEARL",
     "ippo": "bidex_algos.multiagent.ippo:IPPO",
     "mappo": "bidex_algos.multiagent.mappo:MAPPO",

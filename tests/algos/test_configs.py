@@ -28,6 +28,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "promp": {"inner_steps": 0, "gamma": 2.0, "init_std": 0.0, "std_range": (1.0, 0.5), "outer_epochs": 0},
     "maml": {"backtracks": 0, "slice_steps": 0},
     "rl2": {"chunk": 0, "gamma": 1.5, "blind_share": -0.1, "reward_unit": 0.0, "hidden": ()},
+    "varibad": {"latent": 0, "kl_weight": -0.1, "belief_learning_rate": 0.0},
     "pearl": {"latent": 0, "encoder": (), "context": 0, "kl_weight": -0.1, "episodes_per_trial": 1, "reward_unit": 0.0},
     "mappo": {"huber_delta": 0.0, "value_clip": -1.0},
     "hatrpo": {"max_factor": 0.5},
@@ -48,6 +49,7 @@ TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
     ("mappo", {"popart": True, "value_heads": False}, "leave per_task_values and value_heads on"),
+    ("varibad", {"chunk": 25}, "whole trials"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
 ]
 HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))

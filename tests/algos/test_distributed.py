@@ -16,6 +16,7 @@ from bidex_algos.imitation.dagger import DAgger, DAggerConfig
 from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.pearl import PEARL, PEARLConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
+from bidex_algos.meta.varibad import VariBAD, VariBADConfig
 from bidex_algos.multiagent.happo import HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPOConfig
@@ -59,6 +60,7 @@ PLAIN_SAC = replace(
     SAC, adam_eps=10.0, max_grad_norm=1e9, learning_rate=0.5, critic_learning_rate=0.5, alpha_learning_rate=0.5
 )
 RECURRENT = RL2Config(hidden=(8,), memory=8, episodes_per_trial=2, chunk=5, num_minibatches=2, epochs=2)
+BELIEVING = VariBADConfig(hidden=(8,), memory=8, latent=2, episodes_per_trial=2, num_minibatches=2, epochs=2)
 TAUGHT = DAggerConfig(hidden=(8,), batch_size=32, updates_per_iteration=3, teacher_steps=800, autocast="off")
 CONTEXT = ICLConfig(
     hidden=(8,), candidates=8, head=(8,), episodes_per_trial=2, updates_per_iteration=3, trials=12,
@@ -178,9 +180,9 @@ def mtsac(config: Any = SAC, kind: Any = MTSAC) -> Any:
     return kind(opposite_bandits(rows=4, scale=10.0), config, seed=0)
 
 
-def rl2(goals: int = 8) -> RL2:
+def rl2(goals: int = 8, config: Any = RECURRENT, kind: type[RL2] = RL2) -> RL2:
     classes = (PointClass("Short", steps=4, count=3), PointClass("Long", steps=7, count=goals))
-    return RL2(PointGoals(6, classes=classes), RECURRENT, seed=0)
+    return kind(PointGoals(6, classes=classes), config, seed=0)
 
 
 def dagger() -> DAgger:
@@ -213,15 +215,18 @@ def mtsac_moves() -> torch.Tensor:
     return moved[1] - moved[0]
 
 
-def rl2_tells() -> torch.Tensor:
-    learner = rl2(goals=3)
+def rl2_tells(*kind: Any) -> torch.Tensor:
+    learner = rl2(3, *kind)
     told = [learner.iterate() for _ in range(3)][-1]
-    names = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction", "Policy/std")
+    names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction", "Policy/std"]
+    names += ["Loss/reward", "Loss/divergence"] * bool(kind)
     return torch.tensor([told[name] for name in names])
 
 
 TWINS: dict[str, Callable[[], torch.Tensor]] = {"mtsac": mtsac_moves, "rl2": rl2_tells}
+TWINS["varibad"] = partial(rl2_tells, BELIEVING, VariBAD)
 OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2, "dagger": dagger}
+OTHERS |= {"varibad": partial(rl2, 8, BELIEVING, VariBAD)}
 OTHERS |= {"icl": icl, "pearl": pearl, "flashsac": partial(mtsac, FLASH, FlashSAC)}
 REPLAYING = 2 * 3 * SAC.steps_per_iteration * 8
 STEPS = {
@@ -232,7 +237,7 @@ STEPS = {
     "pearl": REPLAYING,
     "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7),
 }
-STEPS["icl"] = STEPS["rl2"]
+STEPS["icl"] = STEPS["varibad"] = STEPS["rl2"]
 STEPS["dagger"] = 2 * 3 * TAUGHT.rollout_steps * 8
 
 
@@ -308,6 +313,7 @@ KINDS = [
     ("brc", BRC),
     ("flashsac", FlashSAC),
     ("rl2", RL2),
+    ("varibad", VariBAD),
     ("dagger", DAgger),
     ("icl", ICL),
     ("pearl", PEARL),

@@ -25,7 +25,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"teacher_updates": 2},
     ],
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
-    **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "flashsac", "ddpg", "rl2")},
+    **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "flashsac", "ddpg", "rl2", "varibad")},
     **{name: [{}] for name in ("bc", "bcq", "td3bc", "iql")},
     "pearl": [{"steps_per_iteration": 25}], "dagger": [{}], "icl": [{"trials": 32, "memory": 8}],
 }  # fmt: skip

@@ -48,6 +48,7 @@ FLAGS = {
     "flashsac": f"{_REPLAY} --learner.critic-hidden 8 --learner.atoms 5",
     **dict.fromkeys(("promp", "maml"), f"{_ADAPTS} --learner.tasks-per-class 2"),
     "rl2": f"{_ADAPTS} --learner.memory 8 --learner.chunk 4 --learner.episodes-per-trial 2",
+    "varibad": f"{_ADAPTS} --learner.memory 8 --learner.latent 2 --learner.episodes-per-trial 2",
     "pearl": f"{_REPLAY} --learner.max-adapt-steps 4 --learner.encoder 8 --learner.context 4",
     **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),
     "bcq": f"{_STORED} --learner.vae-hidden 8 --learner.candidates 2",
@@ -59,7 +60,7 @@ _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.st
 _LOADED += tuple(f"bidex_meta.cli.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
 _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references"))
 """What each process would load by itself, for longer than it runs."""
-ADAPTS = ("promp", "maml", "rl2", "icl", "pearl")
+ADAPTS = ("promp", "maml", "rl2", "varibad", "icl", "pearl")
 OFFLINE = ("bc", "bcq", "td3bc", "iql")
 TAUGHT = ("dagger", "icl")
 ROWS = 8

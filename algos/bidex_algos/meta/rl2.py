@@ -6,6 +6,7 @@ over it in mini-batches of chunks, and starts the next without memory. The first
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -150,14 +151,18 @@ class RL2(TrialLearner):
         cls, config: RL2Config, shape: Shape, init: torch.Generator, device: torch.device
     ) -> RecurrentPolicy:
         def actor(inputs: Inputs) -> RecurrentNet:
-            return RecurrentNet(
-                inputs, config.hidden, config.memory, shape.actions, 0.01, init, config.activation, config.trial_steps
-            )
+            return cls._make_actor(config, inputs, shape.actions, init)
 
         return RecurrentPolicy(
             cls._inputs(config, shape), shape.actions, config.memory, config.init_std, config.reward_unit,
             config.normalise_observations, actor
         ).to(device)  # fmt: skip
+
+    @classmethod
+    def _make_actor(cls, config: Any, inputs: Inputs, actions: int, init: torch.Generator) -> RecurrentNet:
+        return RecurrentNet(
+            inputs, config.hidden, config.memory, actions, 0.01, init, config.activation, config.trial_steps
+        )
 
     def _parts(self) -> Parts:
         shared = {"critic": self.critic, "return_stats": self.return_stats, **self.adams.parts()}

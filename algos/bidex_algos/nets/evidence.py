@@ -77,10 +77,6 @@ class BeliefPolicy(RecurrentPolicy):
         new, again = torch.rand(2, rows, 1, generator=generator, device=device)
         return new if last is None else torch.where(again < 1.0 / self.try_steps, new, last)
 
-    def earned(self, reward: Tensor) -> Tensor:
-        """Raw rewards (...) as the model knows them."""
-        return self.rewards(self._compressed(reward)).squeeze(-1)
-
     def evidence(self, obs: Tensor, reward: Tensor) -> Tensor:
         """Log-likelihoods (N, candidates) of the rewards (N,) that led to raw observations (N, d)."""
         mean, log_std = self.actor.pays(self.observations(obs), self.goals(self.actor.candidates))

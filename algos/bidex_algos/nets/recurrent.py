@@ -90,9 +90,13 @@ class RecurrentPolicy(nn.Module):
 
         ``obs`` are raw (..., d), ``action`` (..., a); ``known`` and ``done`` as in :class:`Memory`, (...); both go in.
         """
-        earned = torch.where(known, self.rewards(self._compressed(reward)).squeeze(-1), 0.0)
+        earned = torch.where(known, self.earned(reward), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)
         return torch.cat([self.observations(obs), action.clamp(-1.0, 1.0), last], dim=-1)
+
+    def earned(self, reward: Tensor) -> Tensor:
+        """Raw rewards (...) as the networks know them."""
+        return self.rewards(self._compressed(reward)).squeeze(-1)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,149 @@
+"""VariBAD: RL² whose memory is a belief of the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
+
+An encoder turns what a trial has shown so far into a Gaussian over a latent. From a sample of it a decoder predicts the
+rewards of the whole trial: that trains both. The policy reads the belief; PPO trains the policy and not the encoder.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.meta.rl2 import RL2, RL2Config
+from bidex_algos.meta.trials import Batch
+from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import ACTIVATIONS, MLP, gaussian_kl, linear
+from bidex_algos.nets.recurrent import RecurrentNet
+from bidex_algos.onpolicy.ppo import mini_batches
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.learner import Parts
+from bidex_meta.utils.validation import Count, NonNegative, Positive
+from bidex_meta.world.contract import PooledWorld
+
+# Times of a trial whose beliefs a mini-batch decodes, and steps whose rewards are predicted from each.
+_TIMES, _STEPS = 16, 64
+
+
+@dataclass(frozen=True)
+class VariBADConfig(RL2Config):
+    """Everything that can be set about VariBAD; the defaults are the preset ``laptop``."""
+
+    latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
+    kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
+    belief_learning_rate: Positive = 1e-3  # Adam's step size for encoder and decoder.
+    max_adapt_steps: Count = 300  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    reward_unit: Positive = 0.3
+    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.chunk is not None:
+            raise BidexError(
+                f"{self.algo}: a belief is learned from whole trials, got chunk {self.chunk}. Leave it out."
+            )
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
+        return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
+
+
+PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig()}
+
+
+class BeliefActor(RecurrentNet):
+    """An actor that reads what is seen and the belief in the memory, and a decoder of rewards.
+
+    Of an input (..., inputs) the decoder sees the observation, its first ``seen`` entries.
+    """
+
+    def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
+        hidden, latent, activation = config.hidden, config.latent, config.activation
+        super().__init__(inputs, hidden, config.memory, 2 * latent, 1.0, generator, activation, config.trial_steps)
+        self.actor = MLP(inputs.extended("belief", 2 * latent), hidden, actions, 0.01, generator, activation)
+        self.seen = seen
+        self.state = MLP(seen, hidden[:-1], hidden[-1], 1.0, generator, activation)
+        self.task, self.activation = linear(latent, hidden[-1], 1.0, generator), ACTIVATIONS[activation]()
+        self.paid = MLP(hidden[-1], (hidden[-1],), 1, 0.01, generator, activation)
+
+    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """As in the base; the memory gets no gradient."""
+        with torch.no_grad():
+            mean, log_std, state = self.believe(x, state)
+        return self.actor(torch.cat([x, mean, log_std], dim=-1)), state
+
+    def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Means and log-deviations (T, B, latent) of the beliefs at steps (T, B, inputs), and the memory after them."""
+        belief, state = super().forward(x, state)
+        mean, log_std = belief.chunk(2, dim=-1)
+        return mean, log_std.clamp(-6.0, 2.0), state
+
+    def pays(self, x: Tensor, latent: Tensor) -> Tensor:
+        """Normalised rewards (K, M, B) that led to inputs (M, B, inputs), by samples of the latent (K, B, latent)."""
+        both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
+        return self.paid(both).squeeze(-1)
+
+    def model(self) -> list[nn.Parameter]:
+        """Weights of encoder and decoder, which PPO leaves alone."""
+        return [weight for name, weight in self.named_parameters() if not name.startswith("actor.")]
+
+
+class VariBAD(RL2):
+    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief of what a task hides."""
+
+    name = "varibad"
+    config_type, presets = VariBADConfig, PRESETS
+    config: VariBADConfig
+
+    def __init__(self, world: PooledWorld, config: VariBADConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.net: Any = self.policy.actor  # a BeliefActor
+        self.model: list[nn.Parameter] = self.net.model()
+        self.model_adam = torch.optim.Adam(self.model, lr=config.belief_learning_rate, fused=True)
+
+    @classmethod
+    def _make_actor(cls, config: VariBADConfig, inputs: Inputs, actions: int, init: torch.Generator) -> BeliefActor:
+        return BeliefActor(inputs, inputs.width - actions - 3, config, actions, init)
+
+    def _update(self, b: Batch) -> dict[str, Tensor]:
+        """PPO's update, with the beliefs that the trial was played by, then theirs."""
+        losses, cfg = super()._update(b), self.config
+        ones = torch.ones_like(b.row, dtype=torch.float32)
+        batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
+        reward, divergence = torch.stack([self._descend(b, chosen) for _, chosen, _ in batches]).mean(0)
+        return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
+
+    def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
+        """One step of encoder and decoder; what :meth:`_bound` returns, of all processes (2,)."""
+        reward, divergence = self._bound(b, chosen)
+        self.model_adam.zero_grad()
+        (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
+        found = sum_gradients(self.model, torch.stack([reward, divergence]).detach())
+        nn.utils.clip_grad_norm_(self.model, self.config.max_grad_norm)
+        self.model_adam.step()
+        return found
+
+    def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean squared error of decoded rewards and mean KL of each belief from the one before: this process's share.
+
+        Of the trials ``chosen``, int64 (B,): beliefs at random times predict rewards of random steps, past and future.
+        """
+        policy, net = self.policy, self.net
+        previous = [b.take(each, chosen) for each in b.previous]
+        x, valid = policy.see(b.take(b.obs, chosen), *previous), b.take(b.weights, chosen)
+        mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
+        before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
+        divergence = valid * gaussian_kl(mean, log_std, *before)
+        # A slot shows the reward of the step before it, but where that ended an episode not what it led to.
+        paid = torch.cat([torch.zeros_like(valid[:1]), valid[:-1]]).masked_fill(previous[3], 0.0)
+        time, step = (torch.randperm(len(x), generator=self.generator, device=x.device)[:k] for k in (_TIMES, _STEPS))
+        noise = torch.randn(mean[time].shape, generator=self.generator, device=x.device)
+        off = net.pays(x[step], mean[time] + log_std[time].exp() * noise) - policy.earned(previous[1])[step]
+        weights = valid[time][:, None] * paid[step]
+        count = all_sum(torch.stack([weights.sum(), valid.sum()])).clamp_min(1.0)
+        return (weights * off.square()).sum() / count[0], divergence.sum() / count[1]
+
+    def _parts(self) -> Parts:
+        return {**super()._parts(), "model_adam": self.model_adam}
