@@ -19,8 +19,7 @@ from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.worlds import Worlds
 
-# Of the known formula: candidates, each of which is asked for in each step, and a deviation of rewards for goals that lie
-# between them.
+# Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
 _CANDIDATES, _EXACT = 128, 0.02
 
 

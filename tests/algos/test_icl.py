@@ -14,8 +14,8 @@ from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 
 SMALL = ICLConfig(
-    hidden=(32,), candidates=64, trust=0.2, head=(32,), init_std=0.3, try_steps=4, episodes_per_trial=2, updates_per_iteration=40,
-    batch_size=256, goals=3, trials=320, learning_rate=6e-3, teacher_steps=10_000,
+    hidden=(32,), candidates=64, trust=0.2, head=(32,), init_std=0.3, try_steps=4, episodes_per_trial=2,
+    updates_per_iteration=40, batch_size=256, goals=3, trials=320, learning_rate=6e-3, teacher_steps=10_000,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 
