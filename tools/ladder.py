@@ -1,7 +1,6 @@
 """``python -m tools.ladder RUN``: the lines between which a learner that infers hidden goals stands."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +69,7 @@ def success(evaluation: MetaEvaluation) -> list[float]:
 class _Known:
     """Log-likelihoods of candidates by the classes' own formulas of the reward."""
 
-    def __init__(self, hidden: HiddenParts, candidates: Sequence[Tensor]):
+    def __init__(self, hidden: HiddenParts, candidates: Tensor):
         self._hidden, self._candidates = hidden, candidates
 
     def evidence(self, obs: Tensor, reward: Tensor) -> Tensor:

@@ -173,8 +173,8 @@ class ICL(TrialLearner):
 
     def _descend(self, data: TaughtTrials) -> Tensor:
         """A step down the mean of the classes' losses; they and the model's squared errors, of all processes (3, K)."""
-        *drawn, task = self._drawn(data, self.config.batch_size)
-        steps = data.steps(*drawn, torch.rand(len(task), generator=self.generator, device=self.device))
+        trial, row, task = self._drawn(data, self.config.batch_size)
+        steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
         losses = torch.stack([self._imitation(steps, task), *self._model(steps)]) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())

@@ -225,7 +225,8 @@ class Towers(Headed):
         widths = list(pairwise([self.encoder.size, *hidden]))
         self.between = nn.Sequential(PlainNorm(layer_norm), ACTIVATIONS[activation]())
         self.common = nn.ModuleList(linear(*pair, gain, generator) for pair in widths[:shared])
-        self.own = nn.ModuleList(StackedLinear(self.one_hot.size, *pair, gain, generator) for pair in widths[shared:])
+        own = [StackedLinear(self.one_hot.size, *pair, gain, generator) for pair in widths[shared:]]
+        self.own: Sequence[StackedLinear] = nn.ModuleList(own)  # type: ignore[assignment]
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
@@ -259,8 +260,9 @@ class Transformer(Headed):
         super().__init__()
         inputs, width = Inputs.of(inputs), hidden[-1]
         shown = [group.name for group in inputs.groups if group.name not in inputs.hidden]
-        self.encoders = nn.ModuleList(GroupEncoder(inputs.only(name), generator) for name in shown)
-        self.tokens = nn.ModuleList(linear(part.size, width, 1.0, generator) for part in self.encoders)
+        encoders = [GroupEncoder(inputs.only(name), generator) for name in shown]
+        self.encoders = nn.ModuleList(encoders)
+        self.tokens = nn.ModuleList(linear(part.size, width, 1.0, generator) for part in encoders)
         with torch.random.fork_rng(devices=[]):  # PyTorch's layers draw from the global generator
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device="cpu")))
             self.blocks = nn.Sequential(
