@@ -79,8 +79,9 @@ def learners() -> Iterator[tuple[str, Any]]:
         data = _data_set(folder)
         for algo in _presets():
             run = Path(folder) / algo
-            source = ["--dataset", str(data)] if algo in OFFLINE else ["--num-envs", str(ENVIRONMENTS)]
-            steps = 4 if algo in OFFLINE else ENVIRONMENTS * (8 if algo in ADAPTS else 4)
+            rows = 150 if algo == "pearl" else ENVIRONMENTS  # of which each keeps its task
+            source = ["--dataset", str(data)] if algo in OFFLINE else ["--num-envs", str(rows)]
+            steps = 4 if algo in OFFLINE else rows * (8 if algo in ADAPTS else 4)
             words = ["--steps", str(ITERATIONS * steps), *FLAGS[algo].partition(" --agents")[0].split()]
             command(*_run(algo), *source, *words, "--no-evaluate", "--run-dir", str(run))
             lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]

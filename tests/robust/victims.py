@@ -53,7 +53,7 @@ FLAGS = {
     **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),
     "bcq": f"{_STORED} --learner.vae-hidden 8 --learner.candidates 2",
     "dagger": f"{_STORED} --learner.rollout-steps 4 --learner.teacher-steps 200",
-    "icl": f"{_ADAPTS} --learner.memory 8 --learner.head 8 --learner.updates-per-iteration 2 --learner.trials 32",
+    "icl": f"{_ADAPTS} --learner.candidates 8 --learner.head 8 --learner.updates-per-iteration 2 --learner.trials 32",
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
