@@ -159,10 +159,11 @@ def test_the_page_shows_the_row_and_obeys(stage):
 def test_without_a_screen_and_viser_one_line_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr(gl_backend, "has_screen", lambda: False)
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert main(["play", "--task", "CatchUnderarm"]) == 2
-    assert "bidex-meta[viewer]" in capsys.readouterr().err
+    for words in ([], ["--task", "CatchUnderarm"]):  # the policy that comes with bidex-meta, and none
+        assert main(["play", *words]) == 2
+        assert "bidex-meta[viewer]" in capsys.readouterr().err
     for flags, told in (
-        ([], "a run folder, --task TASK or --suite SUITE"),
+        (["--policy", "random"], "a run folder, --task TASK or --suite SUITE"),
         (["--task", "CatchUnderarms"], "Did you mean 'CatchUnderarm'"),
         (["--task", "CatchUnderarm", "--speed", "0"], "speed"),
     ):
