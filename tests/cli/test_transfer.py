@@ -250,7 +250,7 @@ def test_bad_input_is_one_line_and_writes_nothing(trained: Path, tmp_path: Path,
         RunFolder.create(run_config(**{"suite": None, **entries}), tmp_path / name)
     RunFolder.create(run_config(suite="ML4-v2"), tmp_path / "nothing")
     RunFolder.create(run_config(suite="ML4-v2"), tmp_path / "others" / "start")
-    for words, told in (
+    for words, message in (
         (["shown"], "Expected a run on a suite with classes that are not trained on (ML4-v2, ML20-v2), got one on MT4"),
         (["both"], "got one on ML1"),
         (["alone"], "got one on HandOver"),
@@ -263,7 +263,7 @@ def test_bad_input_is_one_line_and_writes_nothing(trained: Path, tmp_path: Path,
         (["start", "--", "--learner.gama", "1"], "Unknown flag --learner.gama of bidex-meta run"),
     ):
         error = refused("transfer", words[0], "--out", "t", *words[1:])
-        assert told in error and error.count("\n") == 1 and not Path("t").exists()
+        assert message in error and error.count("\n") == 1 and not Path("t").exists()
 
 
 def test_each_start_has_the_network_of_its_run(tmp_path: Path) -> None:
