@@ -243,11 +243,12 @@ def test_columns_in_eights_change_no_product(width: int):
         torch.testing.assert_close(got, expected)
 
 
-def test_own_heads_are_those_of_all_heads():
+@pytest.mark.parametrize("tasks", [[1, 0, 1, 1, 1, 0], [0, 0, 1, 1, 1, 1]], ids=["mixed", "in order"])
+def test_own_heads_are_those_of_all_heads(tasks):
     generator = torch.Generator().manual_seed(0)
     actor = GaussianActor(TASKS_LAST, (8,), 3, 0.5, generator, heads=2)
     x = torch.randn(6, 5, generator=generator)
-    x[:, 3:] = torch.eye(2)[torch.tensor([1, 0, 1, 1, 1, 0])]
+    x[:, 3:] = torch.eye(2)[torch.tensor(tasks)]
 
     def found(own: bool) -> list[Tensor]:
         with pytest.MonkeyPatch.context() as patch:
