@@ -12,7 +12,7 @@ from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.policies import load_policy, policy_loader
-from bidex_meta.cli.tables import Json, evaluation_table, print_table, say
+from bidex_meta.cli.tables import Json, evaluation_table, print_table, result_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
@@ -88,20 +88,30 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
 
 
 def judged_on_others(
-    config: RunConfig, policy: Agent, step: int, split: str, options: Options, random: bool
+    config: RunConfig, policy: Agent, step: int, split: str, options: Options, random: bool, brief: bool = False
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
     drawn = Worlds.open(config.to_json()).seed + _OTHER_SEED
     others = Worlds.open({**config.to_json(), "task_seed": drawn})
     title = f"{config.algo} on {others.name}, other tasks (seed {drawn})"
-    found, table = judged(others, policy, step, split, options, random, title)
+    found, table = judged(others, policy, step, split, options, random, title, brief)
     return {"task_seed": drawn, **found}, table
 
 
 def judged(
-    worlds: Worlds, policy: Agent, step: int, split: str, options: Options, random: bool, title: str
+    worlds: Worlds,
+    policy: Agent,
+    step: int,
+    split: str,
+    options: Options,
+    random: bool,
+    title: str,
+    brief: bool = False,
 ) -> tuple[Json, Table]:
-    """The evaluation of a policy on a split, beside that of a random one if asked, as JSON and as a table."""
+    """The evaluation of a policy on a split, beside that of a random one if asked, as JSON and as a table.
+
+    ``brief`` ones, always beside random, have a table for a terminal.
+    """
     world = worlds.world(split, options.num_envs)
     found = worlds.judge(policy, world, options.episodes, options.starts)
     result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
@@ -110,7 +120,7 @@ def judged(
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
         result |= {"random": other.to_json(), "return_above_random": differences}
     world.close()
-    return result, evaluation_table(title, found, other)
+    return result, result_table(title, found, other) if brief and other else evaluation_table(title, found, other)
 
 
 def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds: Worlds) -> Json:

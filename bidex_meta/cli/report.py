@@ -1,6 +1,6 @@
 """``bidex-meta report``: runs as one HTML page.
 
-Pictures and films stand in the file itself, so that it needs no network. Needs the extra ``plot``.
+Pictures and films stand in the file itself, so that it needs no network.
 """
 
 import base64
@@ -53,11 +53,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def render(runs: Sequence[Run]) -> str:
-    """The page of some runs; BidexError where none has logged anything, or matplotlib or jinja2 is missing."""
-    try:
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    except ImportError:
-        raise BidexError("Reports need jinja2 and matplotlib: pip install 'bidex-meta[plot]'.") from None
+    """The page of some runs; BidexError where none has logged anything."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     histories = read_histories(runs)
     short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
     named = list(zip(short, histories, strict=True))
@@ -170,8 +168,6 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
 
 def _picture(draw: Callable[[], Any]) -> str | None:
     """A figure as the address of an image; None where there is nothing to draw."""
-    if missing := plots.missing():
-        raise BidexError(missing)
     try:
         return _data(plots.svg(draw()), "image/svg+xml")
     except BidexError:

@@ -242,17 +242,17 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
     title = f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps"
     options = metatest.Options(episodes=episodes)
-    found, table = judged(source, learner, learner.env_steps, "train", options, random=True, title=title)
+    found, table = judged(source, learner, learner.env_steps, "train", options, random=True, title=title, brief=True)
     tables = [table]
     if plan.flags.other_tasks:
         config = replace(plan.config, device=launch().own_device(plan.config.device))
         step = learner.env_steps
-        found["other_tasks"], table = judged_on_others(config, learner, step, "train", options, random=True)
+        found["other_tasks"], table = judged_on_others(config, learner, step, "train", options, True, brief=True)
         tables.append(table)
     write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
     for table in tables:
         print_table(table)
-    say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
+    say(f"More columns: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
 
 
 def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:

@@ -82,6 +82,20 @@ def evaluation_table(
     return table
 
 
+def result_table(title: str, policy: Evaluation, random: Evaluation) -> Table:
+    """The least of ``evaluation_table``, for a terminal of 80 columns."""
+    headers = ["success", "random", "return [95 %]", "random return"]
+    table = titled(title, "[..] 95 % bootstrap interval over tasks", ["task"], headers)
+    rows, others = policy.to_json(), random.to_json()
+    for name, row in rows["classes"].items():
+        other = others["classes"][name]
+        cells = [percent(row["success"]), percent(other["success"]), ranged(row["return"], row["return_interval"])]
+        table.add_row(plain(name), *cells, f"{other['return']:.4g}")
+    means = [percent(each["aggregate"]["success"]["mean"]) for each in (rows, others)]
+    table.add_row("mean over tasks", *means, style="dim")
+    return table
+
+
 def gained(measures: Mapping[str, Difference | None]) -> list[str]:
     """Cells of the gains in success, return and score."""
     success, earned, score = (measures[name] for name in ("success", "return", "score"))

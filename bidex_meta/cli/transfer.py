@@ -125,7 +125,7 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
     if shots:
         print_table(plain_table(*_shots_table(shots)))
     _draw(flags.out, steps, shots)
-    say(plots.missing() or f"Tables and figures: {flags.out}")
+    say(f"Tables and figures: {flags.out}")
 
 
 def _steps_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[str]]]:
@@ -162,8 +162,6 @@ def _text(found: Json | None, factor: float = 100.0, form: str = ".1f") -> str:
 
 def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:
     """A panel of each class: success against steps, and against demonstrations."""
-    if plots.missing() is not None:
-        return
     curves = {(row["class"], row["from"]): _curve(**row["curve"]) for row in steps}
     if curves:
         _save(plots.draw_panels(_panels(curves), TAG, "success"), out / "reinforcement.png")

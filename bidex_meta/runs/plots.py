@@ -1,4 +1,4 @@
-"""Curves and points of runs as figures: learning, metrics, adaptation, comparison. Needs the extra ``plot``."""
+"""Curves and points of runs as figures: learning, metrics, adaptation, comparison."""
 
 import io
 import textwrap
@@ -48,7 +48,6 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
     Each task has its own panels: their returns differ by orders of magnitude. Line styles are those of the families of
     tags; evaluations while training are dashed. Raises BidexError where no episode has ended yet.
     """
-    _matplotlib()
     starts = [f"{family}/{measure}/" for measure in _MEASURES for family in families]
     tags = [tag for _, curves in groups for tag in curves]
     names = list(dict.fromkeys(tag[len(start) :] for tag in tags for start in starts if tag.startswith(start)))
@@ -119,7 +118,6 @@ def draw_adaptation(evaluation: Json, where: object) -> Figure:
     Bands are the 95 % bootstrap intervals over episodes. Raises BidexError where ``evaluation`` (of evaluation.json or
     of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names it in messages) holds no meta-test.
     """
-    _matplotlib()
     splits = evaluation.get("splits") if isinstance(evaluation, dict) else None
     if not splits:
         raise BidexError(
@@ -156,18 +154,8 @@ def _draw_shots(axis: Axes, rows: list[Json], measure: str, colour: str | None) 
         axis.set_xlabel("shots")
 
 
-def missing() -> str | None:
-    """What to install where nothing can be drawn; None where it can."""
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        return "Plots need matplotlib: pip install 'bidex-meta[plot]'."
-    return None
-
-
 def _matplotlib() -> Any:
-    if (reason := missing()) is not None:
-        raise BidexError(reason)
+    import_module("matplotlib.figure")  # only where something is drawn: it takes half a second
     return import_module("matplotlib")
 
 

@@ -34,8 +34,8 @@ class PlainConsole(Console):
 class Progress:
     """Shows steps per second, time left, mean return and success, and both per task, on stderr or ``stream``.
 
-    Steps and seconds in all are those of the whole run; its training time is the metric ``Perf/training_time``. Speed
-    counts from ``start_step`` on, where this process began.
+    Steps and seconds in all are those of the whole run; its training time is the metric ``Perf/training_time``. Where
+    there is a time, that is what is said to be done. Speed counts from ``start_step`` on, where this process began.
     """
 
     def __init__(
@@ -46,8 +46,11 @@ class Progress:
         self._start_step = start_step
         self._start_time = time.monotonic()
         self._last_line = -math.inf
+        self._step = start_step
         self._shown: dict[str, float] = {}
-        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+        self._live = (
+            Live(console=self._console, auto_refresh=False, transient=True) if self._console.is_terminal else None
+        )
 
     def start(self) -> None:
         """Begin; speed counts from here."""
@@ -61,29 +64,33 @@ class Progress:
         Raises BrokenPipeError where the reader has ended or the terminal is gone; later output goes nowhere.
         """
         self._shown.update({tag: value for tag, value in metrics.items() if value == value})
+        self._step = step
         try:
             if self._live is not None:
                 self._live.update(self._table(step), refresh=True)
             elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
                 self._last_line = time.monotonic()
-                self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
+                self._print([*self._overall(step), *self._of_tasks()])
         except OSError as error:  # of a terminal that is gone: EIO
             silence(self._console.file)
             raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Restore the terminal, the last table standing; quietly where it is gone."""
+        """Restore the terminal, a line in the place of the table; quietly where it is gone."""
         if self._live is not None:
             with contextlib.suppress(OSError):
                 self._live.stop()
+                self._print(self._overall(self._step))
 
     def _tasks(self) -> list[str]:
         starts = (_SUCCESS, _RETURN)
         return list(dict.fromkeys(tag[len(s) :] for tag in self._shown for s in starts if tag.startswith(s)))
 
-    def _line(self, step: int) -> str:
-        tasks = [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
-        return " | ".join([*self._overall(step), *tasks])
+    def _of_tasks(self) -> list[str]:
+        return [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
+
+    def _print(self, parts: Iterable[str]) -> None:
+        self._console.print(" | ".join(parts), soft_wrap=True, highlight=False, markup=False)
 
     def _table(self, step: int) -> Table:
         table = Table(title="  ".join(self._overall(step)), title_justify="left", title_style="bold")
@@ -107,7 +114,11 @@ class Progress:
     def _overall(self, step: int) -> list[str]:
         seconds = self._seconds_left(step)
         left = _duration(seconds) if seconds < math.inf else "?"
-        speed = f"{step:,} / {self._total:,} steps  {self._rate(step):,.0f} steps/s  {left} left"
+        done = f"{step:,} / {self._total:,} steps"
+        if self._total_seconds < math.inf:
+            spent = self._shown.get("Perf/training_time", 0.0)
+            done = f"{_duration(spent)} of {_duration(self._total_seconds)}  {step:,} steps"
+        speed = f"{done}  {self._rate(step):,.0f} steps/s  {left} left"
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
         return [speed, f"return {_number(mean_return)}", f"success {_percent(success)}"]
 

@@ -1,4 +1,4 @@
-"""A viewer in the browser, by viser, for machines without a screen. Needs the extra ``viewer``."""
+"""A viewer in the browser, by viser, for machines without a screen."""
 
 from importlib import import_module
 from typing import Any
@@ -11,7 +11,7 @@ from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import CAMERAS, GHOST
 
 _TYPE = mujoco.mjtGeom
-_Handle = Any  # viser's, of an optional extra
+_Handle = Any  # viser's, which is not imported before something is shown
 _SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 
@@ -65,14 +65,10 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Browser:
-    """A ``Screen`` as a web server (``host`` 0.0.0.0: for all), on the next free port; BidexError without viser."""
+    """A ``Screen`` as a web server (``host`` 0.0.0.0: for all), on the next free port."""
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
-        try:
-            viser = import_module("viser")
-        except ImportError:
-            what = "The view in the browser needs viser: pip install 'bidex-meta[viewer]'"
-            raise BidexError(f"{what}. Or film it: bidex-meta render.") from None
+        viser = import_module("viser")
         self.paused, self.speed = False, speed
         self._asked: list[str] = []
         self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)

@@ -117,5 +117,3 @@ def test_nothing_to_show_is_one_line(runs, refused, monkeypatch):
     log(runs[0])
     assert "holds nothing yet" in refused("report", runs[0])
     log(runs[0], *ROWS)
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    assert "bidex-meta[plot]" in refused("report", runs[0])

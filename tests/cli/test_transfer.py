@@ -29,7 +29,7 @@ from bidex_meta.data import Episode, open_dataset, part_files
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.transfer_measures import at_the_end
-from bidex_meta.runs import RunFolder, plots
+from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite
 from bidex_meta.worlds import WorldConfig, Worlds
 from tests.data.worlds import ABOUT
@@ -216,8 +216,7 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
     assert (config.steps, config.evaluate_every, config.seed, config.start_from) == (96, 1, 1, None)
     assert (config.learner_values["hidden"], config.learner_values["critic_first"]) == ([8], 12)
     assert Path(config.suite or "") == tmp_path / "t/suites/ML4-v2-TwoCatchUnderarm.toml"
-    if plots.missing() is None:
-        assert {path.name for path in Path("t").glob("*.png")} == {"reinforcement.png", "demonstrations.png"}
+    assert {path.name for path in Path("t").glob("*.png")} == {"reinforcement.png", "demonstrations.png"}
     monkeypatch.setattr(transfer, "work", lambda runs, cores, say: pytest.fail("run twice") if runs else 0)
     tables = shown("transfer", trained, *FLAGS, "--out", "t", *MORE)
     assert out.endswith(tables) and tables.count("TwoCatchUnderarm") == 4 and tables.count("0, 1") == 4

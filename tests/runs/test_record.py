@@ -100,8 +100,8 @@ def test_time_left_is_that_of_what_ends_first(rare_lines):
     progress.update({"Perf/training_time": 301.0}, 30)
     progress.close()
     first, last = stream.getvalue().splitlines()
-    assert "10 / 1,000,000,000,000,000 steps" in first and "4:00 left" in first
-    assert "30 / 1,000,000,000,000,000 steps" in last and "0:00 left" in last
+    assert "1:00 of 5:00  10 steps" in first and "4:00 left" in first
+    assert "5:01 of 5:00  30 steps" in last and "0:00 left" in last
 
 
 def test_progress_in_a_terminal_is_a_table(monkeypatch):
@@ -117,6 +117,8 @@ def test_progress_in_a_terminal_is_a_table(monkeypatch):
     progress.close()
     assert "HandOver" in stream.getvalue()
     assert "25.0 %" in stream.getvalue()
+    left = stream.getvalue().rpartition("\x1b[2K")[2]  # after what clears the table
+    assert left.startswith("600 / 1,000 steps") and left.count("\n") == 1
 
 
 def curve(*values, spread=None):
