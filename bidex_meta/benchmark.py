@@ -62,7 +62,7 @@ class Benchmark:
 
     Raises BidexError for an unknown suite, a faulty suite file or seed.
 
-    Example:
+    Examples:
         >>> from bidex_meta import Benchmark
         >>> ml4 = Benchmark("ML4", seed=0)
         >>> list(ml4.test_classes), len(ml4.train_tasks)

@@ -22,6 +22,7 @@ def stage() -> list[Path]:
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
         ROOT / "CHANGELOG.md",
+        *(ROOT / "docs" / "site" / name for name in ("site.css", "iframe-worker.js")),
         *sorted((ROOT / "docs").rglob("*.md")),
     ]
     seen: list[Path] = []
