@@ -1,5 +1,6 @@
 """A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`. Extra: `sb3`."""
 
+from collections import defaultdict, deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -12,14 +13,14 @@ from bidex_meta.world.contract import Info, VectorWorld
 _Rows = None | int | Iterable[int]
 
 with extra("sb3"):
-    from stable_baselines3.common import monitor, vec_env
+    from stable_baselines3.common import callbacks, monitor, vec_env
 
 
 class SB3VecEnv(vec_env.VecEnv):
     """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
 
     `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
-    observation) and, unless it was a shortened first episode, `episode` (r, l, t) and `is_success` (at any step).
+    observation) and, unless it was a shortened first episode, `episode` (r, l, t), `is_success` (at any step), `task`.
     `stagger`: shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does. Raises
     BidexError for a world in another autoreset mode than SAME_STEP.
     """
@@ -27,6 +28,7 @@ class SB3VecEnv(vec_env.VecEnv):
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         check_training(world, stagger)
         self.world: Any = world
+        self._names = [world.task_names[task] for task in world.task_id.tolist()]
         super().__init__(world.num_envs, world.single_observation_space, world.single_action_space)
 
     def reset(self) -> np.ndarray:
@@ -53,7 +55,7 @@ class SB3VecEnv(vec_env.VecEnv):
                 infos[row] = {"terminal_observation": final, "TimeLimit.truncated": columns["truncated"][i]}
                 if columns["counted"][i]:
                     episode = {name: columns[name][i] for name in ("r", "l", "t") if name in columns}
-                    infos[row] |= {"episode": episode, "is_success": columns["success"][i]}
+                    infos[row] |= {"episode": episode, "is_success": columns["success"][i], "task": self._names[row]}
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
 
     def get_attr(self, attr_name: str, indices: _Rows = None) -> list[object]:
@@ -77,3 +79,20 @@ class SB3VecEnv(vec_env.VecEnv):
     def close(self) -> None:
         """Frees the world."""
         self.world.close()
+
+
+class SuccessPerTask(callbacks.BaseCallback):
+    """Logs `rollout/success/<task>`, the share of solved among each task's last 100 episodes."""
+
+    def _on_training_start(self) -> None:
+        self._solved: dict[str, deque[bool]] = defaultdict(lambda: deque(maxlen=100))
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "is_success" in info:
+                self._solved[info["task"]].append(info["is_success"])
+        return True
+
+    def _on_rollout_end(self) -> None:
+        for task, solved in self._solved.items():
+            self.logger.record(f"rollout/success/{task}", sum(solved) / len(solved))

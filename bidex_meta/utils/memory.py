@@ -4,6 +4,8 @@ import os
 import sys
 from pathlib import Path
 
+import psutil
+
 from bidex_meta.errors import BidexError
 
 ROW_BYTES = 500_000
@@ -17,10 +19,11 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def available() -> int | None:
-    """Free bytes, by the system and by the container's limit; None where neither is known."""
-    found = [amount for amount in (_of_system(), _of_container()) if amount is not None]
-    return min(found, default=None)
+def available() -> int:
+    """Free bytes, by the system (with what can be swapped) and by the container's limit."""
+    of_system = psutil.virtual_memory().available + psutil.swap_memory().free
+    of_container = _of_container()
+    return of_system if of_container is None else min(of_system, of_container)
 
 
 def check_memory(needed: float, what: str, mend: str) -> None:
@@ -29,21 +32,8 @@ def check_memory(needed: float, what: str, mend: str) -> None:
     ``what`` takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
     """
     there = available()
-    if there is not None and needed > there:
+    if needed > there:
         raise BidexError(f"{what} would take about {needed / 1e9:,.1f} GB, and {there / 1e9:,.1f} are free. {mend}")
-
-
-def _of_system() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        kilobytes = {line.split(":")[0]: int(line.split()[1]) for line in lines if line.split()}
-        return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
-    except (OSError, KeyError, ValueError, IndexError):
-        pass
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return None
 
 
 def _of_container() -> int | None:

@@ -175,6 +175,30 @@ def test_a_missing_package_is_one_line() -> None:
         import_module("nobodys_package")
 
 
+def test_sb3_logs_success_of_each_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = adapt("sb3", points(), stagger=True)
+    kinds = import_module("bidex_meta.clients.sb3_env")
+    model = import_module("stable_baselines3").PPO(
+        "MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, device="cpu"
+    )
+    callback = kinds.SuccessPerTask()
+    seen: dict[str, list[bool]] = {"Near": [], "Far": []}
+    step_wait = env.step_wait
+
+    def watched() -> Any:
+        result = step_wait()
+        for info in result[3]:
+            if "is_success" in info:
+                seen[info["task"]].append(info["is_success"])
+        return result
+
+    monkeypatch.setattr(env, "step_wait", watched)
+    model.learn(16 * ROWS, callback=callback)
+    logged = model.logger.name_to_value
+    for name, solved in seen.items():
+        assert solved and logged[f"rollout/success/{name}"] == pytest.approx(np.mean(solved[-100:]))
+
+
 def test_sb3_seeds_options_and_attributes() -> None:
     env, twin = adapt("sb3", real(), stagger=True), real()
     env.seed(3)
