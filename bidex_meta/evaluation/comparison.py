@@ -15,7 +15,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
-from bidex_meta.runs.stored import Run
+from bidex_meta.runs.stored import Run, StoredRun
 from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
@@ -73,7 +73,11 @@ def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
 
 
 def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
-    """Runs of the same kind together, in the order they are named, with a label of the settings that differ."""
+    """Runs of the same kind together, in the order they are named, with a label each.
+
+    That is the name of a study's arm where all runs of the group come from it and no other group's do, else the
+    settings that differ.
+    """
     members: dict[str, list[Run]] = {}
     unique: dict[str, Json] = {}
     for kind, run in zip(kinds, runs, strict=True):
@@ -86,7 +90,9 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
         names = {name for a in others for b in others for name in a.keys() | b.keys() if a.get(name) != b.get(name)}
         differing = [f"{name.removeprefix('learner.')} {kind.get(name)}" for name in sorted(names)]
         groups.append((", ".join([kind["algo"], *differing]), members[key]))
-    return groups
+    arms = [{run.arm if isinstance(run, StoredRun) else None for run in mine} for _, mine in groups]
+    names = [arm.pop() if len(arm) == 1 and arms.count(arm) == 1 else None for arm in map(set, arms)]
+    return [(name or label, mine) for name, (label, mine) in zip(names, groups, strict=True)]
 
 
 def iqm(values: np.ndarray) -> Estimate:

@@ -55,6 +55,21 @@ def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest
     assert COMMIT[:10] in (tmp_path / "r.html").read_text()
 
 
+def test_groups_have_the_names_of_their_arms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number, (gamma, arm) in enumerate(
+        [(0.9, "usual"), (0.9, "usual"), (0.8, "short"), (0.7, "same"), (0.6, "same")]
+    ):
+        collect(evaluated(tmp_path, number, 0.5, f"r{number}", gamma=gamma), into=tmp_path / "data", arm=arm)
+    stored = [StoredRun.open(Path(name)) for name in capsys.readouterr().out.split()]
+    expected = [
+        "usual",
+        "short",
+        "mtppo, gamma 0.7",
+        "mtppo, gamma 0.6",
+    ]  # an arm's name that two groups have says nothing
+    assert [group.label for group in read_groups(stored)] == expected
+
+
 def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data"
     bad = evaluated(tmp_path, 1, 0.5, "bad")
