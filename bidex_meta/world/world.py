@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
@@ -140,7 +140,10 @@ class World(BatchedWorld):
         actions = max(slot.task_class.action_size for slot in self.slots)
         self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), actions)
 
-    def _randomised(self, rule: Randomisation) -> Randomiser:
+    def _randomised(self, rule: object) -> Randomiser:
+        if not isinstance(rule, Randomisation):
+            mend = "Write Randomisation(friction=(0.7, 1.3)), of bidex_meta.suite."
+            raise BidexError(f"randomisation: expected a Randomisation, got {shortened(rule)}. {mend}")
         hidden = [sight.hidden for sight in self._sights] if self._sights else [()] * self.num_tasks
         table = deviations(rule, [slot.task_class.layout for slot in self.slots], hidden).to(self.device)
         return Randomiser(rule, self.parts, self.action_size, table[self.task_id])
