@@ -12,7 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
+from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Randomisation, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
@@ -134,6 +134,7 @@ class Benchmark:
         threads: int | None = None,
         engine: str = "auto",
         stagger: bool = True,
+        randomisation: Randomisation | bool | None = None,
     ) -> World:
         """A batched world of one split.
 
@@ -150,10 +151,16 @@ class Benchmark:
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
                 environments do not end together; False: at 0.
+            randomisation: True: as the suite's file says; False: none; left out, as the file says in training worlds
+                alone; or another (docs/randomisation.md).
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
+        if randomisation is None:
+            randomisation = mode.name == "SAME_STEP"
+        if isinstance(randomisation, bool):
+            randomisation = self.suite.randomisation if randomisation else None
         return World(
             slots,
             num_envs,
@@ -167,6 +174,7 @@ class Benchmark:
             threads=threads,
             stagger=stagger,
             points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
+            randomisation=randomisation,
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
@@ -221,6 +229,7 @@ def make_task_world(
     stagger: bool = True,
     points: int = 0,
     object: str | None = None,
+    randomisation: Randomisation | None = None,
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -231,6 +240,7 @@ def make_task_world(
       out, uniform in training worlds, fixed in evaluation worlds.
     - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
     - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
+    - `randomisation`: what is drawn anew for environments (docs/randomisation.md); left out, nothing.
     - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
@@ -250,6 +260,7 @@ def make_task_world(
         threads=threads,
         stagger=stagger,
         points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
+        randomisation=randomisation,
     )
 
 

@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
 from bidex_meta.utils.files import absolute, expanded, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import parse
+from bidex_meta.utils.validation import check_fields, check_rising, parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
@@ -68,6 +68,51 @@ class Rules:
 
 
 V1, V2 = Rules(), Rules("v2", "wide", "at-end", "jittered")
+
+
+_Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
+_Size = Annotated[float, Meta(ge=0.8, le=1.25)]
+_Steps = Annotated[int, Meta(ge=0, le=60)]
+_Range = tuple[_Factor, _Factor]
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """What is drawn anew for an environment, uniformly from ranges, or added as noise; nothing by default.
+
+    Raises BidexError for values out of bounds or ranges that fall.
+    """
+
+    friction: _Range = (1.0, 1.0)
+    """Factor of the friction of all contacts."""
+    object_mass: _Range = (1.0, 1.0)
+    object_size: tuple[_Size, _Size] = (1.0, 1.0)
+    """Factor of the lengths of free objects without joints; their masses stay."""
+    actuator_gain: _Range = (1.0, 1.0)
+    """Factor of the fingers' actuator forces, before their limits."""
+    joint_damping: _Range = (1.0, 1.0)
+    """Factor of the damping of the fingers' joints."""
+    gravity: _Range = (1.0, 1.0)
+    observation_noise: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    """Standard deviation in an observation's units, of what sensors show of hands and objects."""
+    action_noise: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
+    """Standard deviation; actions are clipped afterwards."""
+    action_delay: tuple[_Steps, _Steps] = (0, 0)
+    """Control steps, a whole number of the range."""
+    push_speed: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    """Most that a push adds to the velocity of all objects along each axis, m/s."""
+    push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
+    """Mean time between pushes, s."""
+    draw: Literal["episode", "environment"] = "episode"
+    """Whether factors and the delay are drawn for every episode, or once for an environment."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "randomisation")
+        check_rising(self, "randomisation", *FACTORS, "action_delay")
+
+
+FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_damping", "gravity")
+"""Of a randomisation, those that are factors of the model's numbers."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +168,8 @@ class Suite:
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False
     """Whether each point tells what it is of."""
+    randomisation: Randomisation | None = None
+    """Of training worlds."""
 
     @property
     def splits(self) -> tuple[Split, ...]:
@@ -155,6 +202,17 @@ def load_suite(name_or_path: str | Path) -> Suite:
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
         return _parse(expanded(name_or_path))
     return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
+
+
+def load_randomisation(path: str | Path) -> Randomisation:
+    """The table ``[randomisation]`` of a TOML file: a suite's, or one that holds nothing else.
+
+    Raises BidexError where there is none, or a faulty one.
+    """
+    content = read_toml(expanded(path), "a file with a table [randomisation]")
+    if "randomisation" not in content:
+        raise BidexError(f"{path}: expected a table [randomisation], found none. See docs/randomisation.md.")
+    return parse(content["randomisation"], Randomisation, f"{path}: randomisation", exact=True)
 
 
 # What stands in a file, as msgspec checks it. No number is larger than a million: beyond it nothing is meant.
@@ -201,6 +259,7 @@ class _File:
     classes: Annotated[list[_ClassEntry], _Tables]
     tasks_per_class: _Count | None = None
     points: _PointsEntry | None = None
+    randomisation: Randomisation | None = None
     variation: Literal["narrow", "wide"] = "narrow"
     success: Literal["once", "at-end"] = "once"
     starts: Literal["plain", "jittered"] = "plain"

@@ -101,6 +101,7 @@ def test_names_and_paths(tmp_path: Path) -> None:
 
 
 BOTH = 'split = "test"', 'objects = ["egg"]\noptions = {object = "egg"}'
+TABLE = "version = 1\nrandomisation = {"
 COUNTED = "version = 1\ntasks_per_class = 3"
 FAULTS = {
     "unknown key": (META, 'base = "moving"', 'base = "moving"\nbasis = 1', "basis: unknown entry, did you mean 'base'"),
@@ -136,6 +137,17 @@ FAULTS = {
     "unknown variation": (META, "version = 1", 'version = 1\nvariation = "v2"', "variation: expected"),
     "unknown success": (META, "version = 1", 'version = 1\nsuccess = "at_end"', "success: expected"),
     "starts as a switch": (META, "version = 1", "version = 1\nstarts = true", "starts: expected"),
+    "unknown randomisation": (META, "version = 1", f"{TABLE}frictoin = [0.5, 1]}}", "randomisation.frictoin: unknown"),
+    "a factor of 0": (META, "version = 1", f"{TABLE}friction = [0, 1]}}", "randomisation.friction[0]: expected"),
+    "no range": (META, "version = 1", f"{TABLE}gravity = 1.1}}", "randomisation.gravity: expected a list"),
+    "a falling range": (META, "version = 1", f"{TABLE}object_mass = [1.5, 0.5]}}", "two rising numbers, got 1.5 0.5"),
+    "half a step of delay": (
+        META,
+        "version = 1",
+        f"{TABLE}action_delay = [0, 1.5]}}",
+        "action_delay[1]: expected a whole",
+    ),
+    "far too large": (META, "version = 1", f"{TABLE}object_size = [1, 2]}}", "randomisation.object_size[1]: expected"),
     "no TOML": (META, 'name = "own"', "name: own", "expected a suite file in TOML, but"),
 }
 
@@ -153,7 +165,7 @@ def test_fault_names_file_key_and_mend(fault: str, tmp_path: Path) -> None:
 
 
 KEYS = ["name", "version", "kind", "observation", "task_id", "reward", "base", "tasks_per_class", "classes", "other"]
-KEYS += ["variation", "success", "starts"]
+KEYS += ["variation", "success", "starts", "randomisation"]
 VALUES = ["3", "-1", "true", '"train"', '"class"', "[]", "{}", "1.5", "[{}]", '[{ name = "HandOver" }]']
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 from rich.table import Table
@@ -42,6 +43,8 @@ class EvaluateFlags(Options):
     """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
     random: Switch = False  # Also play a random policy, and show the difference.
     other_tasks: Switch = False  # Also play as many tasks that no run trained on, drawn by another seed.
+    randomisation: Path | None = None
+    """Randomise the worlds by the table of this TOML file (docs/randomisation.md); None: not at all."""
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False
@@ -54,12 +57,14 @@ def main(arguments: Sequence[str]) -> None:
     stored = folder.config()
     device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=flags.engine)
-    worlds = Worlds.open(config.to_json())
+    randomisation = None if flags.randomisation is None else str(flags.randomisation)
+    worlds = Worlds.open({**config.to_json(), "randomisation": randomisation})
     set_up_torch(config.threads)
     play = _meta_test if learner_kind(config.algo).make.adapts else _evaluate
     result = play(flags, folder, config, worlds)
     if flags.json:
         run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}
+        run |= {"randomisation": asdict(worlds.randomisation)} if worlds.randomisation else {}
         print(json.dumps(run, indent=2))
 
 
@@ -79,7 +84,7 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
     result, table = judged(worlds, policy, step, split, flags, flags.random, title)
     tables = [table]
     if flags.other_tasks:
-        result["other_tasks"], table = judged_on_others(config, policy, step, split, flags, flags.random)
+        result["other_tasks"], table = judged_on_others(worlds, config.algo, policy, step, split, flags, flags.random)
         tables.append(table)
     if not flags.json:
         for table in tables:
@@ -88,12 +93,19 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
 
 
 def judged_on_others(
-    config: RunConfig, policy: Agent, step: int, split: str, options: Options, random: bool, brief: bool = False
+    worlds: Worlds,
+    algo: str,
+    policy: Agent,
+    step: int,
+    split: str,
+    options: Options,
+    random: bool,
+    brief: bool = False,
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
-    drawn = Worlds.open(config.to_json()).seed + _OTHER_SEED
-    others = Worlds.open({**config.to_json(), "task_seed": drawn})
-    title = f"{config.algo} on {others.name}, other tasks (seed {drawn})"
+    drawn = worlds.seed + _OTHER_SEED
+    others = Worlds.open(replace(worlds.config, task_seed=drawn))
+    title = f"{algo} on {others.name}, other tasks (seed {drawn})"
     found, table = judged(others, policy, step, split, options, random, title, brief)
     return {"task_seed": drawn, **found}, table
 

@@ -245,9 +245,8 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     found, table = judged(source, learner, learner.env_steps, "train", options, random=True, title=title, brief=True)
     tables = [table]
     if plan.flags.other_tasks:
-        config = replace(plan.config, device=launch().own_device(plan.config.device))
-        step = learner.env_steps
-        found["other_tasks"], table = judged_on_others(config, learner, step, "train", options, True, brief=True)
+        algo, step = plan.config.algo, learner.env_steps
+        found["other_tasks"], table = judged_on_others(source, algo, learner, step, "train", options, True, brief=True)
         tables.append(table)
     write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
     for table in tables:

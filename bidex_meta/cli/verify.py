@@ -131,6 +131,8 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Json:
     if named is None and not exists(path):
         raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
     found = schemas.read_evaluation(path, again)
+    if "randomisation" in found:
+        raise BidexError(f"{path}: expected an evaluation without --randomisation, got one with it. Name another.")
     parse_content(found, _Recorded, str(path))
     if "splits" not in found and "policy" not in found:
         parse_content(found, _Part, str(path))

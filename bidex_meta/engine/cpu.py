@@ -5,7 +5,7 @@ import ctypes
 import os
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import mujoco.batch
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, STATE, checked_state, outside, quaternion_columns
+from bidex_meta.engine.models import differing_fields
 from bidex_meta.engine.protocol import Engine
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
@@ -149,6 +150,18 @@ class CpuEngine(Engine):
         for name, value in state.items():
             self._state[name].copy_(value)
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
+        # A batch has either models or fields of its simulations' own: what the models differ in becomes such fields.
+        self.batch.set_models(None)
+        differing = {name for model in self._models for name in differing_fields(self._models[0], model)}
+        wanted, found = set(names), {}
+        for name in sorted(wanted | differing & mujoco.batch.MODEL_FIELDS):
+            field = self.batch.expand(name)
+            field[:] = np.stack([getattr(model, name)[: field.shape[1]] for model in self._models])[self._model_of]
+            if name in wanted:
+                found[name] = torch.from_numpy(field).view(self.num, field.shape[1], -1)
+        return found
 
     def model(self, row: int) -> mujoco.MjModel:
         return self._batch.get_model(row)

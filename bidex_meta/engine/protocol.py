@@ -1,6 +1,6 @@
 """What the world asks of an engine."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 import mujoco
@@ -72,6 +72,13 @@ class Engine(Protocol):
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restores a ``state_dict``; BidexError for one of another model or number of rows, or not finite."""
+
+    def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
+        """Fields of the model that each simulation has for itself from now on: views (num, n, k) to write, by name.
+
+        They hold what was; fields that the engine does not have are left out. What follows from them is the caller's.
+        """
+        ...
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""

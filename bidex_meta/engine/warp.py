@@ -8,7 +8,7 @@ freedom), a solver tolerance of 1e-6 (its least), fixed room for contacts. Tests
 import copy
 import gc
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
@@ -144,6 +144,20 @@ class WarpEngine(Engine):
         self._graphs.clear()
         with self._on_device():
             self._lean = lean(self._m)
+
+    def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
+        found = {}
+        with self._on_device():
+            for name in names:
+                field = getattr(self._m, name, None)
+                if field is None:  # bounding volumes, of which it has none
+                    continue
+                if len(field) != self.num:
+                    field = wp.array(np.repeat(field.numpy(), self.num, axis=0), dtype=field.dtype)
+                    setattr(self._m, name, field)
+                found[name] = wp.to_torch(field).view(self.num, field.shape[1], -1)
+        self.recapture()
+        return found
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The state may be of the C engine. Refreshes position and velocity sensors."""

@@ -122,9 +122,13 @@ class BatchedWorld(VectorEnv, ABC):
 
     def _set_seed(self, seed: object) -> None:
         self.seed = checked.seed(seed)
-        pairs = zip(self.task_names, self.slot_rows, strict=True)
-        self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
+        self._keys = self._random_keys()
         self.episodes = Episodes.fresh(self.num_envs, self.device)
+
+    def _random_keys(self, what: str = "") -> Tensor:
+        """Keys of the environments, (n, 2), for one of the things that are drawn."""
+        pairs = zip(self.task_names, self.slot_rows, strict=True)
+        return torch.cat([row_keys(self.seed, name + what, r.stop - r.start, self.device) for name, r in pairs])
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes of all environments, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""

@@ -125,11 +125,11 @@ class Part:
 
         ``task_index``: task of each of the part's environments, (num,); ``rows``: engine rows, ascending, None for all.
         """
-        for i, member, where, chosen in self._members(rows):
+        for i, member, where, chosen in self.members(rows):
             frozen = self.frozen(i, task_index[chosen])
             yield member, where, TaskState(self._engine.sensordata[chosen], member.scene.sensors, frozen)
 
-    def _members(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
+    def members(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
         """Index, member, slice among the chosen rows, and engine rows of the members that have rows among them."""
         for i, member in enumerate(self.group.members):
             if rows is None:
@@ -193,7 +193,7 @@ class Part:
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         each = len(draws) // self._engine.num if rows is None else 1
-        for i, member, place, _ in self._members(rows):
+        for i, member, place, _ in self.members(rows):
             where = slice(each * place.start, each * place.stop)
             qpos[where] = self._start[i]
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}

@@ -5,6 +5,7 @@ operations, so that the numbers are the same on every device, for any subset of 
 """
 
 import hashlib
+import math
 
 import torch
 from torch import Tensor
@@ -34,6 +35,19 @@ def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
     words = [torch.tensor(int.from_bytes(digest[i : i + 4], "little"), device=device) for i in (0, 4)]
     index = torch.arange(count, device=device)
     return torch.stack(threefry((words[0], words[1]), (index, torch.zeros_like(index))), dim=1)
+
+
+def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
+    """Keys (n, 2) of a stream of numbers within an episode (n,), from the keys (n, 2) of its environment."""
+    beyond = torch.full_like(episode, _MASK - stream)  # no pair of an episode's own draws is counted so far
+    return torch.stack(threefry((keys[:, 0], keys[:, 1]), (episode, beyond)), dim=1)
+
+
+def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
+    """Standard normal numbers, float32 (n, draws), that depend on the same as ``uniform``'s."""
+    pairs = uniform(keys, episode, draws + draws % 2).float().unflatten(1, (-1, 2))
+    radius, angle = (-2.0 * torch.log1p(-pairs[..., 0])).sqrt(), 2.0 * math.pi * pairs[..., 1]
+    return torch.stack((radius * angle.cos(), radius * angle.sin()), dim=2).flatten(1)[:, :draws]
 
 
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:

@@ -16,7 +16,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.suite import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
@@ -29,13 +30,14 @@ from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fr
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups
 from bidex_meta.world.part import Part, base_rotations, collect
+from bidex_meta.world.randomiser import Randomiser, deviations
 from bidex_meta.world.rendering import Painter
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import keep_freed_memory
 
 _DEFAULT_SIZES = {"cpu": 1024, "cuda": 8192}
 _MOST_COLUMNS = 1_000_000
-_STATE = ("_action", "_obs", "task_index")
+_STATE = ("_action", "_past", "_obs", "task_index")
 """What a step changes beside the episodes' counters."""
 
 
@@ -62,6 +64,7 @@ class World(BatchedWorld):
         threads: int | None = None,
         stagger: bool = True,
         points: PointsRule | None = None,
+        randomisation: Randomisation | None = None,
     ) -> None:
         """Builds the world; no episode is started before ``reset``.
 
@@ -79,6 +82,7 @@ class World(BatchedWorld):
             stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that they do not end
                 together, and do not count in ``episode``. False: they begin at 0.
             points: Show a point cloud before the task id, and of objects nothing else; None: their state.
+            randomisation: What is drawn anew for environments, or added as noise; None: nothing.
 
         Raises BidexError for fewer environments than slots, unknown device, engine, mode or sampling, too narrow a
         padding.
@@ -108,6 +112,9 @@ class World(BatchedWorld):
         width = self.observation_size
         self.parts = [Part(g, self.slots, observation, width, self.num_envs, self._sights) for g in groups]
         self._masked = groups[0].engine.masked
+        self._randomiser = None if randomisation is None else self._randomised(randomisation)
+        remembered = self._randomiser.remembered if self._randomiser else 0
+        self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
         self._side_by_side = SideBySide(len(groups), self.device)
         captured = self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP
         self._graphs = GraphCache(self._state, self._put_state, cuda_graph) if captured else None
@@ -133,8 +140,18 @@ class World(BatchedWorld):
         actions = max(slot.task_class.action_size for slot in self.slots)
         self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), actions)
 
+    def _randomised(self, rule: object) -> Randomiser:
+        if not isinstance(rule, Randomisation):
+            mend = "Write Randomisation(friction=(0.7, 1.3)), of bidex_meta.suite."
+            raise BidexError(f"randomisation: expected a Randomisation, got {shortened(rule)}. {mend}")
+        hidden = [sight.hidden for sight in self._sights] if self._sights else [()] * self.num_tasks
+        table = deviations(rule, [slot.task_class.layout for slot in self.slots], hidden).to(self.device)
+        return Randomiser(rule, self.parts, self.action_size, table[self.task_id])
+
     def _set_seed(self, seed: object) -> None:
         super()._set_seed(seed)
+        if self._randomiser:
+            self._randomiser.seed(self._random_keys(", randomised"))
         draws = max(slot.task_class.draws for slot in self.slots)
         self._starts = Starts(self.parts, self._keys, draws, self._pool_size if self._uniform_tasks else None)
         if self._graphs is not None:  # they hold the starts and the pools
@@ -184,6 +201,10 @@ class World(BatchedWorld):
         task_index, share, starts = self._starts.take(mask, self.episodes.number + 1, self.task_index)
         self._count_episodes(mask, task_index, share, stagger)
         self._action = torch.where(mask[:, None], 0.0, self._action)
+        if self._randomiser:
+            self._past = torch.where(mask[:, None, None], 0.0, self._past)
+            self._randomiser.begin(mask, self.episodes.number)
+            self._randomiser.lift(starts, mask)
         return starts
 
     def _refresh(self, parts: list[Part], engine_rows: list[Tensor]) -> None:
@@ -191,7 +212,8 @@ class World(BatchedWorld):
         for part, rows, rotation in zip(parts, engine_rows, turned, strict=True):
             world_rows = part.group.rows[rows]
             states = list(part.states(part.group.take(self.task_index), rows))
-            self._obs[world_rows] = part.observe(states, self._action[world_rows], rotation, rows)
+            obs = part.observe(states, self._action[world_rows], rotation, rows)
+            self._obs[world_rows] = self._noisy(obs, self.episodes.elapsed[world_rows], world_rows)
         self._write_ids(self._obs)
 
     def _refresh_masked(self, mask: Tensor) -> None:
@@ -201,8 +223,12 @@ class World(BatchedWorld):
             group = part.group
             states = list(part.states(group.take(self.task_index)))
             new[group.rows] = part.observe(states, group.take(self._action), rotation)
+        new = self._noisy(new, self.episodes.elapsed)
         self._write_ids(new)
         self._obs = torch.where(mask[:, None], new, self._obs)
+
+    def _noisy(self, obs: Tensor, elapsed: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        return self._randomiser.observe(obs, elapsed, rows) if self._randomiser else obs
 
     def _write_ids(self, obs: Tensor) -> None:
         if self.num_id_columns:
@@ -211,8 +237,11 @@ class World(BatchedWorld):
     def _write_action(self, action: Tensor, active: Tensor) -> None:
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
         self._action = torch.where(active[:, None], action, self._action) if disabled else action
+        applied = self._action
+        if self._randomiser:
+            applied, self._past = self._randomiser.act(self._action, self._past, self.episodes.elapsed)
         for part in self.parts:
-            part.control(part.group.take(self._action))
+            part.control(part.group.take(applied))
 
     def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
         if not self._masked:
@@ -231,8 +260,9 @@ class World(BatchedWorld):
 
     def _collect(self) -> Transition:
         transition = collect(self.parts, self.task_index, self._action, self.observation_size)
-        self._write_ids(transition.obs)
-        return transition
+        obs = self._noisy(transition.obs, self.episodes.elapsed + 1)
+        self._write_ids(obs)
+        return transition._replace(obs=obs)
 
     def step_engines(self, active: Tensor | None = None) -> None:
         """Physics alone: a control step of all environments, or those of a mask (num_envs,), under their controls."""
@@ -241,12 +271,17 @@ class World(BatchedWorld):
 
     def state_dict(self) -> State:
         """As in ``BatchedWorld``."""
-        return super().state_dict() | {
-            "slots": list(self.task_names),
-            "tasks": [torch.tensor(slot.tasks) for slot in self.slots],
-            "action": self._action.clone(),
-            "engines": [part.group.engine.state_dict() for part in self.parts],
-        }
+        past = {"past": self._past.clone()} if self._past.numel() else {}
+        return (
+            super().state_dict()
+            | past
+            | {
+                "slots": list(self.task_names),
+                "tasks": [torch.tensor(slot.tasks) for slot in self.slots],
+                "action": self._action.clone(),
+                "engines": [part.group.engine.state_dict() for part in self.parts],
+            }
+        )
 
     def load_state_dict(self, state: State) -> None:
         """As in ``BatchedWorld``, on a world of the same suite and size."""
@@ -254,8 +289,16 @@ class World(BatchedWorld):
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)
+        if self._randomiser:
+            self._past = state.get("past", self._past).to(self.device, copy=True)
+            self._randomiser.begin(torch.ones_like(self.episodes.finished), self.episodes.number)
         for part, engine in zip(self.parts, state["engines"], strict=True):
             part.group.engine.load_state_dict(engine)
+
+    @property
+    def randomised(self) -> dict[str, Tensor]:
+        """What was drawn for the running episodes: factors, and the delay in control steps, each (num_envs,)."""
+        return {name: value.clone() for name, value in self._randomiser.drawn.items()} if self._randomiser else {}
 
     def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """A picture of an environment with its goal, shape (height, width, 3), uint8."""

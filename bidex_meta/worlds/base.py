@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from bidex_meta.errors import known_name
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_suite, suite_names
+from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class WorldConfig:
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
+    randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
     def of(config: "Json | WorldConfig") -> "WorldConfig":
@@ -67,6 +68,7 @@ class Worlds(ABC):
         self.seed = config.seed if config.task_seed is None else config.task_seed
         self.device, self.threads, self.engine = config.device, config.threads, config.engine
         self.points = config.points
+        self.randomisation = None if config.randomisation is None else load_randomisation(config.randomisation)
 
     @staticmethod
     def open(config: Json | WorldConfig) -> "Worlds":
@@ -85,8 +87,8 @@ class Worlds(ABC):
         return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
 
     @abstractmethod
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
-        """A fresh world of a split, ``train`` or ``test``, in autoreset mode SAME_STEP to train, DISABLED to evaluate.
+    def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
+        """A fresh world of a split, ``train`` or ``test``: to train in an autoreset mode; None: to evaluate, DISABLED.
 
         ``rows`` are its environments over all tasks, by default one per task (of Meta-World's a few per class). Raises
         BidexError for a missing split, too few environments, or a device or engine that it does not run on.

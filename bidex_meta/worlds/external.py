@@ -26,6 +26,11 @@ class Foreign(Worlds):
     on_gpu = False
     bytes_per_environment: int
 
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        super().__init__(name, config)
+        if self.randomisation is not None:
+            raise BidexError(f"Worlds of our own are randomised, got {name}. Leave --randomisation out.")
+
     def _check(self, split: str, rows: int) -> None:
         """Refuses another split than train, engines but C MuJoCo on the CPU, and more than fits into memory."""
         if split != "train":
@@ -61,13 +66,13 @@ class MetaWorldSuite(Foreign):
         if self.points:
             raise BidexError(f"Point clouds are made of scenes of our own, got the suite {name}. Leave --points out.")
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+    def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """As in ``Worlds``."""
         rows = rows or _EVALUATION_SIZE * len(self.class_names)
         self._check(split, rows)
         from bidex_meta.metaworld.batched import MetaWorldWorld
 
-        return MetaWorldWorld(self.name, rows, seed=self.seed, autoreset_mode=mode)
+        return MetaWorldWorld(self.name, rows, seed=self.seed, autoreset_mode=mode or "DISABLED")
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
@@ -98,13 +103,13 @@ class HumanoidTask(Foreign):
             if value:
                 raise BidexError(f"--{flag} is of the classes with hands, got {value} with {HUMANOID}. Leave it out.")
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+    def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """As in ``Worlds``."""
         rows = rows or _HUMANOIDS
         self._check(split, rows)
         from bidex_meta.worlds.humanoid import HumanoidWorld
 
-        return HumanoidWorld(rows, seed=self.seed, autoreset_mode=mode, threads=self.threads)
+        return HumanoidWorld(rows, seed=self.seed, autoreset_mode=mode or "DISABLED", threads=self.threads)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""

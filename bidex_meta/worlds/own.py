@@ -34,13 +34,14 @@ class OwnSuite(Worlds):
 
         return Benchmark(self.suite, seed=self.seed)
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+    def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """As in ``Worlds``."""
         if rows is None:
             # They are split evenly over slots, so that all need as many as the slot with the most tasks.
             pools = self.tasks(split).values()
             rows = max(map(len, pools), default=1) * max(len(pools), 1)
-        return self.benchmark.make_world(split, rows, self.device, self.seed, mode, self.threads, self.engine)
+        given = split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine
+        return self.benchmark.make_world(*given, randomisation=self.randomisation or mode is not None)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``: the names that the file lists, else numbers."""
@@ -74,15 +75,16 @@ class SingleClass(Worlds):
         if self.object is not None:
             self.task_classes()  # refuses an unknown one now
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+    def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """As in ``Worlds``."""
         from bidex_meta.benchmark import make_task_world
 
         if split != "train":
             raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
         named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
-        rows = rows or _TASKS_ALONE
-        return make_task_world(self.class_name, rows, self.device, self.seed, mode, self.threads, **named)
+        named |= {"randomisation": self.randomisation}
+        given = self.class_name, rows or _TASKS_ALONE, self.device, self.seed, mode or "DISABLED", self.threads
+        return make_task_world(*given, **named)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""

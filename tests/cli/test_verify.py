@@ -100,6 +100,7 @@ def test_conditions_that_changed_are_told(run, capsys):
         (lambda found: found.pop("seed"), "seed: expected it to be there"),
         (lambda found: found["policy"].update(episodes_per_task="x"), "episodes_per_task: expected a whole number"),
         (lambda found: found["policy"]["classes"].pop("Near"), "Expected the recorded evaluation to be of Near, Far"),
+        (lambda found: found.update(randomisation={}), "expected an evaluation without --randomisation"),
         (lambda found: found["conditions"].update(engine="rust"), "conditions.engine: expected one of auto, c, warp"),
         (lambda found: found.update(splits={"train": {"before": found["policy"], "after": found["policy"]}}), "shots"),
     ],

@@ -1,0 +1,100 @@
+"""How the numbers of a scene's model follow from the factors of a randomisation.
+
+All of them are multiplied by powers of factors, so that nothing is left to ``mj_setConst``, which would cost a step.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.tasks.scene import Scene
+
+Exponents = dict[str, dict[str, Tensor]]
+"""By the model's field and the factor: the power of the factor that each number of the field is multiplied by."""
+
+
+def object_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Which bodies are of objects, (nbody,), bool: those behind the hands'."""
+    names = [model.body(i).name for i in range(model.nbody)]
+    return np.array([i > 0 and name.partition("/")[0] not in SIDES for i, name in enumerate(names)])
+
+
+def _free(model: mujoco.MjModel) -> np.ndarray:
+    """Which bodies are free objects without joints, (nbody,), bool."""
+    parents = np.isin(np.arange(model.nbody), model.body_parentid)
+    free = np.array(
+        [n == 1 and model.jnt_type[a] == 0 for n, a in zip(model.body_jntnum, model.body_jntadr, strict=True)]
+    )
+    return object_bodies(model) & free & ~parents
+
+
+def heights(scene: Scene) -> dict[int, float]:
+    """How far free objects without joints reach below their origin at the start, metres, by qpos column of z."""
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mujoco.mj_kinematics(model, data)
+    centre, half = model.geom_aabb[:, :3, None], model.geom_aabb[:, 3:, None]
+    turned = data.geom_xmat.reshape(-1, 3, 3)
+    lowest = (data.geom_xpos[:, :, None] + turned @ centre - np.abs(turned) @ half)[:, 2, 0]
+    found = {}
+    for body in _free(model).nonzero()[0]:
+        column = int(model.jnt_qposadr[model.body_jntadr[body]]) + 2
+        found[column] = float(data.xpos[body, 2] - lowest[model.geom_bodyid == body].min())
+    return found
+
+
+def exponents(scene: Scene, varied: Sequence[str], device: torch.device) -> Exponents:
+    """How the model's fields (n, k) depend on the factors; exponents (n, 1) or (n, k)."""
+    found: Exponents = {}
+    for factor, name, exponent in _laws(scene.model):
+        if factor in varied:
+            found.setdefault(name, {})[factor] = torch.tensor(exponent, dtype=torch.float64, device=device)
+    if "object_size" in varied and (scene.model.geom_type[_free(scene.model)[scene.model.geom_bodyid]] == _MESH).any():
+        raise BidexError(
+            f"randomisation: object_size: expected simple shapes, got a mesh in {scene.task.name}. Leave it out."
+        )
+    return found
+
+
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+
+def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Factor, field and exponents (n, 1) or (n, k): sizes leave masses, inverse inertias follow both."""
+    objects, free = object_bodies(model), _free(model)
+    of_object, of_free = objects[model.dof_bodyid], free[model.dof_bodyid]
+    turning = of_free & (np.arange(model.nv) - model.jnt_dofadr[model.dof_jntid] >= 3)
+    hinge = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_HINGE
+    yield "friction", "geom_friction", np.ones((model.ngeom, 1))
+    yield "friction", "pair_friction", np.ones((model.npair, 1))
+    for name in ("body_mass", "body_inertia", "body_subtreemass"):
+        yield "object_mass", name, (1.0 * objects)[:, None]
+    yield "object_mass", "body_invweight0", (-1.0 * objects)[:, None]
+    for name in ("dof_armature", "dof_M0"):  # where C MuJoCo has the inertia of bodies whose frames are simple
+        yield "object_mass", name, (1.0 * of_object)[:, None]
+    yield "object_mass", "dof_invweight0", (-1.0 * of_object)[:, None]
+    for name in ("geom_size", "geom_pos", "geom_rbound", "geom_aabb"):
+        yield "object_size", name, (1.0 * free[model.geom_bodyid])[:, None]
+    yield "object_size", "site_pos", (1.0 * free[model.site_bodyid])[:, None]
+    yield "object_size", "body_ipos", (1.0 * free)[:, None]
+    yield "object_size", "body_inertia", (2.0 * free)[:, None]
+    yield "object_size", "body_invweight0", free[:, None] * np.array((0.0, -2.0))
+    yield "object_size", "dof_M0", (2.0 * turning)[:, None]
+    yield "object_size", "dof_invweight0", (-2.0 * turning)[:, None]
+    yield "object_size", "bvh_aabb", (1.0 * _volumes(model, free))[:, None]
+    yield "actuator_gain", "actuator_gainprm", np.ones((len(model.actuator_gainprm), 1))
+    yield "actuator_gain", "actuator_biasprm", np.ones((len(model.actuator_gainprm), 1))
+    yield "joint_damping", "dof_damping", (1.0 * (hinge & ~of_object))[:, None]
+    yield "gravity", "body_gravcomp", (1.0 * objects)[:, None]
+
+
+def _volumes(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Which of the bodies' bounding volumes are of some bodies, bool."""
+    found = np.zeros(int(model.body_bvhnum.sum()), dtype=bool)
+    for body in bodies.nonzero()[0]:
+        found[model.body_bvhadr[body] :][: model.body_bvhnum[body]] = True
+    return found

@@ -1,0 +1,175 @@
+"""Domain randomisation of a world: what is drawn, and how it gets into models, actions and observations.
+
+A draw depends on seed, slot, environment, episode and, of noise and pushes, on the elapsed steps alone.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.suite import FACTORS, Randomisation
+from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.tasks.layout import CLIP, Layout
+from bidex_meta.world.model_factors import exponents, heights, object_bodies
+from bidex_meta.world.part import Part
+from bidex_meta.world.random import derived, normal, uniform
+
+_OBSERVATION, _ACTION, _PUSH = range(3)
+"""Streams of numbers within an episode."""
+_DELAY = "action_delay"
+
+
+class Randomiser:
+    """What is drawn for the environments of a world."""
+
+    def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
+        """``deviation``: of the observations' noise, (n, width), or of none of their columns.
+
+        Raises BidexError where an object's size shall vary that is a mesh.
+        """
+        self._rule, self._parts, self._action_size = rule, parts, action_size
+        self._deviation, device = deviation, deviation.device
+        self._varied = [name for name in FACTORS if getattr(rule, name) != (1.0, 1.0)]
+        num = len(deviation)
+        self.drawn = {name: torch.ones(num, dtype=torch.float64, device=device) for name in self._varied}
+        """Factors and the delay (control steps) of the running episodes, each (n,)."""
+        if self.remembered:
+            self.drawn[_DELAY] = torch.zeros(num, dtype=torch.int64, device=device)
+        self._keys = torch.zeros(num, 2, dtype=torch.int64, device=device)
+        self._streams = torch.zeros(3, num, 2, dtype=torch.int64, device=device)
+        self._models = [_Models(part, self._varied) for part in parts]
+
+    @property
+    def remembered(self) -> int:
+        """How many actions are remembered, the last one among them; 0 without delay."""
+        most = self._rule.action_delay[1]
+        return most + 1 if most else 0
+
+    def seed(self, keys: Tensor) -> None:
+        """Takes the environments' random keys, (n, 2), for all that is drawn from now on."""
+        self._keys.copy_(keys)
+
+    def begin(self, mask: Tensor, number: Tensor) -> None:
+        """Draws for the episodes ``number`` (n,) of the environments of a mask (n,), and changes their models."""
+        masked = self._parts[0].group.engine.masked
+        rows = torch.arange(len(mask), device=mask.device) if masked else mask.nonzero().squeeze(1)
+        keys, episode, new = self._keys[rows], number[rows], mask[rows]
+        for i, stream in enumerate(self._streams):
+            stream[rows] = torch.where(new[:, None], derived(keys, episode, i), stream[rows])
+        counter = episode if self._rule.draw == "episode" else torch.zeros_like(episode)
+        share = uniform(keys, counter, len(FACTORS) + 1)
+        for name, drawn in self.drawn.items():
+            low, high = getattr(self._rule, name)
+            if name == _DELAY:
+                value = low + (share[:, -1] * (high - low + 1)).long()
+            else:
+                value = low + share[:, FACTORS.index(name)] * (high - low)
+            drawn[rows] = torch.where(new, value, drawn[rows])
+        for models in self._models:
+            models.write(self.drawn, mask)
+
+    def lift(self, starts: Sequence[Tensor], mask: Tensor) -> None:
+        """Raises larger objects in the starts of a mask's environments (of each part, see ``Starts.take``), in place.
+
+        So that they do not begin within what they lie on.
+        """
+        if "object_size" in self.drawn:
+            for models, start in zip(self._models, starts, strict=True):
+                models.lift(start, self.drawn["object_size"], mask)
+
+    def act(self, action: Tensor, past: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
+        """What of the actions (n, a) comes to the engines, and the remembered ones; pushes objects.
+
+        ``past``: the remembered actions, newest first, (n, ``remembered``, a); ``elapsed``: steps since the start (n,).
+        """
+        if self.remembered:
+            past = torch.cat((action[:, None], past[:, :-1]), dim=1)
+            delay = self.drawn[_DELAY][:, None, None]
+            action = past.gather(1, delay.expand(-1, 1, self._action_size))[:, 0]
+        if self._rule.action_noise:
+            noise = normal(self._streams[_ACTION], elapsed, self._action_size)
+            action = (action + self._rule.action_noise * noise).clamp(-1.0, 1.0)
+        if self._rule.push_speed:
+            share = uniform(self._streams[_PUSH], elapsed, 4)
+            now = share[:, :1] < 1.0 / (CONTROL_RATE * self._rule.push_interval)
+            change = torch.where(now, self._rule.push_speed * (2.0 * share[:, 1:] - 1.0), 0.0)
+            for models in self._models:
+                models.push(CONTROL_RATE * change)
+        return action, past
+
+    def observe(self, obs: Tensor, elapsed: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """Observations (k, width) of some environments with noise; ``elapsed``: their steps since the start, (k,)."""
+        if not self._rule.observation_noise:
+            return obs
+        noise = normal(self._streams[_OBSERVATION][rows], elapsed, self._deviation.shape[1])
+        noisy = (obs[:, : noise.shape[1]] + self._deviation[rows] * noise).clamp(-CLIP, CLIP)
+        return torch.cat((noisy, obs[:, noise.shape[1] :]), dim=1)
+
+
+class _Models:
+    """The models of a part's environments."""
+
+    def __init__(self, part: Part, varied: Sequence[str]) -> None:
+        engine, members = part.group.engine, part.group.members
+        self._part = part
+        rules = [exponents(member.scene, varied, engine.device) for member in members]
+        self._fields = engine.expand(rules[0]) if rules[0] else {}
+        self._rules = [{name: rule[name] for name in self._fields} for rule in rules]
+        self._bases = [{n: f[m.engine_rows.start].clone() for n, f in self._fields.items()} for m in members]
+        self._first = [int(object_bodies(member.scene.model).argmax()) for member in members]
+        self._masses = [
+            torch.as_tensor(m.scene.model.body_mass[first:], device=engine.device)
+            for m, first in zip(members, self._first, strict=True)
+        ]
+        self._heights = [heights(member.scene) for member in members]
+
+    def _chosen(self, mask: Tensor) -> Tensor | None:
+        """Engine rows of a mask's environments; None: all of them, of which the mask chooses."""
+        group = self._part.group
+        return None if group.engine.masked else group.take(mask).nonzero().squeeze(1)
+
+    def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:
+        """Multiplies fields of the models of a mask's environments, as they were compiled, by what was drawn."""
+        if not self._fields:
+            return
+        group = self._part.group
+        new = group.take(mask)[:, None, None]
+        factors = {name: group.take(drawn[name]) for name in drawn if name != _DELAY}
+        for i, _, _, rows in self._part.members(self._chosen(mask)):
+            for name, field in self._fields.items():
+                value = self._bases[i][name]
+                for factor, exponent in self._rules[i][name].items():
+                    value = value * factors[factor][rows][:, None, None] ** exponent
+                field[rows] = torch.where(new[rows], value.to(field.dtype), field[rows])
+
+    def lift(self, start: Tensor, size: Tensor, mask: Tensor) -> None:
+        """See ``Randomiser.lift``; of this part."""
+        size = self._part.group.take(size)
+        for i, _, where, rows in self._part.members(self._chosen(mask)):
+            for column, height in self._heights[i].items():
+                start[where, column] += (height * (size[rows] - 1.0)).to(start.dtype)
+
+    def push(self, acceleration: Tensor) -> None:
+        """Forces on all objects that accelerate them so, (n, 3), m/s², for the next control step."""
+        acceleration = self._part.group.take(acceleration)
+        masses = self._fields.get("body_mass")
+        for member, first, nominal in zip(self._part.group.members, self._first, self._masses, strict=True):
+            rows, force = member.engine_rows, self._part.group.engine.xfrc_applied
+            mass = nominal[:, None] if masses is None else masses[rows, first:]
+            force[rows, first:, :3] = (acceleration[rows, None] * mass).to(force.dtype)
+
+
+def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
+    """Of the noise on observations of each slot, (slots, columns), float32: what is sensed, unless it is hidden.
+
+    Goals, actions and what a point cloud replaces (``hidden``, columns of each slot) have none.
+    """
+    table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
+    for row, layout, zero in zip(table, layouts, hidden, strict=True):
+        for block, where in layout:
+            if not block.goal and block.name not in {f"{side}_action" for side in SIDES}:
+                row[where] = rule.observation_noise
+        row[list(zero)] = 0.0
+    return table
