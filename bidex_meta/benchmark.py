@@ -146,7 +146,8 @@ class Benchmark:
             num_envs: Environments over all classes, divided evenly; left out, 1024 on the CPU, 8192 on an accelerator.
             device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
             seed: Seed of starts and task draws; left out, the benchmark's.
-            autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
+            autoreset_mode: SAME_STEP (the default, for training), NEXT_STEP (for Gymnasium's tools) or DISABLED (for
+                evaluation); also as text.
             threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
@@ -158,7 +159,7 @@ class Benchmark:
         """
         slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
         if randomisation is None:
-            randomisation = mode.name == "SAME_STEP"
+            randomisation = mode.name != "DISABLED"
         if isinstance(randomisation, bool):
             randomisation = self.suite.randomisation if randomisation else None
         return World(

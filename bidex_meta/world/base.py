@@ -84,8 +84,9 @@ class BatchedWorld(VectorEnv, ABC):
     ) -> None:
         """Splits the environments over the slots; a subclass sets spaces, pools and the seed.
 
-        ``autoreset_mode`` is SAME_STEP (training) or DISABLED (evaluation); with ``stagger`` first episodes begin at a
-        random elapsed step (SAME_STEP only). Raises BidexError for fewer environments than slots, or an unknown mode.
+        ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation);
+        with ``stagger`` first episodes begin at a random elapsed step (not in DISABLED). Raises BidexError for fewer
+        environments than slots, or an unknown mode.
         """
         self.num_envs, self.device = checked.num_envs(num_envs, slots.names), device
         self.autoreset_mode = checked_mode(autoreset_mode)
@@ -136,7 +137,7 @@ class BatchedWorld(VectorEnv, ABC):
         if seed is not None:
             self._set_seed(checked_seed(seed, mask))
         first = not self._ready or seed is not None
-        stagger = self.stagger and first and self.autoreset_mode == AutoresetMode.SAME_STEP
+        stagger = self.stagger and first and self.autoreset_mode != AutoresetMode.DISABLED
         self._ready = True
         with one_torch_thread():
             self._begin(mask, stagger)
@@ -152,11 +153,16 @@ class BatchedWorld(VectorEnv, ABC):
             raise BidexError("Expected reset() before step(): the environments have no episode yet.")
         action = checked.action(action, (self.num_envs, self.action_size), self.device)
         with one_torch_thread():
+            waiting = self.episodes.finished
             active, broken = self._run("control", self._control, action)
             reward, terminated, truncated, info = self._move(active, broken)
             self._clock.stamp(info)
             ended = info["_final_obs"]
-            if self.autoreset_mode == AutoresetMode.SAME_STEP and (self._masked or ended.any()):
+            if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+                ended = waiting
+                terminated, truncated = terminated & ~waiting, truncated & ~waiting
+                info |= {name: info[name] & ~waiting for name in ("success", "solved")}
+            if self.autoreset_mode != AutoresetMode.DISABLED and (self._masked or ended.any()):
                 self._begin(ended, stagger=False)
             return self._obs.clone(), reward, terminated, truncated, info
 
@@ -229,7 +235,7 @@ class BatchedWorld(VectorEnv, ABC):
         if self._masked or ended.any():
             info |= ended_info(info)
         self._obs = obs.clone()
-        if self.autoreset_mode == AutoresetMode.DISABLED:
+        if self.autoreset_mode != AutoresetMode.SAME_STEP:
             episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
             episodes.finished = episodes.finished | ended
         return reward, terminated, truncated, info

@@ -7,7 +7,8 @@ changes it, and changing it, or the action that was given, changes nothing in th
 Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) a row that ends starts its next episode within the step;
 the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
 (evaluation, meta-learning) an ended row is frozen: it may be stepped, keeps its observation and its flags and gets
-reward 0, until a ``reset`` whose ``reset_mask`` names it.
+reward 0, until a ``reset`` whose ``reset_mask`` names it. NEXT_STEP, which Gymnasium's tools expect and no learner of
+ours takes, is between them: the step after its end starts a row's next episode, whatever the action, with reward 0.
 
 ``info`` of a reset is empty; that of a step is about the transition just made:
 
@@ -103,7 +104,7 @@ class VectorWorld(Protocol):
     observation_groups: tuple[ObservationGroup, ...]
     """The named parts of an observation, in the order of their first entries; each entry is in one."""
     metadata: dict[str, Any]
-    """Holds ``autoreset_mode``, gymnasium's SAME_STEP or DISABLED."""
+    """Holds ``autoreset_mode``, gymnasium's SAME_STEP, NEXT_STEP or DISABLED."""
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes; observations (N, d), float32, and an empty info.

@@ -16,7 +16,7 @@ from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
 
-_MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
+_MODES = {mode.name: mode for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
 _FINAL = ("success", "unstable", "reward_unscaled")
 
 
@@ -31,7 +31,7 @@ class Episodes:
     counts: Tensor
     """Whether it enters statistics (a shortened first episode does not)."""
     finished: Tensor
-    """Whether it has ended and waits for a reset (DISABLED autoreset only); its flags are the next two."""
+    """Whether it has ended and waits for a reset (never in SAME_STEP); its flags are the next two."""
     terminated: Tensor
     truncated: Tensor
     success: Tensor

@@ -68,7 +68,7 @@ class ForeignWorld(BatchedWorld):
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
         draws, tasks = uniform(self._keys, self.episodes.number + mask, OWN_DRAWS), self.task_index
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+        if self.autoreset_mode != AutoresetMode.DISABLED:
             tasks = (draws[:, _TASK_DRAW] * self._pool_size).long()
         self._count_episodes(mask, tasks, draws[:, _ELAPSED_DRAW], stagger)
         self._place(mask)

@@ -74,7 +74,8 @@ class World(BatchedWorld):
             device: "cpu", "auto" (CUDA where there is one) or a CUDA device, e.g. "cuda:0".
             engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": what is fast there.
             seed: Decides every draw.
-            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            autoreset_mode: SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation), as
+                a member or its name.
             observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
             pad_to: Observation entries before the task id; None takes the widest class.
             task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n.
@@ -235,8 +236,8 @@ class World(BatchedWorld):
             obs[:, -self.num_id_columns :] = self._one_hot
 
     def _write_action(self, action: Tensor, active: Tensor) -> None:
-        disabled = self.autoreset_mode == AutoresetMode.DISABLED
-        self._action = torch.where(active[:, None], action, self._action) if disabled else action
+        frozen = self._frozen_if(active) is not None
+        self._action = torch.where(active[:, None], action, self._action) if frozen else action
         applied = self._action
         if self._randomiser:
             applied, self._past = self._randomiser.act(self._action, self._past, self.episodes.elapsed)
@@ -256,7 +257,7 @@ class World(BatchedWorld):
 
     def _frozen_if(self, active: Tensor) -> Tensor | None:
         """The mask for the engines: in SAME_STEP mode no environment is ever frozen."""
-        return active if self.autoreset_mode == AutoresetMode.DISABLED else None
+        return None if self.autoreset_mode == AutoresetMode.SAME_STEP else active
 
     def _collect(self) -> Transition:
         transition = collect(self.parts, self.task_index, self._action, self.observation_size)
