@@ -48,6 +48,7 @@ COMMANDS: dict[str, Command] = {
     "baseline": Command("bidex_meta.cli.baseline", "measure the references of the normalised score"),
     "validity": Command("bidex_meta.cli.validity", "whether there is something to learn about a suite's tasks"),
     "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
+    "export": Command("bidex_meta.cli.export", "a policy as an ONNX file, checked against torch"),
     "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),
     "bench": Command("bidex_meta.cli.bench", "measure the speed of a suite's world"),
