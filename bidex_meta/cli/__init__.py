@@ -49,6 +49,8 @@ COMMANDS: dict[str, Command] = {
     "validity": Command("bidex_meta.cli.validity", "whether there is something to learn about a suite's tasks"),
     "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
     "export": Command("bidex_meta.cli.export", "a policy as an ONNX file, checked against torch"),
+    "push": Command("bidex_meta.cli.push", "publish a policy or a data set, with its card"),
+    "pull": Command("bidex_meta.cli.pull", "fetch a published policy or data set"),
     "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),
     "bench": Command("bidex_meta.cli.bench", "measure the speed of a suite's world"),
