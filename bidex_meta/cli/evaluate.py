@@ -22,7 +22,7 @@ from bidex_meta.runs.versions import package_versions
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
-_OTHER_SEED = 500_000
+OTHER_SEED = 500_000
 """Added to a run's seed for tasks that it was not trained on."""
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
@@ -91,7 +91,7 @@ def judged_on_others(
     config: RunConfig, policy: Agent, step: int, split: str, options: Options, random: bool
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
-    drawn = Worlds.open(config.to_json()).seed + _OTHER_SEED
+    drawn = Worlds.open(config.to_json()).seed + OTHER_SEED
     others = Worlds.open({**config.to_json(), "task_seed": drawn})
     title = f"{config.algo} on {others.name}, other tasks (seed {drawn})"
     found, table = judged(others, policy, step, split, options, random, title)

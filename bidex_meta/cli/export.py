@@ -71,20 +71,21 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     import onnxruntime
     import torch
 
+    network: Any = policy
     if not isinstance(policy, torch.nn.Module):
         raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
-    policy.low_precision = False  # the file computes in float32
+    network.low_precision = False  # the file computes in float32
     # Another library's product, by the size of a batch, which is left open here.
     with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
         try:
-            content = _onnx(policy, _observations(2, shape), metadata)
+            content = _onnx(network, _observations(2, shape), metadata)
         except Exception as error:  # the exporter raises many kinds
             raise BidexError(
                 f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
                 "look at numbers; --debug shows where."
             ) from error
         obs = _observations(_ROWS, shape)
-        wanted = policy.eval_action(obs).numpy()
+        wanted = network.eval_action(obs).numpy()
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     gap = float(abs(session.run(None, {"observations": obs.numpy()})[0] - wanted).max())
     if not gap <= TOLERANCE:
