@@ -23,7 +23,7 @@ from bidex_meta.runs.versions import package_versions
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
-_OTHER_SEED = 500_000
+OTHER_SEED = 500_000
 """Added to a run's seed for tasks that it was not trained on."""
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
@@ -103,7 +103,7 @@ def judged_on_others(
     brief: bool = False,
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
-    drawn = worlds.seed + _OTHER_SEED
+    drawn = worlds.seed + OTHER_SEED
     others = Worlds.open(replace(worlds.config, task_seed=drawn))
     title = f"{algo} on {others.name}, other tasks (seed {drawn})"
     found, table = judged(others, policy, step, split, options, random, title, brief)

@@ -4,8 +4,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 
+import gymnasium
+
 from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.cli.tables import Json
+from bidex_meta.clients.gymnasium_ids import task_id
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs.versions import collect_versions
@@ -26,11 +29,14 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
     ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
     [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
-    ({class: {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
+    ({class: {random, zero, expert}}, unscaled returns), ``versions``, ``commit``, and ``gymnasium_id`` of the same
+    environment, None of a suite or an altered class.
     """
     alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
     references = {name: known for name, known in source.references().items() if name in names}
+    altered = source.object or source.points or source.moving_base is not None
+    env_id = task_id(alone) if alone and not altered else None
     return {
         "suite": None if alone else source.name,
         "suite_version": source.suite.version if source.suite else None,
@@ -44,6 +50,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "kind": kind, "policies": list(policies), "seed": source.seed,
         "references": {n: {"random": k.random, "zero": k.zero, "expert": k.expert} for n, k in references.items()},
         "versions": versions, "commit": (versions["git"] or {}).get("commit"),
+        "gymnasium_id": env_id if env_id in gymnasium.registry else None,
         **more,
     }  # fmt: skip
 

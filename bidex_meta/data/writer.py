@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
@@ -213,6 +214,8 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: J
         "algorithm_name": str(metadata.get("kind", "")),
         "requirements": [],
     }
+    if metadata.get("gymnasium_id"):
+        content["env_spec"] = gymnasium.spec(metadata["gymnasium_id"]).to_json()  # for Minari's recover_environment
     _write_metadata(inner, content, ours)
     (inner / part_files.RECORDING).unlink(missing_ok=True)
 

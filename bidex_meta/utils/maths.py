@@ -159,5 +159,8 @@ def quaternion_product(
 
 
 def may_look(device: torch.device) -> bool:
-    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
-    return device.type == "cpu"
+    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device.
+
+    Never while a network is exported, whose path may not depend on numbers.
+    """
+    return device.type == "cpu" and not torch.compiler.is_exporting()

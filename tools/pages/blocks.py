@@ -20,6 +20,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table, shots_table
+from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import curves_figure, points_figure, read_studies
@@ -96,6 +97,9 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
         return
     if block.show == "validity":
         yield from validity_table(block.on or "", data)
+        return
+    if block.show == "leaderboard":
+        yield from leaderboard_table(block.on or "", data)
         return
     if not block.study:
         raise ValueError("expected the name of a study")

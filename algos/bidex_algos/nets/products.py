@@ -110,9 +110,9 @@ def _pays(x: Tensor, weight: Tensor) -> bool:
     """Whether oneDNN is to make ``x @ weight.T``."""
     return (
         x.device.type == "cpu"
+        and torch.backends.mkldnn.enabled  # before sizes, which an export leaves open
         and x.numel() * len(weight) >= _LEAST
         and x.dtype == weight.dtype == torch.float32
-        and torch.backends.mkldnn.enabled
         and not torch.is_autocast_enabled("cpu")
         and is_faster_here()
     )

@@ -1,0 +1,138 @@
+"""``bidex-meta export``: a run's policy as one ONNX file, checked against torch."""
+
+import json
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.cli.learners import learner_kind
+from bidex_meta.cli.parsing import RunPath, parse
+from bidex_meta.cli.policies import checkpoint, policy_of
+from bidex_meta.cli.tables import Json
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import check_writable, write_atomic
+from bidex_meta.utils.validation import parse as parse_content
+from bidex_meta.worlds import Worlds
+
+TOLERANCE = 1e-5
+"""How far an action of the file may be from torch's."""
+_ROWS = 256  # of the check; the export itself sees another number
+_SHAPE = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ExportFlags:
+    """Write a run's policy as ONNX: raw observations (N, d) in, mean actions (N, a) in [-1, 1] out, float32.
+
+    Example: bidex-meta export assets/policies/MT20 --out mt20.onnx
+
+    The running statistics of observations are inside. Policies that remember or adapt are refused.
+    """
+
+    run: RunPath  # Run folder.
+    out: Path | None = None  # The file; None: policy.onnx in the run's folder.
+    checkpoint: str = "last"  # Which policy: last, best or a file.
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Export, check and print where the file is."""
+    flags = parse(ExportFlags, arguments, "export")
+    if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
+        raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
+    folder = RunFolder.open(flags.run)
+    config = replace(folder.config(), device="cpu")
+    if learner_kind(config.algo).make.adapts:
+        raise BidexError(
+            f"{config.algo} adapts to tasks or remembers, and an ONNX file maps one observation to one action. "
+            "Export a policy that does not adapt, such as one of mtppo, mtsac, td3, mappo, dagger or bc."
+        )
+    out = flags.out or folder.path / "policy.onnx"
+    check_writable(out)
+    state, steps = checkpoint(folder, flags.checkpoint)
+    policy: Any = policy_of(folder, state, "cpu")
+    shape = parse_content(state["learner"]["policy"].get("shape"), _SHAPE, f"{folder.path}: the policy's shape")
+    content, gap = exported(policy, shape, _metadata(folder, config, steps, shape))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(out, lambda file: file.write(content))
+    print(f"{out}: {len(content) / 1e6:.1f} MB, within {gap:.1g} of torch on {_ROWS} random observations")
+
+
+def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float]:
+    """A policy as the bytes of an ONNX file, and the largest difference to torch's actions.
+
+    ``shape`` is as in a checkpoint. Raises BidexError where torch cannot export it, or the actions differ.
+    """
+    import onnxruntime
+    import torch
+
+    network: Any = policy
+    if not isinstance(policy, torch.nn.Module):
+        raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
+    network.low_precision = False  # the file computes in float32
+    # Another library's product, by the size of a batch, which is left open here.
+    with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
+        try:
+            content = _onnx(network, _observations(2, shape), metadata)
+        except Exception as error:  # the exporter raises many kinds
+            raise BidexError(
+                f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
+                "look at numbers; --debug shows where."
+            ) from error
+        obs = _observations(_ROWS, shape)
+        wanted = network.eval_action(obs).numpy()
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    gap = float(abs(session.run(None, {"observations": obs.numpy()})[0] - wanted).max())
+    if not gap <= TOLERANCE:
+        raise BidexError(f"The exported actions differ by {gap:.2g} from torch's, more than {TOLERANCE:g}: none kept.")
+    return content, gap
+
+
+def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
+    import torch
+
+    class MeanAction(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, observations: torch.Tensor) -> torch.Tensor:
+            return self.policy.eval_action(observations)
+
+    for name in ("torch.onnx", "onnxscript", "onnx_ir"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    program = torch.onnx.export(
+        MeanAction(), (obs,), input_names=["observations"], output_names=["actions"],
+        dynamic_shapes={"observations": {0: torch.export.Dim("rows")}}, dynamo=True, verbose=False,
+    )  # fmt: skip
+    if program is None:
+        raise TypeError("torch.onnx.export returned no program")
+    program.model.metadata_props.update(metadata)
+    return program.model_proto.SerializeToString()
+
+
+def _observations(rows: int, shape: Json) -> Any:
+    """Random raw observations (rows, d), float32, with a task's one-hot where there is one."""
+    import torch
+
+    obs = torch.randn(rows, shape["observations"], generator=torch.Generator().manual_seed(0))
+    for start, stop in shape.get("groups", {}).get("task_id", []):
+        obs[:, start:stop] = torch.eye(stop - start)[torch.arange(rows) % (stop - start)]
+    return obs
+
+
+def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
+    """What the file says of itself: texts by name, lists and tables as JSON."""
+    worlds, versions = Worlds.open(config.to_json()), folder.versions()
+    facts = {
+        "suite": worlds.name, "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
+        "classes": list(worlds.tasks("train")), "seed": config.seed, "steps": steps,
+        "commit": (versions.get("git") or {}).get("commit"), "versions": versions.get("packages"),
+        "observation_groups": shape.get("groups"),
+    }  # fmt: skip
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}

@@ -1,0 +1,41 @@
+"""``bidex-meta pull``: a policy or a data set from a hub or a folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bidex_meta.cli.hub import CARD, FOLDER, OF_A_RUN, OF_DATA, called, copied, files_of
+from bidex_meta.cli.parsing import parse
+from bidex_meta.errors import BidexError
+from bidex_meta.utils.files import absolute
+
+
+@dataclass(frozen=True)
+class PullFlags:
+    """Fetch what was pushed: `bidex-meta evaluate` plays a policy, `bidex-meta data info` describes a data set.
+
+    Example: bidex-meta pull me/mt4-mtppo
+    """
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """Repository of the Hugging Face Hub, of a data set datasets/OWNER/NAME; or folder:PATH."""
+    out: Path | None = None  # The new folder; None: pulled/NAME.
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Download and print the folder."""
+    flags = parse(PullFlags, arguments, "pull")
+    wanted = (*OF_A_RUN, *OF_DATA, CARD)
+    if flags.name.startswith(FOLDER):
+        source = absolute(flags.name.removeprefix(FOLDER))
+    else:
+        source = Path(called("snapshot_download", flags.name, allow_patterns=list(wanted)))
+    files = files_of(source, wanted)
+    if not {"config.json", "data/metadata.json"} & files.keys():
+        raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")
+    out = flags.out or Path("pulled") / Path(flags.name.removeprefix(FOLDER)).name
+    copied(files, out)
+    print(out)

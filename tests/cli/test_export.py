@@ -1,0 +1,81 @@
+"""``bidex-meta export``: the file does what torch does, says what it is, and what it cannot hold is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bidex_algos.nets.shape import Shape
+from bidex_meta.cli.export import exported
+from bidex_meta.cli.learners import learner_kind
+from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import ObservationGroup
+from tests.pages import ROOT
+
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+GROUPS = {"joints": [(0, 6)], "object": [(6, 9), (11, 13)], "goal": [(9, 11)], "task_id": [(13, 16)]}
+SHAPE = Shape(16, 4, tuple(ObservationGroup(name, tuple(slice(*w) for w in where)) for name, where in GROUPS.items()))
+
+
+def policy(algo: str, **options: object) -> torch.nn.Module:
+    """A policy with statistics and weights of its own."""
+    kind, drawn = learner_kind(algo), torch.Generator().manual_seed(0)
+    config = replace(next(iter(kind.presets.values())), **options)
+    made = kind.make._make_policy(config, SHAPE, drawn, torch.device("cpu"))  # type: ignore[attr-defined]
+    for weight in made.parameters():
+        weight.data.add_(0.1 * torch.randn(weight.shape, generator=drawn))
+    made.observations.update(3.0 * torch.randn(64, 16, generator=drawn) + 1.0)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("algo", "options"),
+    [
+        ("mtppo", {"architecture": "towers"}),
+        ("mtppo", {"architecture": "moore", "modules": 2}),
+        ("mtppo", {"architecture": "soft_modules", "modules": 2}),
+        ("mtppo", {"architecture": "transformer", "modules": 2, "hidden": (8,)}),
+        ("mtsac", {}),
+        ("dagger", {"normalise_per_task": True}),
+        ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
+    ],
+    ids=str,
+)
+def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: dict[str, object]) -> None:
+    made = policy(algo, **{"hidden": (8, 8), **options})
+    content, gap = exported(made, SHAPE.state_dict(), {"suite": "mine"})
+    assert gap < 1e-5
+    obs = torch.randn(5, 16)
+    obs[:, 13:] = torch.eye(3)[[0, 2, 1, 1, 0]]
+    (actions,) = onnxruntime.InferenceSession(content).run(None, {"observations": obs.numpy()})
+    wanted = made.eval_action(obs)  # type: ignore[operator]
+    assert wanted.std() > 0.05
+    torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
+
+
+def test_a_policy_whose_file_would_differ_is_refused() -> None:
+    class Drawn(torch.nn.Module):
+        def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+            return obs[:, :4] if torch.compiler.is_exporting() else 1e-4 + obs[:, :4]
+
+    with pytest.raises(BidexError, match=r"differ by 0\.0001 from"):
+        exported(Drawn(), SHAPE.state_dict(), {})
+
+
+def test_a_run_exports_with_its_name_tag(shown, tmp_path: Path) -> None:
+    run, out = ROOT / "tests" / "data" / "old_runs" / "mtppo", tmp_path / "policy.onnx"
+    assert "of torch on 256 random observations" in shown("export", run, "--out", out)
+    model = onnx.load(out)
+    said = {entry.key: entry.value for entry in model.metadata_props}
+    assert (said["suite"], said["algorithm"], said["seed"]) == ("MT4", "mtppo", "3")
+    assert "CatchUnderarm" in said["classes"] and said["versions"].startswith("{")
+    (entry,) = model.graph.input
+    assert entry.type.tensor_type.shape.dim[0].dim_param and entry.type.tensor_type.shape.dim[1].dim_value > 400
+
+
+def test_what_adapts_is_refused_in_one_line(refused, tmp_path: Path) -> None:
+    said = refused("export", ROOT / "tests" / "data" / "old_runs" / "rl2", "--out", tmp_path / "x.onnx")
+    assert "rl2 adapts to tasks or remembers" in said and "Export a policy that does not adapt" in said
+    assert not (tmp_path / "x.onnx").exists()
