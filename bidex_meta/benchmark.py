@@ -134,6 +134,7 @@ class Benchmark:
         threads: int | None = None,
         engine: str = "auto",
         stagger: bool = True,
+        pixels: int = 0,
     ) -> World:
         """A batched world of one split.
 
@@ -150,6 +151,7 @@ class Benchmark:
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
                 environments do not end together; False: at 0.
+            pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
@@ -167,6 +169,7 @@ class Benchmark:
             threads=threads,
             stagger=stagger,
             points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
+            pixels=pixels,
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
@@ -221,6 +224,7 @@ def make_task_world(
     stagger: bool = True,
     points: int = 0,
     object: str | None = None,
+    pixels: int = 0,
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -250,6 +254,7 @@ def make_task_world(
         threads=threads,
         stagger=stagger,
         points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
+        pixels=pixels,
     )
 
 

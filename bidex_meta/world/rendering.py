@@ -19,6 +19,8 @@ CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": 
 """Azimuth and elevation of the named views, degrees; None: the class's ``camera_angle``."""
 _MOST_RENDERERS = 32
 """A tiled film of all classes fits; each takes some megabytes."""
+MOST_PIXELS = 1080
+"""Edge of the largest square picture."""
 _SMALL = 320
 """Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
 GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
