@@ -127,7 +127,9 @@ class _Tailor:
         self._add(body, material, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"looks/{mesh}")
 
     def _pin(self, body: str, radius: float, half: float, axis: tuple[float, float, float], z: float = 0.0) -> None:
-        start, end = (0.001 * np.array((s * half * axis[0], s * half * axis[1], z + s * half * axis[2])) for s in (-1, 1))
+        start, end = (
+            0.001 * np.array((s * half * axis[0], s * half * axis[1], z + s * half * axis[2])) for s in (-1, 1)
+        )
         self._add(body, "link", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.001 * radius, 0, 0], fromto=[*start, *end])
 
     def dress(self) -> None:  # noqa: D102

@@ -117,7 +117,7 @@ class TaskClass(ABC):
     needs: Capacity = Capacity(71, 20, 134)
     camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
     camera_distance: ClassVar[float] = 1.15
-    camera_angle: ClassVar[tuple[float, float]] = (125.0, -25.0)
+    camera_angle: ClassVar[tuple[float, float]] = (150.0, -35.0)
     depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
