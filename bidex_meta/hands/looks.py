@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -25,7 +26,7 @@ def loft(sections: Sequence[Section], low: float, high: float, power: float = 2.
     ``power``: 2 for ellipses, more for rounded rectangles.
     """
     given = np.array(sections)
-    z = np.concatenate([np.linspace(a, b, _ALONG, endpoint=False) for a, b in zip(given, given[1:], strict=False)])
+    z = np.concatenate([np.linspace(a, b, _ALONG, endpoint=False) for a, b in pairwise(given)])
     rings = _smooth(given, np.append(z[:, 0], given[-1, 0]))
     angle = np.linspace(0.0, 0.5 * np.pi, _DOME + 1)[1:]
     ends = []
@@ -132,7 +133,7 @@ class _Tailor:
         )
         self._add(body, "link", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.001 * radius, 0, 0], fromto=[*start, *end])
 
-    def dress(self) -> None:  # noqa: D102
+    def dress(self) -> None:
         self._skin("forearm", "forearm", "forearm")
         self._skin("forearm", "cover", "link")
         self._skin("forearm", "ring", "tip")

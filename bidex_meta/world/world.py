@@ -125,8 +125,8 @@ class World(BatchedWorld):
 
     def step(self, action: Tensor | np.ndarray) -> Step:
         """As in ``BatchedWorld``; with ``pixels`` info holds pictures of the state that the observation shows."""
-        *rest, info = super().step(action)
-        return *rest, self._with_pixels(info)
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, self._with_pixels(info)
 
     def _with_pixels(self, info: Info) -> Info:
         if self._pixels:

@@ -72,7 +72,7 @@ def test_pixels_come_with_every_observation_and_change_nothing_else(world, monke
     assert isinstance(pixels.to_numpy().reset(seed=0)[1]["pixels"], np.ndarray)
     for wrong in (-1, 2000, 1.5):
         with pytest.raises(BidexError, match="pixels"):
-            make_task_world("CatchUnderarm", num_envs=1, pixels=wrong)
+            make_task_world("CatchUnderarm", num_envs=1, pixels=wrong)  # type: ignore[arg-type]
 
 
 def test_pixels_show_what_moves():
