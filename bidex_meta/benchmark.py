@@ -135,6 +135,7 @@ class Benchmark:
         engine: str = "auto",
         stagger: bool = True,
         randomisation: Randomisation | bool | None = None,
+        pixels: int = 0,
     ) -> World:
         """A batched world of one split.
 
@@ -154,6 +155,7 @@ class Benchmark:
                 environments do not end together; False: at 0.
             randomisation: True: as the suite's file says; False: none; left out, as the file says in training worlds
                 alone; or another (docs/randomisation.md).
+            pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
@@ -176,6 +178,7 @@ class Benchmark:
             stagger=stagger,
             points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
             randomisation=randomisation,
+            pixels=pixels,
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
@@ -231,6 +234,7 @@ def make_task_world(
     points: int = 0,
     object: str | None = None,
     randomisation: Randomisation | None = None,
+    pixels: int = 0,
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -262,6 +266,7 @@ def make_task_world(
         stagger=stagger,
         points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
         randomisation=randomisation,
+        pixels=pixels,
     )
 
 

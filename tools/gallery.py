@@ -20,7 +20,7 @@ from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import Witness, load_witness, witness_path
 
-VIEWS = ("back", "side")
+VIEWS = ("front", "side")
 STRIP = 5
 """Pictures per witness."""
 _HEAD = """# The task classes

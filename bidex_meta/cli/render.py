@@ -29,6 +29,8 @@ class RenderFlags(LookFlags):
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""
+    large: Switch = False
+    """With --tiled: one class at a time large beside all."""
     steps: Steps | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
     every: Few | None = None  # Steps from one frame of a film to the next; None: 1, with --tiled 2.
@@ -75,7 +77,10 @@ def main(arguments: Sequence[str]) -> None:
     look = {"width": width, "height": height, "camera": flags.camera}
     if flags.tiled:
         every = every if suffix != ".png" else max(steps, 1)
-        frames, count = film_tiles(agent, world, rows, steps, flags.seed, every, **look), steps // every + 1
+        frames, count = (
+            film_tiles(agent, world, rows, steps, flags.seed, every, flags.large, **look),
+            steps // every + 1,
+        )
     elif suffix == ".png":  # the last one alone
         frames, count = film_row(agent, world, rows[0], steps, flags.seed, None, **look), 1
     else:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.agents import Agent
-from bidex_meta.runs.video import tiled
+from bidex_meta.runs.video import LABEL, tiled
 from bidex_meta.world.cloud import Camera, Cloud, beside, camera_of, draw
 from bidex_meta.world.depth_sensor import CANDIDATES
 from bidex_meta.world.surfaces import sample
@@ -33,12 +33,20 @@ def film_row(
 
 
 def film_tiles(
-    agent: Agent, world: Any, rows: Sequence[int], steps: int, seed: int, every: int = 1, **look: Any
+    agent: Agent,
+    world: Any,
+    rows: Sequence[int],
+    steps: int,
+    seed: int,
+    every: int = 1,
+    large: bool = False,
+    **look: Any,
 ) -> Iterator[np.ndarray]:
     """So many steps of several environments, tiles beside each other; each begins its next episode when one ends.
 
     An environment's name is green from its first success on, until its episode ends. The world is in autoreset mode
-    DISABLED; the size is that of a tile.
+    DISABLED; the size is that of a tile. ``large``: left of the tiles, as high as they are, one environment after the
+    other, each for an equal share of the steps.
     """
     names = [world.task_names[int(world.task_id[row])] for row in rows]
     obs, _ = world.reset(seed=seed)
@@ -47,7 +55,12 @@ def film_tiles(
     agent.reset(began)
     for step in range(steps + 1):
         if step % every == 0:
-            yield tiled([world.render(row=row, **look) for row in rows], names, solved[list(rows)].tolist())
+            done = solved[list(rows)].tolist()
+            frame = tiled([world.render(row=row, **look) for row in rows], names, done)
+            if large:
+                at = step * len(rows) // (steps + 1)
+                frame = np.concatenate((_large(world, rows[at], names[at], done[at], len(frame), look), frame), axis=1)
+            yield frame
         if step == steps:
             return
         obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
@@ -57,6 +70,14 @@ def film_tiles(
             obs, _ = world.reset(options={"reset_mask": ended})
             agent.reset(ended)
             solved = solved & ~ended
+
+
+def _large(world: Any, row: int, name: str, done: bool, height: int, look: dict[str, Any]) -> np.ndarray:
+    """A tile of that height, of the others' shape; its width is even, as films need it."""
+    inner = height - LABEL
+    width = 2 * round(inner * look["width"] / look["height"] / 2)
+    picture = world.render(row=row, **look | {"width": width, "height": inner})
+    return tiled([picture], [name], [done])
 
 
 class CloudView:

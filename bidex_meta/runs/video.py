@@ -13,7 +13,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
 SUFFIXES = (".png", ".mp4", ".webp")
-_STRIP = 20  # height of a name, pixels
+LABEL = 20
+"""Height of a name under a tile, pixels."""
 _BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
 
 
@@ -107,19 +108,19 @@ def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[b
     """
     height, width, _ = pictures[0].shape
     columns, rows = grid(len(pictures))
-    whole = np.empty((rows * (height + _STRIP), columns * width, 3), np.uint8)
+    whole = np.empty((rows * (height + LABEL), columns * width, 3), np.uint8)
     whole[:] = _BACK
     for number, picture in enumerate(pictures):
-        top, left = number // columns * (height + _STRIP), number % columns * width
+        top, left = number // columns * (height + LABEL), number % columns * width
         whole[top : top + height, left : left + width] = picture
-        whole[top + height : top + height + _STRIP, left : left + width] = _label(names[number], width, done[number])
+        whole[top + height : top + height + LABEL, left : left + width] = _label(names[number], width, done[number])
     return whole
 
 
 def _label(name: str, width: int, done: bool) -> np.ndarray:
     from PIL import Image, ImageDraw, ImageFont
 
-    strip = Image.new("RGB", (width, _STRIP), _BACK)
+    strip = Image.new("RGB", (width, LABEL), _BACK)
     pen = ImageDraw.Draw(strip)
-    pen.text((width / 2, _STRIP / 2), name, fill=_DONE if done else _INK, font=ImageFont.load_default(13), anchor="mm")
+    pen.text((width / 2, LABEL / 2), name, fill=_DONE if done else _INK, font=ImageFont.load_default(13), anchor="mm")
     return np.asarray(strip)

@@ -58,6 +58,7 @@ class OpenScissors(ReachTask):
     points = ("scissors/left_handle_position", "scissors/right_handle_position")
     constant = 2.0
     camera_target = (0.08, 0.0, 0.66)
+    camera_angle = (20.0, -42.0)
     variation_space = join(placed("scissors"), component("target_angle", -0.15, 0.3))
     wide_space = join(placed("scissors", 2 * SHIFT, 2 * TURN), component("target_angle", -0.15, 0.3))
     wide_solved = "hinge within 0.04 rad of its target"
@@ -143,6 +144,7 @@ class OpenPenCap(ReachTask):
     exponential = True
     ghost = (0.012, 0.012, 0.012)
     camera_target = (0.12, 0.0, 0.66)
+    camera_angle = (20.0, -42.0)
     variation_space = placed("pen")
     wide_space = join(placed("pen", 2 * SHIFT, 2 * TURN), component("gap", 0.2, 0.45))
     wide_solved = "points on body and cap within 1.25 cm of the gap between them"
@@ -216,6 +218,7 @@ class Switch(ReachTask):
     points = ("switch1/button_position", "switch2/button_position")
     constant = 2.0
     camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
+    camera_angle = (20.0, -42.0)
     variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
     wide_space = join(
         *(component(f"switch{i}_{axis}", -3 * SHIFT, 3 * SHIFT) for i in (1, 2) for axis in "xy"),

@@ -87,6 +87,7 @@ class TaskClass(ABC):
             by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
             largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
+        camera_angle: Azimuth and elevation of that look, degrees, such that hands, objects and goal are seen.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
     """
@@ -116,6 +117,7 @@ class TaskClass(ABC):
     needs: Capacity = Capacity(71, 20, 134)
     camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
     camera_distance: ClassVar[float] = 1.15
+    camera_angle: ClassVar[tuple[float, float]] = (150.0, -35.0)
     depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:

@@ -75,6 +75,7 @@ class GraspAndPlace(ReachTask):
     exponential = True
     terms = ("left", "right", "target")
     camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
+    camera_angle = (20.0, -42.0)
     variation_space = join(placed("bucket"), placed("block"))
     wide_space = join(
         placed("bucket", 3 * SHIFT, 3 * TURN),
@@ -176,6 +177,7 @@ class PourWater(ReachTask):
     constant = 1.0
     terms = ("constant", "left", "right", "target")
     camera_target, camera_distance = (0.1, -0.05, 0.5), 1.4
+    camera_angle = (20.0, -42.0)
     variation_space = join(placed("kettle"), placed("bucket"))
     wide_space = join(variation_space, *(component(f"goal_{axis}", -0.12, 0.12) for axis in "xy"))
     wide_solved = f"{solved} and within 4 cm of its goal"

@@ -88,6 +88,7 @@ class PushBlock(_TwoBlocks):
     objects = _cubes("block", (0.0, -0.2, 0.625), (0.0, 0.2, 0.625))
     constant, weight, widest = 2.0, 5.0, 0.8
     camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
+    camera_angle = (20.0, -42.0)
     variation_space = join(placed("block1"), placed("block2"))
     wide_space = join(
         *(placed(f"block{i}", 3 * SHIFT, 3 * TURN) for i in (1, 2)),

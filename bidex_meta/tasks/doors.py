@@ -55,6 +55,7 @@ class _Door(ReachTask):
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
     camera_target, camera_distance = (0.05, 0.0, 0.68), 2.0
+    camera_angle = (125.0, -25.0)
     blocks = (
         *object_blocks("object"),
         *goal_blocks("goal"),

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from bidex_meta.hands.hand import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, hand, set_contact_bits
+from bidex_meta.hands.looks import dress
 from bidex_meta.tasks.state import unknown_sensor
 from bidex_meta.utils import paths
 from bidex_meta.utils.maths import quaternion_from_rpy
@@ -144,6 +145,13 @@ class Scene:
         """Body ids of the movable fixtures, in the order of ``mocap_pos``."""
         place = self.model.body_mocapid
         return sorted((i for i in range(self.model.nbody) if place[i] >= 0), key=lambda i: place[i])
+
+    @cached_property
+    def dressed(self) -> mujoco.MjModel:
+        """For pictures: the same bodies and joints with hands as ``looks.dress`` shows them."""
+        spec = build_spec(self.task)
+        dress(spec)
+        return spec.compile()
 
     @cached_property
     def base_bodies(self) -> tuple[int, int]:

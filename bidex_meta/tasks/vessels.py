@@ -219,6 +219,7 @@ class SwingCup(OwnObjectClass):
     constant = -1.0
     ghost = (0.1, 0.012, 0.012)
     camera_target = (0.08, 0.0, 0.68)
+    camera_angle = (20.0, -42.0)
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
     wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # a small table
     wide_solved = "cup within 8 degrees of its goal and within 20 cm of its start"

@@ -8,7 +8,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.world.rendering import CAMERAS, GHOST
+from bidex_meta.world.rendering import GHOST
 
 _TYPE = mujoco.mjtGeom
 _Handle = Any  # viser's, which is not imported before something is shown
@@ -116,8 +116,8 @@ class Browser:
             self._shapes[geom] = scene.add_mesh_simple(
                 f"/geoms/{geom}", points, faces, color=(red, green, blue), opacity=alpha if alpha < 1.0 else None
             )
-        target, distance = stage.camera()
-        azimuth, elevation = np.radians(CAMERAS["front"])
+        target, distance, angle = stage.camera()
+        azimuth, elevation = np.radians(angle)
         away = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = np.array(target) - distance * away, np.array(target), 0.7

@@ -6,7 +6,7 @@ import mujoco
 
 from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.world.rendering import CAMERAS, add_ghosts
+from bidex_meta.world.rendering import add_ghosts
 
 _SPACE, _RIGHT, _ENTER, _MINUS, _EQUAL = 32, 262, 257, 45, 61
 KEYS = "Space pauses, Enter begins another episode, Right goes to the next task, - and = change the speed."
@@ -34,11 +34,11 @@ class Desktop:
         except Exception as error:  # the window library raises errors of many kinds
             hint = " On macOS start it by mjpython -m bidex_meta.cli play." if sys.platform == "darwin" else ""
             raise BidexError(f"No window can be opened ({error}).{hint} Add --browser.") from error
-        target, distance = stage.camera()
+        target, distance, angle = stage.camera()
         with self._viewer.lock():
             camera = self._viewer.cam
             camera.lookat[:], camera.distance = target, distance
-            camera.azimuth, camera.elevation = CAMERAS["front"]
+            camera.azimuth, camera.elevation = angle
 
     def is_open(self) -> bool:
         """Until the window is closed."""
@@ -64,8 +64,7 @@ class Desktop:
             self._open(stage)
         now = stage.data()
         with self._viewer.lock():
-            self._data.time = now.time
-            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
+            for name in ("qpos", "mocap_pos", "mocap_quat"):
                 getattr(self._data, name)[:] = getattr(now, name)
             mujoco.mj_forward(self._model, self._data)
             scene = self._viewer.user_scn

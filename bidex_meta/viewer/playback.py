@@ -10,7 +10,7 @@ import torch
 from bidex_meta.agents import Agent
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.world import World
-from bidex_meta.world.rendering import Ghost, ghosts, simulation
+from bidex_meta.world.rendering import Ghost, ghosts, pose, simulation
 
 
 class Stage:
@@ -71,23 +71,24 @@ class Stage:
         self._begin()
 
     def model(self) -> mujoco.MjModel:
-        """The model of the shown environment."""
-        engine, row = simulation(self._world, self.row)
-        return engine.model(row)
+        """The model that shows the environment: its bodies and joints, hands with their looks."""
+        return simulation(self._world, self.row)[2].dressed
 
     def data(self) -> mujoco.MjData:
-        """Its present state, forwarded, a copy."""
-        engine, row = simulation(self._world, self.row)
-        return engine.data(row)
+        """Its present pose, in that model."""
+        engine, row, scene = simulation(self._world, self.row)
+        data = mujoco.MjData(scene.dressed)
+        pose(scene.dressed, data, engine.placement()[row])
+        return data
 
     def ghosts(self) -> list[Ghost]:
         """Its goals."""
         return ghosts(self._world, self.row)
 
-    def camera(self) -> tuple[tuple[float, float, float], float]:
-        """The camera's target, world, metres, and its distance from it."""
+    def camera(self) -> tuple[tuple[float, float, float], float, tuple[float, float]]:
+        """The camera's target, world, metres, its distance from it, azimuth and elevation, degrees."""
         task = self._world.slots[int(self._world.task_id[self.row])].task_class
-        return task.camera_target, task.camera_distance
+        return task.camera_target, task.camera_distance, task.camera_angle
 
     def status(self) -> dict[str, str]:
         """Labels and values to show beside it."""

@@ -10,7 +10,7 @@ the observation returned is already that of the new episode, ``info["final_obs"]
 reward 0, until a ``reset`` whose ``reset_mask`` names it. NEXT_STEP, which Gymnasium's tools expect and no learner of
 ours takes, is between them: the step after its end starts a row's next episode, whatever the action, with reward 0.
 
-``info`` of a reset is empty; that of a step is about the transition just made:
+``info`` of a reset is empty (save ``pixels``); that of a step is about the transition just made:
 
 =====================  ====================  ===========================================================================
 key                    shape, type           meaning
@@ -32,7 +32,7 @@ counted                (N,), bool            rows whose episode ended and counts
 For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
 (``episodes.py``) where a row ended, and on the warp engine, which would have to wait for the answer, in every step:
 zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may add keys
-like these and ``reward_terms``; learners may not rely on them.
+like these, ``reward_terms`` and ``pixels``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
 seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there. A world

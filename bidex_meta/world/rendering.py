@@ -12,12 +12,15 @@ from bidex_meta.utils.maths import wxyz
 
 if TYPE_CHECKING:
     from bidex_meta.engine.protocol import Engine
+    from bidex_meta.tasks.scene import Scene
     from bidex_meta.world.world import World
 
-CAMERAS = {"front": (125.0, -25.0), "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
-"""Azimuth and elevation of the named views, degrees."""
+CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
+"""Azimuth and elevation of the named views, degrees; None: the class's ``camera_angle``."""
 _MOST_RENDERERS = 32
 """A tiled film of all classes fits; each takes some megabytes."""
+MOST_PIXELS = 1080
+"""Edge of the largest square picture."""
 _SMALL = 320
 """Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
 GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
@@ -31,7 +34,7 @@ class Painter:
     """Draws rows of a world; renderers are cached. A copy starts without any: they cannot be copied."""
 
     def __init__(self) -> None:
-        self._renderers: dict[tuple[int, int, int], mujoco.Renderer] = {}
+        self._renderers: dict[tuple[int, int, int], tuple[mujoco.Renderer, mujoco.MjData]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Painter, ()
@@ -46,34 +49,51 @@ class Painter:
             raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {shortened(name)}.")
         if not 0 <= row < world.num_envs:
             raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
-        engine, engine_row = simulation(world, row)
-        renderer = self._renderer(engine, engine_row, (int(world.task_id[row]), width, height))
-        renderer.update_scene(engine.data(engine_row), _camera(world, row, name))
+        engine, engine_row, scene = simulation(world, row)
+        return self._draw(world, row, name, (width, height), scene, engine.placement()[engine_row])
+
+    def pictures(self, world: "World", size: int) -> torch.Tensor:
+        """Square pictures of all rows by their classes' own cameras, (num_envs, size, size, 3), uint8, on the CPU."""
+        found = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8)
+        for part in world.parts:
+            placement, rows = part.group.engine.placement().cpu(), part.group.rows.tolist()
+            for member in part.group.members:
+                for at in range(member.engine_rows.start, member.engine_rows.stop):
+                    picture = self._draw(world, rows[at], "front", (size, size), member.scene, placement[at])
+                    found[rows[at]] = torch.from_numpy(picture)
+        return found
+
+    def _draw(
+        self, world: "World", row: int, camera: str, size: tuple[int, int], scene: "Scene", placement: torch.Tensor
+    ) -> np.ndarray:
+        renderer, data = self._renderer(scene.dressed, (int(world.task_id[row]), *size))
+        pose(scene.dressed, data, placement)
+        renderer.update_scene(data, _camera(world, row, camera))
         add_ghosts(ghosts(world, row), renderer.scene)
         return renderer.render()
 
-    def _renderer(self, engine: "Engine", row: int, key: tuple[int, int, int]) -> mujoco.Renderer:
+    def _renderer(self, model: mujoco.MjModel, key: tuple[int, int, int]) -> tuple[mujoco.Renderer, mujoco.MjData]:
         """That of a slot (its rows have one model) and a size, width and height."""
         if key not in self._renderers:
             gl_backend.prepare()
-            model = engine.model(row)
             most = model.vis.global_.offwidth, model.vis.global_.offheight
             if not (0 < key[1] <= most[0] and 0 < key[2] <= most[1]):
                 raise BidexError(
                     f"Expected a picture of at most {most[0]} x {most[1]} pixels, got {key[1]} x {key[2]}."
                 )
             if len(self._renderers) >= _MOST_RENDERERS:
-                self._renderers.pop(next(iter(self._renderers))).close()
-            if key[1] <= _SMALL:
-                model.vis.quality.shadowsize, model.vis.quality.offsamples = 1024, 4
-            renderer = self._renderers[key] = mujoco.Renderer(model, key[2], key[1])
-            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = key[1] > _SMALL
+                self._renderers.pop(next(iter(self._renderers)))[0].close()
+            small = key[1] <= _SMALL
+            model.vis.quality.shadowsize, model.vis.quality.offsamples = (1024, 4) if small else (4096, 8)
+            renderer = mujoco.Renderer(model, key[2], key[1])
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = not small
+            self._renderers[key] = renderer, mujoco.MjData(model)
         return self._renderers[key]
 
     def close(self) -> None:
         """Frees the renderers."""
         while self._renderers:
-            self._renderers.popitem()[1].close()
+            self._renderers.popitem()[1][0].close()
 
 
 def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
@@ -81,14 +101,26 @@ def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
     task = world.slots[int(world.task_id[row])].task_class
     view.lookat[:] = task.camera_target
     view.distance = task.camera_distance
-    view.azimuth, view.elevation = CAMERAS[name]
+    view.azimuth, view.elevation = CAMERAS[name] or task.camera_angle
     return view
 
 
-def simulation(world: "World", row: int) -> "tuple[Engine, int]":
-    """The engine that carries a row, and its row there."""
+def simulation(world: "World", row: int) -> "tuple[Engine, int, Scene]":
+    """The engine that carries a row, its row there, and its scene."""
     part = next(p for p in world.parts if bool((p.group.rows == row).any()))
-    return part.group.engine, int((part.group.rows == row).nonzero()[0])
+    at = int((part.group.rows == row).nonzero()[0])
+    scene = next(m.scene for m in part.group.members if m.engine_rows.start <= at < m.engine_rows.stop)
+    return part.group.engine, at, scene
+
+
+def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) -> None:
+    """Puts everything that is drawn where a row of ``Engine.placement`` says."""
+    numbers = placement.double().cpu().numpy()
+    data.qpos[:] = numbers[: model.nq]
+    mocap = numbers[model.nq :].reshape(-1, 7)
+    data.mocap_pos[:], data.mocap_quat[:] = mocap[:, :3], mocap[:, 3:]
+    for part in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
+        part(model, data)
 
 
 def ghosts(world: "World", row: int) -> list[Ghost]:

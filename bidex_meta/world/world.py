@@ -24,14 +24,14 @@ from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
-from bidex_meta.world.contract import Info, State
+from bidex_meta.world.contract import Info, Options, State, Step
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups
 from bidex_meta.world.part import Part, base_rotations, collect
 from bidex_meta.world.randomiser import Randomiser, deviations
-from bidex_meta.world.rendering import Painter
+from bidex_meta.world.rendering import MOST_PIXELS, Painter
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import keep_freed_memory
 
@@ -65,6 +65,7 @@ class World(BatchedWorld):
         stagger: bool = True,
         points: PointsRule | None = None,
         randomisation: Randomisation | None = None,
+        pixels: int = 0,
     ) -> None:
         """Builds the world; no episode is started before ``reset``.
 
@@ -84,6 +85,7 @@ class World(BatchedWorld):
                 together, and do not count in ``episode``. False: they begin at 0.
             points: Show a point cloud before the task id, and of objects nothing else; None: their state.
             randomisation: What is drawn anew for environments, or added as noise; None: nothing.
+            pixels: Edge of the square pictures by the classes' cameras in ``info["pixels"]``, pixels; 0: none.
 
         Raises BidexError for fewer environments than slots, unknown device, engine, mode or sampling, too narrow a
         padding.
@@ -91,12 +93,13 @@ class World(BatchedWorld):
         place, make_engine = choose_engine(device, engine, threads)
         checked.choices(task_sampling, observation, points)
         checked.seed(seed)
+        self._pixels = whole_number("pixels", pixels, 0, MOST_PIXELS)
         if num_envs is None:
             num_envs = _DEFAULT_SIZES[place.type]
         names = [slot.name for slot in slots]
         num_envs = checked.num_envs(num_envs, names)
         if place.type == "cpu":
-            needed = num_envs * (ROW_BYTES + (points.count if points else 0) * POINT_BYTES)
+            needed = num_envs * (ROW_BYTES + (points.count if points else 0) * POINT_BYTES + 3 * pixels**2)
             check_memory(needed, f"{num_envs:,} environments", "Lower num_envs.")
         keep_freed_memory()
         self.slots = [with_pool(slot, slot.tasks) for slot in slots]
@@ -122,6 +125,21 @@ class World(BatchedWorld):
         self._painter = Painter()
         self._set_pool_sizes([len(slot.tasks) for slot in self.slots])
         self._set_seed(seed)
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
+        """As in ``BatchedWorld``; with ``pixels`` info holds the pictures."""
+        obs, info = super().reset(seed=seed, options=options)
+        return obs, self._with_pixels(info)
+
+    def step(self, action: Tensor | np.ndarray) -> Step:
+        """As in ``BatchedWorld``; with ``pixels`` info holds pictures of the state that the observation shows."""
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, self._with_pixels(info)
+
+    def _with_pixels(self, info: Info) -> Info:
+        if self._pixels:
+            info["pixels"] = self._painter.pictures(self, self._pixels).to(self.device)
+        return info
 
     def _describe_observations(
         self, observation: Rule, pad_to: int | None, points: PointsRule | None, groups: list[Group]

@@ -102,7 +102,7 @@ class NumpyWorld(VectorEnv):
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts episodes; see ``VectorWorld.reset``."""
         obs, info = self.world.reset(seed=seed, options=options)
-        return _arrays(obs), info
+        return _arrays(obs), {name: _arrays(value) for name, value in info.items()}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Takes actions (num_envs, a).

@@ -56,6 +56,10 @@ def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy
     assert main(["render", str(path), *small, "--steps", "6", "--every", "3", "--out", str(out)]) == 0
     with Image.open(out) as film:
         assert (film.n_frames, film.size) == (3, (128, 64))
+    # Beside two tiles a large one of 64 x 44 (a grid is as high as its tiles); toys are as large as they are.
+    assert main(["render", str(path), *small, "--large", "--steps", "6", "--every", "3", "--out", str(out)]) == 0
+    with Image.open(out) as film:
+        assert (film.n_frames, film.size) == (3, (192, 64))
     assert main(["render", str(path), "--width", "64", "--every", "4"]) == 0  # its first class
     assert (path / "videos" / "film.mp4").is_file()
     capsys.readouterr()

@@ -5,9 +5,12 @@ import pickle
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from bidex_meta.benchmark import make_task_world
+from bidex_meta.errors import BidexError
 from bidex_meta.utils import gl_backend
+from bidex_meta.world import rendering
 
 
 class FakeRenderer:
@@ -51,3 +54,38 @@ def test_one_renderer_draws_a_film_and_closes_with_the_world(world):
     assert pickle.loads(pickle.dumps(world._painter))._renderers == {}
     world.close()
     assert FakeRenderer.open == 0
+
+
+def test_pixels_come_with_every_observation_and_change_nothing_else(world, monkeypatch):
+    seen = []
+    monkeypatch.setattr(rendering, "pose", lambda model, data, placement: seen.append(placement.tolist()))
+    plain, pixels = (
+        make_task_world("CatchUnderarm", num_envs=3, seed=0, threads=1, stagger=False, pixels=size) for size in (0, 24)
+    )
+    (obs, none), (same, info) = plain.reset(seed=0), pixels.reset(seed=0)
+    assert none == {} and info["pixels"].shape == (3, 24, 24, 3) and info["pixels"].dtype == torch.uint8
+    assert torch.equal(obs, same)
+    for _ in range(3):
+        (obs, *_, none), (same, *_, info) = (each.step(np.ones((3, 52), np.float32)) for each in (plain, pixels))
+        assert torch.equal(obs, same) and "pixels" not in none and info["pixels"].shape == (3, 24, 24, 3)
+    assert seen[-3:] == pixels.parts[0].group.engine.placement().tolist()
+    assert isinstance(pixels.to_numpy().reset(seed=0)[1]["pixels"], np.ndarray)
+    for wrong in (-1, 2000, 1.5):
+        with pytest.raises(BidexError, match="pixels"):
+            make_task_world("CatchUnderarm", num_envs=1, pixels=wrong)  # type: ignore[arg-type]
+
+
+def test_pixels_show_what_moves():
+    try:
+        gl_backend.prepare()
+    except BidexError as error:
+        pytest.skip(str(error))
+    world = make_task_world("CatchUnderarm", 2, "cpu", seed=0, threads=1, autoreset_mode="DISABLED", pixels=48)
+    first = world.reset(seed=0)[1]["pixels"]
+    assert first.float().std() > 20.0
+    for _ in range(10):
+        info = world.step(torch.tensor([[0.0] * 52, [1.0] * 52]))[4]
+    differs = (info["pixels"].int() - first.int()).abs().amax(dim=(1, 2, 3))
+    assert (differs > 60).all() and not torch.equal(info["pixels"][0], info["pixels"][1])
+    assert np.array_equal(info["pixels"][1].numpy(), world.render(1, 48, 48))
+    world.close()
