@@ -113,7 +113,7 @@ class Watch:
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
             rows, seed = range(world.num_envs), self._plan.config.seed
-            frames = film_tiles(self._policy("cpu"), world, rows, steps, seed, _FILM_EVERY, **_FILM)
+            frames = film_tiles(self._policy("cpu"), world, rows, steps, seed, _FILM_EVERY, large=False, **_FILM)
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:
             say(f"No film at {self._learner.env_steps:,} steps: {error}")

@@ -74,6 +74,7 @@ class Browser:
         self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
         self._server.scene.set_up_direction("+z")
+        self._server.scene.configure_environment_map(environment_intensity=0.3)  # at 1 colours are all but white
         self._shapes: dict[int, _Handle] = {}
         self._ghosts: list[_Handle] = []
         self._add_controls(stage)
@@ -120,7 +121,8 @@ class Browser:
         azimuth, elevation = np.radians(angle)
         away = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         camera = self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = np.array(target) - distance * away, np.array(target), 0.7
+        position = np.array(target) - 1.35 * distance * away  # farther than in pictures: the controls hide a part
+        camera.position, camera.look_at, camera.fov = position, np.array(target), 0.7
         for client in self._server.get_clients().values():
             client.camera.position, client.camera.look_at = camera.position, camera.look_at
 
