@@ -210,7 +210,7 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
         ({"num_envs": 3}, "num_envs: expected at least 4, one each for CatchUnderarm, HandOver"),
         ({"num_envs": 4.5}, "num_envs: expected a whole number"),
         ({"split": "test"}, "MT4 has the splits train, got 'test'"),
-        ({"autoreset_mode": "NEXT_STEP"}, "Unknown autoreset_mode 'NEXT_STEP'"),
+        ({"autoreset_mode": "LAST_STEP"}, "Unknown autoreset_mode 'LAST_STEP'"),
         ({"device": "gpu"}, "device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
         ({"seed": -1}, "seed: expected a whole number"),
     ],

@@ -35,7 +35,9 @@ def test_a_card_is_made_from_the_run_and_read_by_the_hub(shown, tmp_path: Path) 
     (result,) = card.data.eval_results
     assert (result.dataset_name, round(mean, 4)) == ("MT20", result.metric_value)
     assert {"MT20", "dagger"} <= {*card.data.tags} and card.data.license == "apache-2.0"
-    assert "| HandOver | 82.0 % | 24.6 |" in card.text and "| commit | 1b6133" in card.text
+    row, versions = classes["HandOver"], json.loads((MT20 / "versions.json").read_text())
+    assert f"| HandOver | {100 * row['success']:.1f} % | {row['return']:.4g} |" in card.text
+    assert f"| commit | {versions['git']['commit'][:6]}" in card.text
 
 
 def test_without_a_network_the_cache_of_the_hub_serves(shown, refused, tmp_path: Path, monkeypatch) -> None:

@@ -35,7 +35,7 @@ def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
     patch.chdir(folder)
     patch.setattr(world_module.World, "__init__", built)
     patch.setattr(batched.MetaWorldWorld, "__init__", built)
-    for what in ("draw_learning", "draw_adaptation", "missing"):  # drawing takes a second
+    for what in ("draw_learning", "draw_adaptation"):  # drawing takes a second
         patch.setattr(f"bidex_meta.runs.plots.{what}", built)
     return folder
 

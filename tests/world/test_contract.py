@@ -34,10 +34,14 @@ def test_attributes_and_calls(world: World) -> None:
 
 
 def test_modes_in_any_spelling(world: World) -> None:
-    for mode in ("same_step", "Same-Step", "SameStep", AutoresetMode.SAME_STEP, "disabled", AutoresetMode.DISABLED):
-        name = "DISABLED" if mode in ("disabled", AutoresetMode.DISABLED) else "SAME_STEP"
-        made = World(world.slots, 4, autoreset_mode=mode, threads=1)
-        assert made.metadata["autoreset_mode"] is AutoresetMode[name]
-    for mode in ("NEXT_STEP", AutoresetMode.NEXT_STEP):
-        with pytest.raises(BidexError, match="DISABLED, SAME_STEP"):
-            World(world.slots, 4, autoreset_mode=mode)
+    spellings = {
+        "SAME_STEP": ("same_step", "Same-Step", "SameStep"),
+        "DISABLED": ("disabled",),
+        "NEXT_STEP": ("next-step",),
+    }
+    for name, modes in spellings.items():
+        for mode in (*modes, AutoresetMode[name]):
+            made = World(world.slots, 4, autoreset_mode=mode, threads=1)
+            assert made.metadata["autoreset_mode"] is AutoresetMode[name]
+    with pytest.raises(BidexError, match="DISABLED, NEXT_STEP, SAME_STEP"):
+        World(world.slots, 4, autoreset_mode="LAST_STEP")
