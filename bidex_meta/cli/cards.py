@@ -12,8 +12,9 @@ def run_card(folder: RunFolder, name: str) -> str:
     """The card of a run's policy: the hub's header in YAML, then facts and results."""
     config, versions = folder.config(), folder.versions()
     subject = config.suite or str(config.task)
-    rows = _results(folder)
-    found = [{"type": "success rate", "value": round(success, 4), "name": "mean over classes"} for success in rows[:1]]
+    classes = _classes(folder)
+    mean = sum(row["success"] for row in classes.values()) / max(len(classes), 1)
+    found = [{"type": "success rate", "value": round(mean, 4), "name": "mean over classes"}]
     header = {
         "library_name": "bidex-meta", "license": "apache-2.0", "pipeline_tag": "reinforcement-learning",
         "tags": ["reinforcement-learning", "bidex-meta", "mujoco", subject, config.algo],
@@ -21,7 +22,7 @@ def run_card(folder: RunFolder, name: str) -> str:
             "task": {"type": "reinforcement-learning"}, "dataset": {"name": subject, "type": subject}, "metrics": found,
         }]}],
     }  # fmt: skip
-    if not found:
+    if not classes:
         del header["model-index"]
     facts = {
         "suite or class": subject, "algorithm": config.algo, "seed": config.seed,
@@ -29,7 +30,7 @@ def run_card(folder: RunFolder, name: str) -> str:
     }  # fmt: skip
     title = f"{config.algo} on {subject}, seed {config.seed}"
     plays = f"bidex-meta pull {name} --out policy\nbidex-meta evaluate policy"
-    return _card(header, title, plays, facts) + _table(folder)
+    return _card(header, title, plays, facts) + _table(classes)
 
 
 def data_card(folder: Path, name: str) -> str:
@@ -69,13 +70,6 @@ def _classes(folder: RunFolder) -> Json:
     return found.get("policy", found).get("classes", {})
 
 
-def _results(folder: RunFolder) -> list[float]:
-    rows = _classes(folder).values()
-    return [sum(row["success"] for row in rows) / len(rows)] if rows else []
-
-
-def _table(folder: RunFolder) -> str:
-    lines = [
-        f"| {name} | {100 * row['success']:.1f} % | {row['return']:.4g} |" for name, row in _classes(folder).items()
-    ]
+def _table(classes: Json) -> str:
+    lines = [f"| {name} | {100 * row['success']:.1f} % | {row['return']:.4g} |" for name, row in classes.items()]
     return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""]) if lines else ""
