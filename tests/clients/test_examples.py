@@ -13,6 +13,7 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "rsl_rl_ppo": ("rsl_rl", {"steps": 512, "num_envs": 16}),
     "skrl_ppo": ("skrl", {"steps": 512, "num_envs": 16, "log": False}),
     "torchrl_ppo": ("torchrl", {"steps": 512, "num_envs": 16}),
+    "optuna_search": ("optuna", {"suite": "MT1", "steps": 512, "trials": 1}),
 }
 
 
@@ -29,8 +30,11 @@ def test_every_example_is_run_here() -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_example(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     package, flags = RUNS[name]
+    monkeypatch.chdir(tmp_path)
     pytest.importorskip(package, reason=f"needs the extra of {package}")
     assert example(name).main(**flags) is not None
 

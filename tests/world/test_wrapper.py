@@ -145,6 +145,9 @@ def test_other_wrappers_of_the_numpy_form() -> None:
     env.reset(seed=0)
     reward = env.step(np.zeros((8, 52), np.float32))[1]
     assert reward.shape == (8,) and np.isfinite(reward).all()
+    env = wrap.NormalizeObservation(suite_world("MT4", 8, "NEXT_STEP").to_numpy())
+    env.reset(seed=0)
+    assert np.isfinite(env.step(np.zeros((8, 52), np.float32))[0]).all()
     listed = wrap.DictInfoToList(suite_world("MT4", 8).to_numpy())
     listed.reset(seed=0)
     assert len(listed.step(np.zeros((8, 52), np.float32))[-1]) == 8
