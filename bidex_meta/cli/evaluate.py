@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
+from bidex_meta.cli.metatest import OTHERS, Options, check_worlds, meta_test, others_of, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.policies import load_policy, policy_loader
 from bidex_meta.cli.tables import Json, evaluation_table, print_table, result_table, say
@@ -23,8 +23,6 @@ from bidex_meta.runs.versions import package_versions
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
-OTHER_SEED = 500_000
-"""Added to a run's seed for tasks that it was not trained on."""
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
@@ -39,8 +37,9 @@ class EvaluateFlags(Options):
 
     run: RunPath  # Run folder.
     checkpoint: str = "last"  # Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
-    split: Literal["auto", "train", "test", "both"] = "auto"
-    """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
+    split: Literal["auto", "train", "test", "others", "both"] = "auto"
+    """Tasks to play: those trained on, a meta suite's unseen ones, or for learners that adapt others of the train
+    classes; auto: train, and train and test for learners that adapt."""
     random: Switch = False  # Also play a random policy, and show the difference.
     other_tasks: Switch = False  # Also play as many tasks that no run trained on, drawn by another seed.
     randomisation: Path | None = None
@@ -78,6 +77,8 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
         raise BidexError(
             f"{config.algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test."
         )
+    if flags.split == OTHERS:
+        raise BidexError(f"{config.algo} does not adapt to tasks: --other-tasks plays others beside its own.")
     policy, step = load_policy(folder, config.device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
     title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
@@ -103,11 +104,10 @@ def judged_on_others(
     brief: bool = False,
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
-    drawn = worlds.seed + OTHER_SEED
-    others = Worlds.open(replace(worlds.config, task_seed=drawn))
-    title = f"{algo} on {others.name}, other tasks (seed {drawn})"
+    others = others_of(worlds)
+    title = f"{algo} on {others.name}, other tasks (seed {others.seed})"
     found, table = judged(others, policy, step, split, options, random, title, brief)
-    return {"task_seed": drawn, **found}, table
+    return {"task_seed": others.seed, **found}, table
 
 
 def judged(
@@ -140,7 +140,7 @@ def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, world
     if flags.random:
         raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
     if flags.other_tasks:
-        raise BidexError(f"{config.algo} adapts: its test tasks are others. Leave --other-tasks out.")
+        raise BidexError(f"{config.algo} adapts: --split others plays other tasks of its train classes.")
     check_worlds(worlds, config.algo)
     splits = splits_of(worlds, flags.split)
     load, step = policy_loader(folder, config.device, flags.checkpoint)

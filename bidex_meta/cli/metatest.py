@@ -1,7 +1,7 @@
 """The meta-test of a run whose learner adapts: its size, its worlds, its tables."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
@@ -13,6 +13,8 @@ from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.worlds import Worlds
 
+OTHER_SEED = 500_000  # added to a run's seed for tasks that it was not trained on
+OTHERS = "others"  # the split of train classes with such tasks
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
 _ROLLOUTS, _MOST_ROLLOUTS = 10, 40  # episodes of a task in a shot where the config has none; the most taken from it
 _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
@@ -52,9 +54,10 @@ def meta_test(
     ``algo``, ``num_envs`` and ``learner`` are read; ``say`` is called with what begins.
     """
     check_worlds(worlds, config.algo)
-    found = {}
+    found, own = {}, worlds
     limit = options.num_envs or _ENVIRONMENTS
-    for split in splits:
+    for name in splits:
+        worlds, split = (others_of(own), "train") if name == OTHERS else (own, name)
         counts = [len(pool) for pool in worlds.tasks(split).values()]
         rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
         tasks = min(options.tasks or TASKS, max(counts))
@@ -63,15 +66,16 @@ def meta_test(
         shots = 1 if options.shots is None else options.shots
         episodes = options.episodes or rollouts  # which the same environments play at once
         often = f", each {trials} times" if trials > 1 else ""
+        kind = "other" if name == OTHERS else name
         say(
-            f"Meta-test on {split} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
+            f"Meta-test on {kind} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
             f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
             f"episodes, {num_envs} environments."
         )
         world = worlds.world(split, num_envs)
-        found[split] = meta_evaluate(
+        found[name] = meta_evaluate(
             load(), world, shots, rollouts=rollouts, episodes_per_task=episodes, tasks=tasks, trials=trials,
-            max_adapt_steps=adapt_steps_of(config), seed=options.starts, references=worlds.references(), split=split,
+            max_adapt_steps=adapt_steps_of(config), seed=options.starts, references=worlds.references(), split=name,
         )  # fmt: skip
         world.close()
     return found
@@ -120,8 +124,15 @@ def check_worlds(worlds: Worlds, algo: str) -> None:
         )
 
 
+def others_of(worlds: Worlds) -> Worlds:
+    """Worlds of as many tasks of each class, drawn by another seed."""
+    return Worlds.open(replace(worlds.config, task_seed=worlds.seed + OTHER_SEED))
+
+
 def splits_of(worlds: Worlds, asked: str) -> list[str]:
     """The splits that a meta-test plays: the one of this name, or all there are for ``both`` and ``auto``."""
+    if asked == OTHERS:
+        return [OTHERS]
     if asked in ("train", "test") and asked not in worlds.splits:
         raise BidexError(f"{worlds.name} has no {asked} tasks. Leave --split out.")
     return [name for name in worlds.splits if asked in ("auto", "both", name)]

@@ -44,10 +44,10 @@ class RunFlags(Generic[LearnerSettings]):
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
     learners that adapt, as many as --rollouts."""
     other_tasks: Switch = False
-    """Evaluate on as many tasks that the run was not trained on, too; not for learners that adapt."""
-    split: Literal["auto", "train", "test", "both"] = "auto"
-    """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
-    beside the five unseen ones."""
+    """Evaluate on as many tasks that the run was not trained on, too; for learners that adapt see --split."""
+    split: Literal["auto", "train", "test", "others", "both"] = "auto"
+    """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: train and test, on ML20
+    fifteen classes beside the five unseen ones; others: tasks of the train classes that the run was not trained on."""
     shots: Shots | None = None  # There: adapt so often, one after the other. None: 1.
     rollouts: Few | None = None  # There: episodes of each task in a shot. None: as in training, but 40 at most.
     tasks: Count | None = None  # There: the first so many tasks of each class. None: 5.
@@ -149,7 +149,7 @@ def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:
     if asked and not kind.make.adapts:
         raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
     if flags.other_tasks and kind.make.adapts:
-        raise BidexError(f"{kind.name} adapts: its test tasks are others. Leave --other-tasks out.")
+        raise BidexError(f"{kind.name} adapts: --split others plays other tasks of its train classes.")
     if config.record:
         part_files.hdf5()  # refuses it where it is not installed
     if config.device.startswith("cpu") and not flags.print_config:

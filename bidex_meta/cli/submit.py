@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidex_meta.cli.evaluate import OTHER_SEED, conditions
+from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.metatest import others_of
 from bidex_meta.cli.parsing import Device, RunPaths, parse
 from bidex_meta.cli.policies import load_policy
 from bidex_meta.cli.tables import Json, say
@@ -99,7 +100,7 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     config = stored.to_json()
     config |= {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": "auto"}
     worlds = Worlds.open(config)
-    others = Worlds.open({**config, "task_seed": worlds.seed + OTHER_SEED})
+    others = others_of(worlds)
     set_up_torch(stored.threads)
     policy, steps = load_policy(folder, config["device"])
     found = []

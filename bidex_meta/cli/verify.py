@@ -9,7 +9,7 @@ from typing import NotRequired, TypedDict
 
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import TASKS, Options, meta_test
+from bidex_meta.cli.metatest import OTHERS, TASKS, Options, meta_test
 from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
 from bidex_meta.cli.policies import checkpoint, policy_of
 from bidex_meta.cli.tables import Json, percent, plain, print_table, ranged, say, titled
@@ -181,7 +181,7 @@ def _again(
         return {"policy": found.to_json()}
     splits = {}
     for split, part in recorded["splits"].items():
-        if split not in worlds.splits:
+        if split not in (*worlds.splits, OTHERS):
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
         before = part["before"]
         options = Options(

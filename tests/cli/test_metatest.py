@@ -55,6 +55,11 @@ def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(
     near = part["by_shot"][2]["classes"]["Near"]
     assert (near["episodes"], near["tasks"]) == (2 * 2 * 5, 2)
     assert part["adapt_steps"] == [2 * 2 * 3 * 6] * 2
+    text = shown("evaluate", adapted, "--json", "--split", "others")
+    (others,) = json.loads(text)["splits"].values()
+    assert others["split"] == "others" and others["before"]["classes"].keys() == COUNTS["train"].keys()
+    (adapted.parent / "others.json").write_text(text)
+    shown("verify", adapted, "--evaluation", adapted.parent / "others.json")
     few = json.loads(shown("evaluate", adapted, "--json", "--num-envs", 8))["splits"]["train"]  # only slower
     assert few["before"]["classes"]["Near"]["episodes"] == 20
     assert few["gain"]["classes"]["Near"]["return"]["interval"][0] > 0

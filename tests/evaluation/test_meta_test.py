@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from bidex_meta.cli.metatest import others_of
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.worlds import Worlds
 from tests.fakes import ToyWorld
 from tests.points import Finder, PointWorld, Still, ring
 
@@ -246,3 +248,9 @@ def test_refusals_name_the_mend(agent, place, keywords, expected):
     with pytest.raises(BidexError, match=expected) as error:
         meta_evaluate(agent, place, **keywords)
     assert "\n" not in str(error.value)
+
+
+def test_others_are_tasks_of_another_seed():
+    worlds = Worlds.open({"suite": "ML1", "threads": 1})
+    own, others = (each.world("train", 2).pools[0] for each in (worlds, others_of(worlds)))
+    assert own.shape == others.shape and not (own == others).all(1).any()
