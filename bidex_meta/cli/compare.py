@@ -63,7 +63,7 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
         measures = (iqm(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
         over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
         cells = [NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]
-        seeds = ", ".join(map(str, group.seeds))
+        seeds = f"{len(group.seeds)} ({', '.join(map(str, group.seeds))})"
         rows.append([group.label, seeds, group.steps_text(), f"{group.hours:.2f}", *cells])
     return [*columns, "success over the first", "score over the first"], rows
 

@@ -16,7 +16,7 @@ from bidex_meta.cli.policies import load_policy, policy_loader
 from bidex_meta.cli.tables import Json, evaluation_table, print_table, result_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent, Watched
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.versions import package_versions
@@ -82,6 +82,7 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
     policy, step = load_policy(folder, config.device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
     title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
+    title += f", randomised by {flags.randomisation}" if flags.randomisation else ""
     result, table = judged(worlds, policy, step, split, flags, flags.random, title)
     tables = [table]
     if flags.other_tasks:
@@ -125,10 +126,12 @@ def judged(
     ``brief`` ones, always beside random, have a table for a terminal.
     """
     world = worlds.world(split, options.num_envs)
-    found = worlds.judge(policy, world, options.episodes, options.starts)
+    longest = int(world.max_episode_steps.max())
+    found = worlds.judge(Watched(policy, longest, "Evaluating"), world, options.episodes, options.starts)
     result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
     if random:
-        other = worlds.judge(RandomAgent(world.action_space), world, options.episodes, options.starts)
+        uniform = Watched(RandomAgent(world.action_space), longest, "A random policy")
+        other = worlds.judge(uniform, world, options.episodes, options.starts)
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
         result |= {"random": other.to_json(), "return_above_random": differences}
     world.close()

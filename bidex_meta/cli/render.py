@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> None:
         if flags.actor in ("zero", "random"):
             raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
         name = "tiled" if flags.tiled else short_name(flags.task or "film")
-        out = Path(flags.actor) / "videos" / f"{name}.mp4"
+        out = Path(flags.actor) / "videos" / (name + video.film_suffix())
     suffix = video.check_suffix(out)
     refuse_links(*([] if flags.out else [out.parent, out]))
     check_writable(out)

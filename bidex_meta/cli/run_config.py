@@ -44,7 +44,7 @@ class RunFlags(Generic[LearnerSettings]):
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
     learners that adapt, as many as --rollouts."""
     other_tasks: Switch = False
-    """Evaluate on as many tasks that the run was not trained on, too; for learners that adapt see --split."""
+    """Evaluate on as many tasks that the run was not trained on, too; learners that adapt have --split others."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
     """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: train and test, on ML20
     fifteen classes beside the five unseen ones; others: tasks of the train classes that the run was not trained on."""

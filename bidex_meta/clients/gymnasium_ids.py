@@ -21,8 +21,8 @@ def suite_ids(suite: Suite) -> dict[str, str]:
 
 
 def task_id(task_name: str) -> str:
-    """The Gymnasium id of a task class, e.g. `"bidex-meta/CatchUnderarm-v1"`."""
-    return f"{NAMESPACE}/{task_name}-v1"
+    """The Gymnasium id of a task class: `"bidex-meta/CatchUnderarm-v1"`, or `-v2` of `CatchUnderarm-v2`."""
+    return f"{NAMESPACE}/{task_name}" + ("" if task_name != registry.plain_name(task_name) else "-v1")
 
 
 def register_ids() -> None:
@@ -34,7 +34,7 @@ def register_ids() -> None:
     }
     custom = {"vector_entry_point": "bidex_meta.metaworld.vector_envs:make_custom"}
     specs |= {f"{NAMESPACE}/custom-{kind}-envs": custom for kind in ("mt", "ml")}
-    for name in registry.names():
+    for name in (each + version for each in registry.names() for version in ("", "-v2")):
         specs[task_id(name)] = {
             "entry_point": "bidex_meta.clients.gymnasium_env:TaskEnv",
             "vector_entry_point": f"{__name__}:make_class_world",

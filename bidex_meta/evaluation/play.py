@@ -6,6 +6,8 @@ unscaled reward. An episode of broken physics is no success and counts with the 
 that is lower.
 """
 
+import sys
+import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -22,6 +24,7 @@ from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
+_SECONDS = 15.0  # from one sign of life of ``Watched`` to the next
 EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains with it, so they are new to the policy
 
 
@@ -167,3 +170,24 @@ class HeldAgent(RandomAgent):
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
         """The action ``(num_envs, action)``, on the device of ``obs``."""
         return self._held.to(obs.device)
+
+
+class Watched:
+    """An agent that says on stderr, every 15 seconds, how many steps of ``longest`` its episodes have come to."""
+
+    def __init__(self, agent: Agent, longest: int, what: str):
+        self._agent, self._longest, self._what = agent, longest, what
+        self._steps, self._said = 0, time.monotonic()
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """The agent's."""
+        self._steps += 1
+        if time.monotonic() - self._said >= _SECONDS:
+            self._said = time.monotonic()
+            print(f"{self._what}: step {self._steps} of {self._longest}", file=sys.stderr, flush=True)
+        return self._agent.eval_action(obs)
+
+    def reset(self, env_mask: torch.Tensor) -> None:
+        """The agent's: a round of episodes begins."""
+        self._steps = 0
+        self._agent.reset(env_mask)

@@ -1,7 +1,8 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
 As there, `MT1` and `ML1` are of any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
-`("ML1")`. Hands move, as in every suite; `seed` chooses the tasks, None: 0.
+`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`. Hands move, as in every suite; `seed` chooses the tasks,
+None: 0.
 """
 
 from collections.abc import Sequence
@@ -9,8 +10,8 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.errors import BidexError, known_name
-from bidex_meta.suite import V1, Split, Suite, SuiteClass
+from bidex_meta.errors import BidexError
+from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
 
@@ -76,14 +77,19 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         splits |= {entry: (*splits.get(entry, ()), split) for entry in _named(given)}
     if not all(classes.values()):
         raise BidexError(f"{name}: expected at least one class in each list, got an empty one.")
+    second = {entry != registry.plain_name(entry) for entry in splits}
+    if len(second) > 1:
+        raise BidexError(f"{name}: expected classes of one version, got {', '.join(splits)}.")
+    (second,) = second
+    splits = {registry.plain_name(entry): where for entry, where in splits.items()}
     return Suite(
         name=name,
-        version=1,
+        version=1 + second,
         kind="meta" if "test" in classes else "multi-task",
         description=", ".join(splits),
         observation=observation,
         task_id="class",
-        rules=V1,
+        rules=V2 if second else V1,
         base="moving",
         tasks_per_class=50,
         classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),
@@ -93,4 +99,4 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
 
 def _named(envs: Sequence[str]) -> list[str]:
     """The classes of a list, each once, as they are written."""
-    return list(dict.fromkeys(known_name("task class", name, registry.names()) for name in envs))
+    return list(dict.fromkeys(registry.resolve(name) for name in envs))

@@ -217,6 +217,6 @@ def _tasks(benchmark: Benchmark, split: str, name: str) -> list[Task]:
 def _is_class(name: str) -> bool:
     """Whether it names a class; raises BidexError where it names no suite either."""
     folded = {known.casefold() for known in registry.names()}
-    if name.casefold() not in folded and not name.endswith(".toml"):
+    if registry.plain_name(name).casefold() not in folded and not name.endswith(".toml"):
         known_name("class or suite", name, [*registry.names(), *suite_names()])
-    return name.casefold() in folded
+    return registry.plain_name(name).casefold() in folded

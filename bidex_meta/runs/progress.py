@@ -19,6 +19,7 @@ from bidex_meta.utils.streams import silence
 Item = TypeVar("Item")
 
 _PLAIN_SECONDS = 5.0
+_COUNTED_SECONDS = 15.0
 _SUCCESS = "Train/success/"
 _RETURN = "Train/return/"
 
@@ -120,7 +121,9 @@ class Progress:
             done = f"{_duration(spent)} of {_duration(self._total_seconds)}  {step:,} steps"
         speed = f"{done}  {self._rate(step):,.0f} steps/s  {left} left"
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
-        return [speed, f"return {_number(mean_return)}", f"success {_percent(success)}"]
+        teacher = self._shown.get("Policy/teacher_share", 0.0)
+        plays = [f"teacher plays {_percent(teacher)}"] if teacher else []
+        return [speed, f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
 def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
@@ -132,7 +135,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
     reported = time.monotonic()
     for number, item in enumerate(items, start=1):
         yield item
-        if time.monotonic() - reported >= _PLAIN_SECONDS:
+        if time.monotonic() - reported >= _COUNTED_SECONDS:
             reported = time.monotonic()
             console.print(f"{number} of {total} {what}", highlight=False, markup=False)
 

@@ -33,9 +33,14 @@ def write_image(path: Path, frame: np.ndarray) -> None:
     write_atomic(path, lambda file: file.write(picture))
 
 
+def film_suffix() -> str:
+    """The ending of a film that nobody named: .mp4 where that can be written, else .webp."""
+    return ".mp4" if find_spec("imageio_ffmpeg") else ".webp"
+
+
 def check_films() -> None:
     """Raises BidexError where MP4 cannot be written, since imageio-ffmpeg is missing."""
-    if find_spec("imageio_ffmpeg") is None:
+    if film_suffix() != ".mp4":
         raise BidexError("Films need imageio-ffmpeg: pip install 'bidex-meta[video]', or write .webp.")
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from bidex_meta.errors import known_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_randomisation, load_suite, suite_names
@@ -80,9 +80,13 @@ class Worlds(ABC):
             task = config.task or ""
             if task.casefold() == external.HUMANOID.casefold():
                 return external.HumanoidTask(external.HUMANOID, config)
+            if task in suites_to_run():
+                raise BidexError(f"{task} is a suite, not a class: name it by suite (--suite {task}).")
             return own.SingleClass(registry.resolve(task, "task"), config)
         suite = config.suite
         if not suite.endswith(".toml"):
+            if registry.plain_name(suite) in registry.names():
+                raise BidexError(f"{suite} is a class, not a suite: name it by task (--task {suite}).")
             suite = known_name("suite", suite, suites_to_run())
         return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
 

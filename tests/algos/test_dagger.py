@@ -65,6 +65,14 @@ def on_track(learner: DAgger) -> float:
     return float((world.off().abs() < 0.1).float().mean())
 
 
+def test_episodes_of_the_teacher_do_not_count_as_success_of_the_student() -> None:
+    for config, counted in ((CLONED, False), (replace(SMALL, teacher_steps=0), True)):
+        learner = taught(two_tasks(), config, Constant(0.5), Constant(-0.5))
+        for _ in range(12):
+            metrics = learner.iterate()
+        assert ("Train/success_rate" in metrics) is counted
+
+
 def test_cloning_leaves_the_track_and_dagger_stays_on_it() -> None:
     found = {}
     for name, config in {"cloned": CLONED, "dagger": SMALL}.items():

@@ -24,6 +24,7 @@ from bidex_meta import Benchmark, Task
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
+from bidex_meta.suite import V2
 from bidex_meta.world.single_env import SuiteEnv
 
 BOTH = pytest.mark.parametrize(
@@ -336,6 +337,11 @@ def test_constructors_take_what_meta_worlds_take() -> None:
     assert isinstance(ours.ML4().train_tasks[0], ours.Task) and ours.Task is Task
     assert ours.MT1("HandOver").make_world(num_envs=2, device="cpu").observation_size == 422
     assert ours.OneHotWrapper is original.OneHotWrapper
+    second = ours.ML1("handover-v2", 1)
+    assert second.suite.version == 2 and second.train_tasks == Benchmark(second.suite, 1).train_tasks
+    assert second.suite.rules == V2
+    with pytest.raises(BidexError, match="one version"):
+        ours.CustomML(["HandOver-v2"], ["Switch"])
 
 
 @pytest.mark.parametrize(

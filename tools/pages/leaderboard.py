@@ -28,7 +28,7 @@ def _row(place: int, entry: Entry, below: list[Entry]) -> list[str]:
         str(place), f"{entry.name} ({entry.algorithm})" if entry.name != entry.algorithm else entry.name,
         *(estimate(iqm, part).text(100.0, " %") for part in (own, others)),
         *(f"{100 * profile(own, rate):.0f} %" for rate in PROFILE), better,
-        ", ".join(map(str, entry.seeds)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
+        str(len(entry.seeds)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
         f"{sum(entry.hours) / len(entry.hours):.2f}", entry.device,
         ", ".join(sorted({commit or "unknown" for commit in entry.commit})),
     ]  # fmt: skip
