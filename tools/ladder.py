@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import spread
+from bidex_meta.cli.metatest import OTHERS, adapt_steps_of, others_of
 from bidex_meta.cli.policies import load_policy
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
@@ -22,48 +23,56 @@ from bidex_meta.worlds import Worlds
 _CANDIDATES, _EXACT = 128, 0.02
 
 
-def ladder(run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, out: Path | None = None) -> None:
-    """Success at the end, on test tasks, of a run of icl and of the same actor with other knowledge of the goal.
+def ladder(
+    run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
+) -> None:
+    """Success of each class on unseen tasks, of a run of icl and of the same actor with other knowledge of the goal.
 
-    Example: python -m tools.ladder runs/ML1-v2/icl/<run> --out results/data/ml1-v2/ladder.json
+    Example: python -m tools.ladder runs/ml1-v2/ML1-v2-icl-seed0 --out results/data/ml1-v2/ladder/seed0.json
 
     Args:
         run: Folder of a run of icl.
         shots: Exploring episodes.
         tasks: Tasks of each class.
+        split: Test tasks, or others of the train classes.
         out: File that takes the numbers too.
     """
     folder = RunFolder.open(run)
     if folder.config().algo != ICL.name:
         raise BidexError(f"Expected a run of icl, got one of {folder.config().algo}.")
     worlds = Worlds.open(folder.config().to_json())
-    world: Any = worlds.world("test", tasks * len(worlds.tasks("test")))
-    hidden, found = HiddenParts(world), dict[str, list[float]]()
+    worlds, split = (others_of(worlds), "train") if split == OTHERS else (worlds, split)
+    world: Any = worlds.world(split, tasks * len(worlds.tasks(split)))
+    hidden, found = HiddenParts(world), dict[str, dict[str, list[float]]]()
+    longest = adapt_steps_of(folder.config())
 
     def agent() -> Any:
         return load_policy(folder, "cpu")[0]
 
     def play(name: str, agent: Any, shots: int) -> None:
-        found[name] = success(meta_evaluate(agent, world, shots, rollouts=1, episodes_per_task=1, tasks=tasks))
-        print(f"{name}: {', '.join(f'{100 * share:.0f} %' for share in found[name])}", flush=True)
+        found[name] = success(
+            meta_evaluate(agent, world, shots, rollouts=1, episodes_per_task=1, tasks=tasks, max_adapt_steps=longest)
+        )
+        for each, shares in found[name].items():
+            print(f"{name}, {each}: {', '.join(f'{100 * share:.0f} %' for share in shares)}", flush=True)
 
-    play("learned model of rewards", agent(), shots)
     inferring = agent()
     inferring.policy.actor.candidates = spread(_CANDIDATES, hidden.values().shape[1])
     inferring.policy.memory = _CANDIDATES
     inferring.policy.evidence = _Known(hidden, inferring.policy.actor.candidates).evidence
-    play("known rewards", inferring, shots)
+    play("the same, known rewards", inferring, shots)
     seeing = agent()
     seeing.policy.believed = lambda state: hidden.values()
-    play("shown the goal", seeing, 0)
+    play("the same, shown the goal", seeing, 0)
     play("script that is shown the goal", Scripted(world), 0)
     if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(found, indent=2) + "\n")
 
 
-def success(evaluation: MetaEvaluation) -> list[float]:
-    """Mean success over classes before and after each shot."""
-    return [float(each.to_json()["aggregate"]["success"]["mean"]) for each in evaluation.by_shot]
+def success(evaluation: MetaEvaluation) -> dict[str, list[float]]:
+    """Of each class before and after each shot."""
+    return {name: [each.classes[name].success for each in evaluation.by_shot] for name in evaluation.before.classes}
 
 
 class _Known:

@@ -25,9 +25,11 @@ def run_card(folder: RunFolder, name: str) -> str:
     if not classes:
         del header["model-index"]
     facts = {
-        "suite or class": subject, "algorithm": config.algo, "seed": config.seed,
-        "steps": f"{folder.checkpoints.newest_step() or 0:,}", **_made(versions),
+        "suite or class": subject, "algorithm": config.algo, "preset": config.preset, "all settings": "config.json",
+        "seed": config.seed, "steps": f"{folder.checkpoints.newest_step() or 0:,}", **_made(versions),
     }  # fmt: skip
+    if classes:
+        facts["evaluated on"] = f"{max(row['episodes'] for row in classes.values())} episodes of a class"
     title = f"{config.algo} on {subject}, seed {config.seed}"
     plays = f"bidex-meta pull {name} --out policy\nbidex-meta evaluate policy"
     return _card(header, title, plays, facts) + _table(classes)

@@ -10,6 +10,7 @@ from tests.pages import ROOT
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill
+from tools.pages.gained import shots_table
 from tools.pages.studies import read_studies
 
 no_weights = test_collect.no_weights
@@ -23,9 +24,16 @@ def test_pages_of_the_repository_are_as_its_data_say() -> None:
 
 
 def test_every_file_of_data_is_read_and_small() -> None:
-    files = sorted((ROOT / "results" / "data").rglob("*.json"))
+    files = sorted((ROOT / "results" / "data").glob("*/*.json"))
     shown = {run.path for folder in {file.parent for file in files} for s in read_studies(folder.parent, folder.name) for run in s.runs}  # fmt: skip  # noqa: E501
     assert shown == set(files) and all(file.stat().st_size < 40_000 for file in files)
+
+
+def test_lines_of_a_ladder_stand_below_the_arms() -> None:
+    (study,) = read_studies(ROOT / "results" / "data", "ml1-v2")
+    head, _, *rows = shots_table(study)
+    assert head.endswith("| before | after 1 | after 2 |") and rows[0].startswith("| CatchUnderarm | icl | 3 |")
+    assert rows[-1].startswith("| CatchUnderarm | script that is shown the goal | 1 | – | 72 % |")
 
 
 @pytest.fixture

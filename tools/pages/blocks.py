@@ -19,7 +19,7 @@ from PIL import Image
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
-from tools.pages.gained import gains_table, shots_table
+from tools.pages.gained import gains_table, shots_figure, shots_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
@@ -38,6 +38,7 @@ _TABLES = {
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "points": (points_figure, "Success and score, 95 % intervals over seeds"),
+    "shot-curves": (shots_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
 _DIGEST = "Description"

@@ -8,7 +8,9 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate
+from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun
+from bidex_meta.utils.files import read_json
 from tools.pages.studies import Study
 from tools.pages.tables import mean_and_range, table
 
@@ -53,26 +55,57 @@ def gains_table(study: Study) -> Iterator[str]:
 
 
 def shots_table(study: Study) -> Iterator[str]:
-    """One row per class and arm: success after each shot, mean over seeds (least to most).
+    """One row per class and arm, and per line of a ladder: success after each shot, mean over seeds (least to most).
 
     Args:
         study: Runs with a meta-test; the test split if the study names none.
     """
-    split, found = study.split or "test", dict[tuple[str, str], list[list[float]]]()
-    steps: dict[str, list[int]] = {}
+    found, steps = _by_shot(study), dict[str, list[int]]()
     for run in study.runs:
         steps.setdefault(run.arm, []).append(run.content["steps"])
-        by_shot = run.evaluation()["splits"][split]["by_shot"]
-        for name in by_shot[0]["classes"]:
-            shares = [shot["classes"][name]["success"] for shot in by_shot]
-            found.setdefault((name, run.arm), []).append(shares)
     most = max(len(shares[0]) for shares in found.values())
     rows = []
     for (name, arm), seeds in found.items():
         shown = [mean_and_range(100.0 * np.array(each), unit=" %") for each in zip(*seeds, strict=True)]
         shown += [""] * (most - len(shown))
-        rows.append([name, arm, str(len(seeds)), f"{int(np.mean(steps[arm])):,}", *shown])
+        made = f"{int(np.mean(steps[arm])):,}" if arm in steps else "–"
+        rows.append([name, arm, str(len(seeds)), made, *shown])
     return table(["class", "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most))], rows)
+
+
+def shots_figure(study: Study) -> Any:
+    """Success against exploring episodes: a panel a class, a line an arm; what knows the goal is the same throughout.
+
+    Args:
+        study: As of ``shots_table``.
+    """
+    found, panels = _by_shot(study), dict[str, list[plots.Group]]()
+    most = max(len(shares[0]) for shares in found.values())
+    for (name, arm), seeds in found.items():
+        shares = np.array([each * most if len(each) == 1 else each for each in seeds])
+        several = len(shares) > 1
+        low, high = (shares.min(0), shares.max(0)) if several else (None, None)
+        curve = plots.Curve(np.arange(shares.shape[1]), shares.mean(0), low, high)
+        panels.setdefault(name, []).append((arm, {"success": curve}))
+    figure = plots.draw_panels(panels, "success", "success", (1.0, "exploring episodes"))
+    for axis in figure.axes:
+        axis.set_xticks(range(most))
+    return figure
+
+
+def _by_shot(study: Study) -> dict[tuple[str, str], list[list[float]]]:
+    """Success before and after each shot, by class and arm, of each seed; lines of ``ladder/`` beside the runs last."""
+    split, found = study.split or "test", dict[tuple[str, str], list[list[float]]]()
+    for run in study.runs:
+        by_shot = run.evaluation()["splits"][split]["by_shot"]
+        for name in by_shot[0]["classes"]:
+            shares = [shot["classes"][name]["success"] for shot in by_shot]
+            found.setdefault((name, run.arm), []).append(shares)
+    for path in sorted((study.runs[0].path.parent / "ladder").glob("*.json")):
+        for line, classes in read_json(path, "a ladder").items():
+            for name, shares in classes.items():
+                found.setdefault((name, line), []).append(shares)
+    return dict(sorted(found.items(), key=lambda item: item[0][0]))  # a class's rows together, in the order they came
 
 
 def _gain(part: dict[str, Any], name: str) -> Estimate:
