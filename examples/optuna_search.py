@@ -30,7 +30,7 @@ def main(
         steps: Environment steps of each run.
         trials: Runs to make.
         seed: Of the search; runs have seed 0.
-        out: Where the runs go.
+        out: Where the runs and the study go.
     """
 
     def success(trial: optuna.Trial) -> float:
@@ -46,10 +46,11 @@ def main(
             raise optuna.TrialPruned  # what was wrong is printed
         return RunFolder(folder).evaluation()["policy"]["aggregate"]["success"]["mean"]
 
+    out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         direction="maximize",
         study_name=f"{suite} {algo} {steps}",
-        storage="sqlite:///optuna.db",
+        storage=f"sqlite:///{out / 'optuna.db'}",
         sampler=optuna.samplers.TPESampler(seed=seed),
         load_if_exists=True,
     )
