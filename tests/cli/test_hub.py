@@ -41,9 +41,10 @@ def test_a_card_is_made_from_the_run_and_read_by_the_hub(shown, tmp_path: Path) 
 
 
 def test_without_a_network_the_cache_of_the_hub_serves(shown, refused, tmp_path: Path, monkeypatch) -> None:
-    hub = pytest.importorskip("huggingface_hub", reason="needs the extra hub")
-    monkeypatch.setattr(hub.constants, "HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    # The package loads its modules on demand: its `constants` is no attribute before somebody has imported it.
+    constants = pytest.importorskip("huggingface_hub.constants", reason="needs the extra hub")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     said = refused("pull", "me/hand-over")
     assert "LocalEntryNotFoundError" in said and "folder:PATH" in said
