@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bidex_meta.cli import main
@@ -12,6 +13,7 @@ from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill
 from tools.pages.gained import shots_table
 from tools.pages.studies import read_studies
+from tools.pages.tables import arms_table, classes_table
 
 no_weights = test_collect.no_weights
 
@@ -34,6 +36,20 @@ def test_lines_of_a_ladder_stand_below_the_arms() -> None:
     head, _, *rows = shots_table(study)
     assert head.endswith("| before | after 1 | after 2 |") and rows[0].startswith("| CatchUnderarm | icl | 3 |")
     assert rows[-1].startswith("| CatchUnderarm | script that is shown the goal | 1 | – | 72 % |")
+
+
+def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:
+    (study,) = read_studies(ROOT / "results" / "data", "mt20-dagger")
+    found = [run.evaluation() for run in study.runs]
+    of_others = [each["other_tasks"]["policy"]["classes"] for each in found]
+    head, _, *rows = map(cells, classes_table(study))
+    assert head == ["class", "success", "other tasks", "return", "score"] and rows[-1][0] == "mean"
+    (row,) = [row for row in rows if row[0] == "HandOver"]
+    assert row[2].startswith(f"{100 * np.mean([each['HandOver']['success'] for each in of_others]):.1f} %")
+    mean = np.mean([row["success"] for each in of_others for row in each.values()])
+    head, _, arm, *_ = map(cells, arms_table(study))
+    assert arm[head.index("other tasks, mean")].startswith(f"{100 * mean:.1f} %")
+    assert rows[-1][2].startswith(f"{100 * mean:.1f} %")
 
 
 @pytest.fixture

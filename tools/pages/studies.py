@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, estimates, group_of, iqm
@@ -31,6 +33,13 @@ class Arm:
     def success(self) -> Estimate:
         """Interquartile mean over seeds and classes."""
         return iqm(self.group.success)
+
+    @cached_property
+    def others(self) -> np.ndarray | None:
+        """Success on other tasks of its classes (seeds, classes), as ``group.success``; None if a run has not any."""
+        rows = [run.evaluation().get("other_tasks", {}).get("policy", {}).get("classes", {}) for run in self.runs]
+        by_seed = [[row.get(name, {}).get("success") for name in self.group.classes] for row in rows]
+        return None if any(None in row for row in by_seed) else np.array(by_seed)
 
     @property
     def parameters(self) -> int | None:

@@ -13,6 +13,8 @@ from tools.pages.studies import Study
 
 _FEW = 4
 """The table of arms shows returns per class for at most this many classes."""
+_MANY = 10
+"""More classes than these are rows of the table of classes."""
 _PLAYED: dict[Kind, str] = {
     "random": "uniform actions",
     "zero": "zero actions",
@@ -53,16 +55,20 @@ def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
 
 
 def arms_table(study: Study) -> Iterator[str]:
-    """One row per arm, then one for uniform actions."""
+    """One row per arm, then one for uniform actions. Means over classes where arms have played other tasks too."""
     classes = study.classes if len(study.classes) <= _FEW else []
-    head = ["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"]
+    means_only = any(arm.others is not None for arm in study.arms)
+    measures = ["success, mean", "other tasks, mean"] if means_only else ["success, IQM", "score, IQM"]
+    head = ["arm", "seeds", "steps", *measures, *classes, "parameters", "hours"]
     rows = []
     for arm in study.arms:
         group, scores = arm.group, arm.group.scores
         means = dict(zip(group.classes, group.returns.mean(axis=0), strict=True))
+        measured = [_over_seeds(group.success), _over_seeds(arm.others)]
+        if not means_only:
+            measured = [arm.success.text(100.0, " %"), "–" if scores is None else iqm(scores).text()]
         rows.append([
-            group.label, str(len(group.seeds)), group.steps_text(),
-            arm.success.text(100.0, " %"), "–" if scores is None else iqm(scores).text(),
+            group.label, str(len(group.seeds)), group.steps_text(), *measured,
             *(f"{means[name]:.4g}" if name in means else "–" for name in classes),
             "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}",
         ])  # fmt: skip
@@ -74,8 +80,15 @@ def arms_table(study: Study) -> Iterator[str]:
     return table(head, rows)
 
 
+def _over_seeds(success: np.ndarray | None) -> str:
+    """Success (seeds, classes) as the mean over all and its range over seeds."""
+    return "–" if success is None else mean_and_range(100.0 * success.mean(axis=1), ".1f", " %")
+
+
 def classes_table(study: Study) -> Iterator[str]:
-    """Success and return per class: mean over seeds (least to most)."""
+    """Success and return per class: mean over seeds (least to most). Many classes are rows, few are columns."""
+    if len(study.classes) > _MANY:
+        return _classes_as_rows(study)
 
     def cells(group: Group, values: np.ndarray, unit: str = "") -> list[str]:
         by_class = dict(zip(group.classes, values.T, strict=True))
@@ -86,6 +99,24 @@ def classes_table(study: Study) -> Iterator[str]:
         rows.append([group.label, "success", *cells(group, 100.0 * group.success, " %")])
         rows.append([group.label, "return", *cells(group, group.returns)])
     return table(["arm", "", *study.classes], rows)
+
+
+def _classes_as_rows(study: Study) -> Iterator[str]:
+    """One row per class, then their mean; of each arm success on its tasks and on others, return and score."""
+    columns: dict[str, list[str]] = {"class": [*study.classes, "mean"]}
+    for arm in study.arms:
+        group, before = arm.group, f"{arm.group.label}: " if len(study.arms) > 1 else ""
+        measured = {"success": (group.success, 100.0, " %"), "other tasks": (arm.others, 100.0, " %")}
+        measured |= {"return": (group.returns, 1.0, ""), "score": (group.scores, 1.0, "")}
+        for title, (values, factor, unit) in measured.items():
+            if values is None:
+                continue
+            form = ".4g" if title == "return" else ".1f" if unit else ".0f"
+            by_class = dict(zip(group.classes, factor * values.T, strict=True))
+            cells = [mean_and_range(by_class[name], form, unit) if name in by_class else "–" for name in study.classes]
+            mean = "" if title == "return" else mean_and_range(factor * values.mean(axis=1), form, unit)
+            columns[before + title] = [*cells, mean]
+    return table([*columns], [*zip(*columns.values(), strict=True)])
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
