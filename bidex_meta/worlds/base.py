@@ -53,7 +53,7 @@ Identity = dict[str, str | int | None]
 class Worlds(ABC):
     """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
-    hides_goals: bool = False  # whether it is a meta suite, whose goals have to be found out
+    hides_goals: bool = False  # whether it is a meta suite that does not show its goals
     suite: Suite | None = None
     class_name: str | None = None  # the class, where it is a single one
     object: str | None = None

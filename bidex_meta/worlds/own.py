@@ -25,7 +25,7 @@ class OwnSuite(Worlds):
         super().__init__(name, config)
         suite = load_suite(name)
         self.suite = replace(suite, points=self.points) if self.points else suite
-        self.hides_goals = self.suite.kind == "meta"
+        self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
 
     @cached_property
     def benchmark(self):

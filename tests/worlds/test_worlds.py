@@ -71,6 +71,13 @@ def test_defaults_follow_the_source() -> None:
     assert foreign.rows_and_steps("cpu", adapts=False) == (40, 20_000_000)
 
 
+def test_a_meta_suite_may_show_its_goals(tmp_path: Path) -> None:
+    file = tmp_path / "shown.toml"
+    file.write_text((paths.suites_dir() / "ML4.toml").read_text().replace('"masked"', '"plain"'))
+    shown = Worlds.open({"suite": str(file), "threads": 1})
+    assert not shown.hides_goals and shown.splits == ["train", "test"]
+
+
 def test_references_are_of_moving_bases() -> None:
     assert Worlds.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
     for config in ({"task": "HandOver"}, {"suite": "metaworld/MT3"}, {"task": "gymnasium/Humanoid-v5"}):
