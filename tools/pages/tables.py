@@ -76,7 +76,8 @@ def arms_table(study: Study) -> Iterator[str]:
     if random.keys() == set(study.classes):
         success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
         returns = [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
-        rows.append(["uniform actions", "", "", f"{100 * iqm(success).value:.1f} %", "–", *returns, "", ""])
+        value = success.mean() if means_only else iqm(success).value
+        rows.append(["uniform actions", "", "", f"{100 * value:.1f} %", "–", *returns, "", ""])
     return table(head, rows)
 
 
