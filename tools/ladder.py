@@ -81,10 +81,11 @@ class _Known:
     def __init__(self, hidden: HiddenParts, candidates: Tensor):
         self._hidden, self._candidates = hidden, candidates
 
-    def evidence(self, obs: Tensor, reward: Tensor) -> Tensor:
+    def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
         """As of ``BeliefPolicy``; of the step that the world has just made."""
         paid = [self._hidden.rewards(goal.expand(len(obs), -1)) for goal in self._candidates]
-        return -0.5 * ((reward[:, None] - torch.stack(paid, dim=1)) / _EXACT).square()
+        off = (reward[:, None] - torch.stack(paid, dim=1)) / _EXACT
+        return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
 
 
 if __name__ == "__main__":

@@ -96,7 +96,8 @@ class ICL(TrialLearner):
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                seen, config.hidden, config.candidates, config.head, goals, shape.actions, init, config.activation
+                seen, config.hidden, config.candidates, config.head, goals, shape.actions, init, config.activation,
+                shape.classes
             )  # fmt: skip
 
         return BeliefPolicy(
@@ -166,22 +167,27 @@ class ICL(TrialLearner):
 
     def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
         losses = [self._descend(data) for _ in range(self.config.updates_per_iteration)]
-        imitation, _, reward = torch.stack(losses).mean(0)
+        imitation, _, reward, unlike = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
-        return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), **found}
+        return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), "Loss/class": unlike.mean(), **found}
 
     def _descend(self, data: TaughtTrials) -> Tensor:
-        """A step down the mean of the classes' losses; they and the model's squared errors, of all processes (3, K)."""
+        """A step down the mean of the classes' losses, of all processes (4, K).
+
+        Of the actor, the model (and its squared errors), the network that tells classes apart.
+        """
         trial, row, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
-        losses = torch.stack([self._imitation(steps, task), *self._model(steps)]) / world_size()
+        terms = self._imitation(steps, task), *self._model(steps, task), self._unlike(steps, task)
+        losses = torch.stack(terms) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())
         self.adam.zero_grad()
-        losses[:2].mean(1).sum().backward()
+        losses[[0, 1, 3]].mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach().flatten()).view_as(losses)
-        for part in (actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])):  # of one loss each
+        parts = [actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])]  # of one loss each
+        for part in [*parts, actor.which] if actor.classes > 1 else parts:
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
         return losses
@@ -197,21 +203,30 @@ class ICL(TrialLearner):
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
         """Squared errors of actions in units of their deviation in the class (1: no better than a constant), (K,)."""
-        actions = self.policy.actor.act(self.policy.observations(steps.obs), self.policy.goals(steps.goals[:, 0]))
+        policy = self.policy
+        actions = policy.actor.act(policy.observations(steps.obs), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
         return self._of_class(off.square().mean(1))
 
-    def _model(self, steps: Steps) -> tuple[Tensor, Tensor]:
+    def _model(self, steps: Steps, task: Tensor) -> tuple[Tensor, Tensor]:
         """Minus the log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
 
         The former is weighted by the deviation (Seitzer et al. 2022, arXiv 2203.09168): else a model that is unsure
         somewhere learns nothing there.
         """
         policy, paid = self.policy, steps.paid[:, None].float()
-        mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals))
+        mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals), task)
         off = (mean - policy.earned(steps.rewards)).square()
         unlikely = (0.5 * off * torch.exp(-2.0 * log_std) + log_std) * log_std.detach().exp()
         return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))
+
+    def _unlike(self, steps: Steps, task: Tensor) -> Tensor:
+        """Cross-entropy of the classes that observations look like, (K,)."""
+        actor = self.policy.actor
+        if actor.classes == 1:
+            return torch.zeros(len(self.tasks), device=self.device)
+        logits = actor.which(self.policy.observations(steps.obs))
+        return self._of_class(nn.functional.cross_entropy(logits, task, reduction="none"))
 
     def _of_class(self, values: Tensor) -> Tensor:
         return values.view(len(self.tasks), -1).mean(1)

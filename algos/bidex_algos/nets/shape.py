@@ -17,13 +17,17 @@ class Shape:
     groups: tuple[ObservationGroup, ...]
     hidden: int = 0
     """Numbers of a task that the world knows and does not show: those of goals in a meta suite."""
+    classes: int = 1
+    """Classes that the observation does not name; 1 where it has the task's one-hot."""
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
         """That of a world."""
         observations, actions = world.single_observation_space, world.single_action_space
         hidden = int(getattr(world, "hidden_size", 0))
-        return cls(int(observations.shape[0]), int(actions.shape[0]), tuple(world.observation_groups), hidden)
+        groups = tuple(world.observation_groups)
+        classes = 1 if any(group.name == "task_id" for group in groups) else world.num_tasks
+        return cls(int(observations.shape[0]), int(actions.shape[0]), groups, hidden, classes)
 
     @classmethod
     def plain(cls, observations: int, actions: int, num_id_columns: int = 0) -> "Shape":
@@ -42,7 +46,8 @@ class Shape:
     def state_dict(self) -> State:
         """Plain values for a checkpoint."""
         hidden = {"hidden": self.hidden} if self.hidden else {}
-        return self.sizes() | hidden | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
+        classes = {"classes": self.classes} if self.classes > 1 else {}
+        return self.sizes() | hidden | classes | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
 
     @classmethod
     def load(cls, state: State) -> "Shape":
@@ -51,7 +56,7 @@ class Shape:
             return cls.plain(**state)
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
         named = tuple(ObservationGroup(*group) for group in groups)
-        return cls(state["observations"], state["actions"], named, state.get("hidden", 0))
+        return cls(state["observations"], state["actions"], named, state.get("hidden", 0), state.get("classes", 1))
 
 
 _OF_SEVERAL = ("task_embedding", "normalise_per_task")
