@@ -9,6 +9,8 @@ from torch import Tensor
 from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trials import Trials
+from bidex_algos.nets.evidence import BeliefNet
+from bidex_algos.nets.inputs import Inputs
 from bidex_meta.errors import BidexError
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
@@ -110,7 +112,7 @@ def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
         TaughtTrials(Trials(2, torch.tensor([2, 3, 3]), 1, 1, None), 2, 2, 1).load_state_dict(data.state_dict())
 
 
-def test_belief_is_bayes_rule_over_candidates() -> None:
+def test_belief_is_bayes_rule_over_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = ICL(PointGoals(2), SMALL, seed=0).policy
     candidates = policy.actor.candidates
     assert candidates.abs().max() <= 1.0 and torch.cdist(candidates, candidates).fill_diagonal_(9.0).min() > 0.1
@@ -123,10 +125,31 @@ def test_belief_is_bayes_rule_over_candidates() -> None:
     for step, paid in zip(obs, reward, strict=True):
         memory.known, memory.reward = torch.tensor([True, False]), paid
         _, memory.state = policy.step(step, memory)
-    likely = sum(policy.evidence(*each)[0] for each in zip(obs, reward, strict=True))
-    assert torch.allclose(memory.state[0], torch.as_tensor(likely), atol=1e-5) and not memory.state[1].any()
+    likely = sum(policy.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
+    assert isinstance(likely, Tensor) and torch.allclose(memory.state, likely, atol=1e-5) and not likely[1].any()
+    monkeypatch.setattr("bidex_meta.utils.maths.may_look", lambda device: False)  # as on a GPU
+    again = sum(policy.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
+    assert isinstance(again, Tensor) and torch.allclose(again, likely, atol=1e-5)
     memory.done = memory.known  # what the last step of an episode led to was not seen
     assert torch.equal(policy.step(obs[0], memory)[1], memory.state)
+
+
+def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    net = BeliefNet(Inputs.of(3), (8,), 4, (6, 5), 2, 2, torch.Generator().manual_seed(0), classes=3)
+    seen, goals, task = torch.randn(4, 3), torch.randn(4, 5, 2), torch.tensor([2, 0, 2, 1])
+    for row, of in enumerate(task.tolist()):
+        weight, bias = net.goal.weight[8 * of : 8 * (of + 1)], net.goal.bias[8 * of : 8 * (of + 1)]
+        both = torch.nn.functional.elu(net.encoder(seen[row : row + 1]) + goals[row] @ weight.T + bias)
+        assert torch.allclose(net.pays(seen, goals, task)[0][row], net.paid(both)[:, 0], atol=1e-6)
+    actions = net.act(seen, goals[:, 0], task)
+    actions[task == 2].sum().backward()
+    assert [bool(part.any()) for part in net.head.own[0].weight.grad] == [False, False, True]
+    monkeypatch.setattr("bidex_meta.utils.maths.may_look", lambda device: False)  # as on a GPU
+    assert torch.allclose(net.act(seen, goals[:, 0], task), actions, atol=1e-6)
+
+    shown = PointGoals(8, classes=(PointClass("Short", steps=3, count=4), PointClass("Long", steps=3, count=4)))
+    learner = taught(shown)
+    assert learner.shape.classes == 2 and 0.6 < learner.iterate()["Loss/class"] < 0.8  # log 2: they look alike
 
 
 def test_it_learns_from_nobody_until_it_has_teachers() -> None:

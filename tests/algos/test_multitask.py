@@ -102,9 +102,11 @@ def test_soft_routes_sum_to_one_and_follow_the_paper(hidden: tuple[int, ...]):
     assert_close(network.head(given[0]), network(x)[row])
 
 
-@pytest.mark.parametrize("name", ["towers", "separate"])
-def test_a_tower_reads_and_learns_its_own_task_alone(name: str, monkeypatch: pytest.MonkeyPatch):
-    network, x = made(name, (16, 12)), observations()
+@pytest.mark.parametrize(("name", "hidden"), [("towers", (16,)), ("towers", (16, 12)), ("separate", (16, 12))])
+def test_a_tower_reads_and_learns_its_own_task_alone(
+    name: str, hidden: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+):
+    network, x = made(name, hidden), observations()
     state = x[:, [0, 1, 2, 6, 7, 8]]
     for layer in network.common:
         state = torch.nn.functional.elu(layer(state))

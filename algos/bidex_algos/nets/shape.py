@@ -47,7 +47,8 @@ class Shape:
         """Plain values for a checkpoint."""
         hidden = {"hidden": self.hidden} if self.hidden else {}
         classes = {"classes": self.classes} if self.classes > 1 else {}
-        return self.sizes() | hidden | classes | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
+        groups = {group.name: [[where.start, where.stop] for where in group.where] for group in self.groups}
+        return self.sizes() | hidden | classes | {"groups": groups}
 
     @classmethod
     def load(cls, state: State) -> "Shape":
