@@ -83,8 +83,8 @@ class _Known:
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
         """As of ``BeliefPolicy``; of the step that the world has just made."""
-        paid = [self._hidden.rewards(goal.expand(len(obs), -1)) for goal in self._candidates]
-        off = (reward[:, None] - torch.stack(paid, dim=1)) / _EXACT
+        paid = self._hidden.rewards(self._candidates[:, None].expand(-1, len(obs), -1))
+        off = (reward[:, None] - paid.T) / _EXACT
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
 
 

@@ -40,31 +40,36 @@ class HiddenParts:
         world = self._world
         values = torch.zeros(world.num_envs, world.hidden_size, device=world.device)
         for slot, rows in zip(world.slots, world.slot_rows, strict=True):
-            columns, (middle, half) = self.variations[slot.name], self._range(slot.name)
+            columns, (middle, half) = self.variations[slot.name], self._ranges[slot.name]
             scaled = (torch.as_tensor(slot.tasks[:, columns]).to(world.device) - middle) / half
             values[rows, : len(columns)] = scaled.float()[world.task_index[rows]]
         return values
 
     def rewards(self, values: Tensor) -> Tensor:
-        """What the step just made would have paid had the tasks hidden other values (N, n): (N,)."""
-        world = self._world
-        rewards = torch.zeros(world.num_envs, device=world.device)
+        """What the step just made would have paid had the tasks hidden other values (..., N, n): (..., N)."""
+        world, given = self._world, values.reshape(-1, *values.shape[-2:])
+        rewards = torch.zeros(given.shape[:2], device=world.device)
         for part in world.parts:
             sensors = part.group.engine.sensordata
             for member in part.group.members:
                 slot, rows = world.slots[member.slot], member.world_rows
-                columns, (middle, half) = self.variations[slot.name], self._range(slot.name)
-                tasks = torch.as_tensor(slot.tasks).to(sensors)[world.task_index[rows]]
-                tasks[:, columns] = values[rows, : len(columns)].to(sensors) * half.to(sensors) + middle.to(sensors)
-                task = member.scene.task
-                state = TaskState(sensors[member.engine_rows], member.scene.sensors, task.freeze(tasks))
-                rewards[rows] = (judge(task, state).reward * slot.reward_scale).float()
-        return rewards
+                columns, (middle, half) = self.variations[slot.name], self._ranges[slot.name]
+                tasks = torch.as_tensor(slot.tasks).to(sensors)[world.task_index[rows]].repeat(len(given), 1)
+                hidden = given[:, rows, : len(columns)].flatten(0, 1)
+                tasks[:, columns] = hidden.to(sensors) * half.to(sensors) + middle.to(sensors)
+                task, felt = member.scene.task, sensors[member.engine_rows].repeat(len(given), 1)
+                state = TaskState(felt, member.scene.sensors, task.freeze(tasks))
+                paid = judge(task, state).reward * slot.reward_scale
+                rewards[:, rows] = paid.float().unflatten(0, (len(given), -1))
+        return rewards.view(values.shape[:-1])
 
-    def _range(self, name: str) -> tuple[Tensor, Tensor]:
-        """Middle and half width of the hidden values of a slot, (n,) each, float64."""
-        (slot,) = (each for each in self._world.slots if each.name == name)
-        space, device = slot.task_class.variation_space, self._world.device
-        ends = (torch.tensor(end, dtype=torch.float64, device=device) for end in (space.low, space.high))
-        low, high = (end[self.variations[name]] for end in ends)
-        return 0.5 * (high + low), 0.5 * (high - low)
+    @cached_property
+    def _ranges(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Of each slot: middle and half width of its hidden values, (n,) each, float64."""
+        found = {}
+        for slot in self._world.slots:
+            space, columns = slot.task_class.variation_space, self.variations[slot.name]
+            ends = (torch.tensor(end, dtype=torch.float64, device=self._world.device) for end in (space.low, space.high))
+            low, high = (end[columns] for end in ends)
+            found[slot.name] = 0.5 * (high + low), 0.5 * (high - low)
+        return found

@@ -36,7 +36,7 @@ class Knowing:
     values = entries
 
     def rewards(self, values: Tensor) -> Tensor:
-        return -(self.world.position - values).norm(dim=1)
+        return -(self.world.position - values).norm(dim=-1)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         return self.world.best(obs)

@@ -287,8 +287,8 @@ class _Pupil:
         data.rewards[slot, self._rows] = reward[:, None]
         if hidden is None:
             return
-        for i in range(1, data.goals.shape[1]):
-            data.rewards[slot, self._rows, i] = hidden.rewards(data.goals[:, i]).masked_fill(~valid, 0.0)
+        others = hidden.rewards(data.goals[:, 1:].transpose(0, 1))
+        data.rewards[slot, self._rows, 1:] = others.masked_fill(~valid, 0.0).T
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Of the teachers or the policy; keeps what the teachers would do."""
