@@ -75,8 +75,9 @@ def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
     parts = HiddenParts(one)
     one.reset(seed=0)
     mirrored, own = -parts.values(), one.step(action)[1]
-    torch.testing.assert_close(parts.rewards(parts.values()), own, rtol=0, atol=1e-5)
-    earned = parts.rewards(mirrored)
+    again, earned = parts.rewards(torch.stack([parts.values(), mirrored]))
+    torch.testing.assert_close(again, own, rtol=0, atol=1e-5)
+    assert torch.equal(parts.rewards(mirrored), earned)
     pools = {}
     for each in one.slots:
         space, columns = each.task_class.variation_space, parts.variations[each.name]
