@@ -69,7 +69,9 @@ class HiddenParts:
         found = {}
         for slot in self._world.slots:
             space, columns = slot.task_class.variation_space, self.variations[slot.name]
-            ends = (torch.tensor(end, dtype=torch.float64, device=self._world.device) for end in (space.low, space.high))
+            ends = (
+                torch.tensor(end, dtype=torch.float64, device=self._world.device) for end in (space.low, space.high)
+            )
             low, high = (end[columns] for end in ends)
             found[slot.name] = 0.5 * (high + low), 0.5 * (high - low)
         return found
