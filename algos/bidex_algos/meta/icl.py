@@ -167,7 +167,7 @@ class ICL(TrialLearner):
 
     def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
         losses = [self._descend(data) for _ in range(self.config.updates_per_iteration)]
-        imitation, _, reward, unlike = torch.stack(losses).mean(0)
+        imitation, _, unlike, reward = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
         return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), "Loss/class": unlike.mean(), **found}
@@ -175,16 +175,17 @@ class ICL(TrialLearner):
     def _descend(self, data: TaughtTrials) -> Tensor:
         """A step down the mean of the classes' losses, of all processes (4, K).
 
-        Of the actor, the model (and its squared errors), the network that tells classes apart.
+        Of the actor, the model and the network that tells classes apart; last the model's squared errors.
         """
         trial, row, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
-        terms = self._imitation(steps, task), *self._model(steps, task), self._unlike(steps, task)
+        unlikely, errors = self._model(steps, task)
+        terms = self._imitation(steps, task), unlikely, self._unlike(steps, task), errors
         losses = torch.stack(terms) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())
         self.adam.zero_grad()
-        losses[[0, 1, 3]].mean(1).sum().backward()
+        losses[:3].mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach().flatten()).view_as(losses)
         parts = [actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])]  # of one loss each
         for part in [*parts, actor.which] if actor.classes > 1 else parts:
