@@ -163,7 +163,7 @@ class Learner(Contract):
         return policy
 
     def start_from(self, policy: State) -> None:
-        """Takes network and statistics of another learner's policy; refuses what would not mean the same here."""
+        """Takes network and statistics of another learner's policy, and keeps these; refuses what has another form."""
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
@@ -178,6 +178,7 @@ class Learner(Contract):
             # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
+        self.policy.observations.keep()
 
     def state_dict(self) -> State:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""

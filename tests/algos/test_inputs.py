@@ -83,6 +83,20 @@ def test_heads_and_statistics_find_the_task_id_in_the_middle() -> None:
     assert_close(normaliser.stats.mean.float(), x[:, rest].mean(0))
 
 
+def test_kept_statistics_stay_but_where_a_column_has_not_varied() -> None:
+    normaliser, obs = ObservationNormaliser(2), torch.randn(50, 2, generator=generator())
+    obs[:, 1] = 0.5
+    normaliser.update(obs)
+    normaliser.keep()
+    again = ObservationNormaliser(2)
+    again.load_state_dict(normaliser.state_dict())  # a resumed run keeps them too
+    before = normaliser(obs)[:, 0]
+    for each in (normaliser, again):
+        each.update(obs.roll(1, 1) + 1.0)
+        assert torch.equal(each(obs)[:, 0], before)
+        assert each.shift[1] > 0.6 and each.scale[1] < 100
+
+
 @pytest.mark.parametrize(("kind", "config"), [(MTPPO, PPO), (MTTRPO, MTTRPOConfig(hidden=(16, 16))), (MTSAC, SAC)])
 def test_an_embedding_tells_tasks_apart_and_is_learned(kind: Any, config: Any) -> None:
     learner = kind(opposite_bandits(), replace(config, task_embedding=4), seed=0)

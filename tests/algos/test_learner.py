@@ -31,9 +31,10 @@ def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
     learner.start_from(given.policy_state_dict())
     assert torch.equal(learner.eval_action(obs), given.eval_action(obs))
     assert torch.equal(learner.policy.actor.log_std, given.policy.actor.log_std)
-    before = learner.eval_action(obs)
+    before, seen = learner.eval_action(obs), learner.policy.observations.shift.clone()
     learner.iterate()
     assert not torch.equal(learner.eval_action(obs), before)
+    assert torch.equal(learner.policy.observations.shift, seen)  # of the state that its weights were made for
 
 
 def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():

@@ -9,6 +9,9 @@ from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.train.distributed import pool_moments
 from bidex_meta.train.learner import LearnerConfig
 
+_FLOOR = 3e-3  # of a deviation: keeps a column that has been constant so far from blowing up noise a thousandfold
+_FOREVER = 1e18  # observations beside which all that follow count nothing
+
 
 class RunningStats(nn.Module):
     """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element, in float64.
@@ -94,14 +97,18 @@ class ObservationNormaliser(nn.Module):
         self.merge(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64))
 
     @torch.no_grad()
+    def keep(self) -> None:
+        """From here on the statistics of columns that have varied stay: the network's weights were made for them."""
+        self.stats.count[self.stats.var > _FLOOR**2] = _FOREVER
+
+    @torch.no_grad()
     def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         """Takes moments of raw observations, of all processes, into the statistics: (measured columns,) each."""
         if not self.enabled:
             return
         self.stats.merge(*pool_moments(mean, var, count))
         self.measured.write(self.shift, self.stats.mean.float())
-        # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
-        self.measured.write(self.scale, self.stats.std(floor=3e-3).reciprocal().float())
+        self.measured.write(self.scale, self.stats.std(_FLOOR).reciprocal().float())
 
 
 def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:
