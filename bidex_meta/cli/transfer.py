@@ -67,13 +67,13 @@ def main(arguments: Sequence[str]) -> None:
     worlds = Worlds.open(config.to_json())
     classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
     words = shared_words(flags.num_envs, arguments[at + 1 :])
-    plan_run([f"--suite={config.suite}", *words])  # refuses what follows -- before anything is written
+    planned = plan_run([f"--suite={config.suite}", *words]).config  # refuses what follows -- before anything is written
     if any(flags.demonstrations):
         part_files.hdf5()
     check_writable(flags.out / "transfer.json")
     flags.out.mkdir(parents=True, exist_ok=True)
     with RunFolder(flags.out).locked(f"Another transfer works in {flags.out}. Wait for its end, or stop it."):
-        cells = list(_cells(flags, worlds, classes, arms, words))
+        cells = list(_cells(flags, worlds, classes, arms, words, reinforced(flags.steps, planned)))
         left = [cell.run for cell in cells if state_of(cell.run).state != "done"]
         say(f"{len(cells) - len(left)} of {len(cells)} runs are done; {len(cores)} at a time.")
         failed = work(left, cores, say)
@@ -84,10 +84,10 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _cells(
-    flags: TransferFlags, worlds: Worlds, classes: Sequence[str], arms: Sequence[Arm], words: Sequence[str]
-) -> Iterator[Cell]:
+    flags: TransferFlags, worlds: Worlds, classes: Sequence[str], arms: Sequence[Arm], words: Sequence[str],
+    steps: list[str]
+) -> Iterator[Cell]:  # fmt: skip
     """All runs, seeds outermost; writes suite files, and records demonstrations that are not there yet."""
-    steps = reinforced(flags.steps, flags.num_envs) if flags.steps else []
     counts, most = sorted({*flags.demonstrations}), max(flags.demonstrations, default=0)
     for folder in ("suites", "data", "runs"):
         (flags.out / folder).mkdir(exist_ok=True)

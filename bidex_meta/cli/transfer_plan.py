@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.spaces import Box
 
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.run_config import plan_run
 from bidex_meta.cli.run_data import dataset_metadata
 from bidex_meta.cli.sweep_plan import PlannedRun, words_of
 from bidex_meta.cli.tables import say
+from bidex_meta.config import RunConfig
 from bidex_meta.data import Dataset, open_dataset, part_files, writer
 from bidex_meta.data.collect import collect_successes, progress, resumed_writer
 from bidex_meta.errors import BidexError, known_name
@@ -203,10 +203,10 @@ def shared_words(num_envs: int, more: Sequence[str]) -> list[str]:
     return [*_USUAL, *more, f"--algo={_ALGO}", f"--num-envs={num_envs}"]
 
 
-def reinforced(steps: int, num_envs: int) -> list[str]:
-    """Words of a run by reinforcement: PPO that is evaluated a hundred times."""
-    iteration = num_envs * learner_kind(_ALGO).presets[_PRESET].rollout_steps
-    return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"]
+def reinforced(steps: int, planned: RunConfig[Any]) -> list[str]:
+    """Words of a run by reinforcement, which is evaluated a hundred times, or after each iteration; [] for 0 steps."""
+    iteration = planned.num_envs * planned.learner_values["rollout_steps"]
+    return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"] if steps else []
 
 
 def cells_of(
