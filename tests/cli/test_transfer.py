@@ -237,7 +237,7 @@ def test_what_no_demonstration_shows_plays_the_policy_itself(trained: Path, show
     shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2])
     before = weights(trained)
     for name, weight in weights(Path("t/runs/TwoCatchUnderarm-start-0-demonstrations-seed0")).items():
-        assert torch.equal(weight, before[name]), name
+        assert name.endswith("count") or torch.equal(weight, before[name]), name
     assert "reinforcement" not in {path.stem for path in Path("t").glob("*.png")}
 
 
