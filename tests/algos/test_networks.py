@@ -84,6 +84,9 @@ def test_each_task_is_normalised_by_its_own_statistics():
     assert_close(halves(obs), normaliser(obs))
     unseen = torch.tensor([[3.0, -2.0, 0.0, 1.0, 0.0]])
     assert_close(normaliser(unseen), unseen)
+    normaliser.keep()
+    normaliser.update(unseen + torch.tensor([0.0, 5.0, 0.0, 0.0, 0.0]))
+    assert_close(normaliser.shift[1, :2], torch.tensor([3.0, 3.0]))  # what was not seen is learned still
 
 
 @pytest.mark.parametrize("tells", [(), ("_is_amx_tile_supported",), ("_is_avx512_bf16_supported",)])

@@ -99,7 +99,8 @@ class ObservationNormaliser(nn.Module):
     @torch.no_grad()
     def keep(self) -> None:
         """From here on the statistics of columns that have varied stay: the network's weights were made for them."""
-        self.stats.count[self.stats.var > _FLOOR**2] = _FOREVER
+        varied = (self.stats.count > 0) & (self.stats.var > _FLOOR**2)  # variances begin at 1
+        self.stats.count[varied] = _FOREVER
 
     @torch.no_grad()
     def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:

@@ -153,7 +153,6 @@ class Demonstrations:
             loss.backward()
             sum_gradients(weights, loss.detach()[None])
             adam.step()
-        policy.observations.keep()
 
 
 def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
