@@ -38,6 +38,17 @@ def test_lines_of_a_ladder_stand_below_the_arms() -> None:
     assert rows[-1].startswith("| CatchUnderarm | script that is shown the goal | 1 | – | 72 % |")
 
 
+def test_several_studies_share_a_table_with_means_over_classes() -> None:
+    both = [study for name in ("ml1-v2", "ml20-v2") for study in read_studies(ROOT / "results" / "data", name)]
+    head, _, *rows = map(cells, shots_table(*both))
+    (row,) = (row for row in rows if row[:2] == ["ML20-v2", "icl"])
+    classes = [cells(line) for line in shots_table(both[1])][2:]
+    assert head[0] == "suite" and rows[0][:3] == ["ML1-v2", "icl", "3"]
+    assert [percent(cell) for cell in row[4:]] == pytest.approx(
+        np.mean([[percent(cell) for cell in row[4:]] for row in classes], axis=0), abs=6e-4
+    )
+
+
 def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:
     (study,) = read_studies(ROOT / "results" / "data", "mt20-dagger")
     found = [run.evaluation() for run in study.runs]

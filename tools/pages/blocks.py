@@ -23,7 +23,7 @@ from tools.pages.gained import gains_table, shots_figure, shots_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
-from tools.pages.studies import curves_figure, points_figure, read_studies
+from tools.pages.studies import curves_figure, digest_of, points_figure, read_studies
 from tools.pages.validity import validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
@@ -50,6 +50,7 @@ class Block:
     """The options of a block."""
 
     study: str = ""
+    """Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``)."""
     show: str = "table"
     on: str | None = None
     """Only this suite or class."""
@@ -104,28 +105,31 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
         return
     if not block.study:
         raise ValueError("expected the name of a study")
-    studies = read_studies(data, block.study, block.on, block.split)
+    names = block.study.split(",")
+    studies = [study for name in names for study in read_studies(data, name, block.on, block.split)]
     if block.show == "best":
         yield from tables.best_table(studies) if studies else ()
         return
-    several = len(studies) > 1
-    for number, study in enumerate(studies):
+    parts = [[study] for study in studies] if len(names) == 1 else [studies]
+    several = len(parts) > 1
+    for number, part in enumerate(parts):
+        on = ", ".join(study.on for study in part)
         if several:
-            yield from ["", f"**{study.on}**", ""] if number else [f"**{study.on}**", ""]
+            yield from ["", f"**{on}**", ""] if number else [f"**{on}**", ""]
         if block.show in _TABLES:
-            yield from _TABLES[block.show](study)
+            yield from _TABLES[block.show](*part)
             continue
         draw, title = _FIGURES[block.show]
-        parts = [study.name, study.on if several or block.on else None, study.split, block.show]
-        picture = page.parent / f"{'-'.join(filter(None, parts))}.png"
-        if _digest_of(picture) != study.digest:
+        words = [*names, on if several or block.on else None, block.split, block.show]
+        picture, digest = page.parent / f"{'-'.join(filter(None, words))}.png", digest_of(part)
+        if _stored_digest(picture) != digest:
             changed.append(picture)
             if not check:
-                plots.save(draw(study), picture, {_DIGEST: study.digest})
-        yield f"![{title}: {study.name}, {study.on}]({picture.name})"
+                plots.save(draw(*part), picture, {_DIGEST: digest})
+        yield f"![{title}: {', '.join(names)}, {on}]({picture.name})"
 
 
-def _digest_of(picture: Path) -> str | None:
+def _stored_digest(picture: Path) -> str | None:
     """Digest of the data of a picture (its own bytes depend on matplotlib's version)."""
     if not picture.exists():
         return None

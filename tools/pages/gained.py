@@ -1,6 +1,7 @@
 """Meta-tests: success after each shot, and each run's gain beside that of a control without meta-training."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from math import hypot
 from typing import Any
 
@@ -54,35 +55,35 @@ def gains_table(study: Study) -> Iterator[str]:
     return table(_HEAD, rows)
 
 
-def shots_table(study: Study) -> Iterator[str]:
-    """One row per class and arm, and per line of a ladder: success after each shot, mean over seeds (least to most).
+def shots_table(*studies: Study) -> Iterator[str]:
+    """Success after each shot, mean over seeds (least to most): a row per arm, and per line of a ladder.
 
     Args:
-        study: Runs with a meta-test; the test split if the study names none.
+        studies: Runs with a meta-test of ``Study.split`` or of one split alone. One study has rows for each class; of
+            several each has one row per arm, of the mean over its classes.
     """
-    found, steps = _by_shot(study), dict[str, list[int]]()
-    for run in study.runs:
-        steps.setdefault(run.arm, []).append(run.content["steps"])
-    most = max(len(shares[0]) for shares in found.values())
+    found = _by_shot(studies)
+    most = max(len(seeds.shares[0]) for seeds in found.values())
     rows = []
     for (name, arm), seeds in found.items():
-        shown = [mean_and_range(100.0 * np.array(each), unit=" %") for each in zip(*seeds, strict=True)]
+        shown = [mean_and_range(100.0 * np.array(each), unit=" %") for each in zip(*seeds.shares, strict=True)]
         shown += [""] * (most - len(shown))
-        made = f"{int(np.mean(steps[arm])):,}" if arm in steps else "–"
-        rows.append([name, arm, str(len(seeds)), made, *shown])
-    return table(["class", "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most))], rows)
+        made = f"{int(np.mean(seeds.steps)):,}" if seeds.steps else "–"
+        rows.append([name, arm, str(len(seeds.shares)), made, *shown])
+    first = "class" if len(studies) == 1 else "suite"
+    return table([first, "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most))], rows)
 
 
-def shots_figure(study: Study) -> Any:
-    """Success against exploring episodes: a panel a class, a line an arm; what knows the goal is the same throughout.
+def shots_figure(*studies: Study) -> Any:
+    """Success against exploring episodes: a panel a class or suite, a line an arm; who knows the goal has one value.
 
     Args:
-        study: As of ``shots_table``.
+        studies: As of ``shots_table``.
     """
-    found, panels = _by_shot(study), dict[str, list[plots.Group]]()
-    most = max(len(shares[0]) for shares in found.values())
+    found, panels = _by_shot(studies), dict[str, list[plots.Group]]()
+    most = max(len(seeds.shares[0]) for seeds in found.values())
     for (name, arm), seeds in found.items():
-        shares = np.array([each * most if len(each) == 1 else each for each in seeds])
+        shares = np.array([each * most if len(each) == 1 else each for each in seeds.shares])
         several = len(shares) > 1
         low, high = (shares.min(0), shares.max(0)) if several else (None, None)
         curve = plots.Curve(np.arange(shares.shape[1]), shares.mean(0), low, high)
@@ -93,18 +94,40 @@ def shots_figure(study: Study) -> Any:
     return figure
 
 
-def _by_shot(study: Study) -> dict[tuple[str, str], list[list[float]]]:
-    """Success before and after each shot, by class and arm, of each seed; lines of ``ladder/`` beside the runs last."""
-    split, found = study.split or "test", dict[tuple[str, str], list[list[float]]]()
-    for run in study.runs:
-        by_shot = run.evaluation()["splits"][split]["by_shot"]
-        for name in by_shot[0]["classes"]:
-            shares = [shot["classes"][name]["success"] for shot in by_shot]
-            found.setdefault((name, run.arm), []).append(shares)
-    for path in sorted((study.runs[0].path.parent / "ladder").glob("*.json")):
-        for line, classes in read_json(path, "a ladder").items():
-            for name, shares in classes.items():
-                found.setdefault((name, line), []).append(shares)
+@dataclass
+class _Seeds:
+    """What is known of an arm's seeds, or of a ladder's line, on one class or suite."""
+
+    shares: list[list[float]] = field(default_factory=list)
+    """Success before and after each shot."""
+    steps: list[int] = field(default_factory=list)
+
+
+def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
+    """By class, or suite if there are several studies, and arm; lines of ``ladder/`` beside the runs last."""
+    found: dict[tuple[str, str], _Seeds] = {}
+
+    def add(study: Study, arm: str, classes: dict[str, list[float]], steps: Sequence[int] = ()) -> None:
+        mean = {study.on: np.mean(list(classes.values()), axis=0).tolist()}
+        for name, shares in (classes if len(studies) == 1 else mean).items():
+            seeds = found.setdefault((name, arm), _Seeds())
+            seeds.shares.append(shares)
+            seeds.steps += steps
+
+    for study in studies:
+        for run in study.runs:
+            splits = run.evaluation()["splits"]
+            by_shot = splits[study.split or (next(iter(splits)) if len(splits) == 1 else "test")]["by_shot"]
+            names = by_shot[0]["classes"]
+            add(
+                study,
+                run.arm,
+                {name: [shot["classes"][name]["success"] for shot in by_shot] for name in names},
+                [run.content["steps"]],
+            )
+        for path in sorted((study.runs[0].path.parent / "ladder").glob("*.json")):
+            for line, classes in read_json(path, "a ladder").items():
+                add(study, line, classes)
     return dict(sorted(found.items(), key=lambda item: item[0][0]))  # a class's rows together, in the order they came
 
 

@@ -97,11 +97,6 @@ class Study:
         """All classes of its arms."""
         return list(dict.fromkeys(name for arm in self.arms for name in arm.group.classes))
 
-    @property
-    def digest(self) -> str:
-        """Digest of all data that its pictures show."""
-        return hashlib.sha256(b"".join(run.path.read_bytes() for run in self.runs)).hexdigest()
-
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:
     """The studies in ``data/name``: one for each set of classes; none if there are no files.
@@ -132,6 +127,11 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
         by_classes.setdefault(frozenset([str(run.config().task)]), []).append(run)
     found = [Study(name, _subject(members), members, split) for members in by_classes.values()]
     return [study for study in sorted(found, key=lambda study: study.on) if on in (None, study.on)]
+
+
+def digest_of(studies: Sequence[Study]) -> str:
+    """Digest of all data that their pictures show."""
+    return hashlib.sha256(b"".join(run.path.read_bytes() for study in studies for run in study.runs)).hexdigest()
 
 
 def curves_figure(study: Study) -> Any:
