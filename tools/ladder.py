@@ -11,10 +11,10 @@ from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import spread
 from bidex_meta.cli.metatest import OTHERS, adapt_steps_of, others_of
 from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.run_teachers import teachers_of
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.runs import RunFolder
-from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.worlds import Worlds
 
@@ -59,11 +59,11 @@ def ladder(
     inferring.policy.actor.candidates = spread(_CANDIDATES, hidden.values().shape[1])
     inferring.policy.memory = _CANDIDATES
     inferring.policy.evidence = _Known(hidden, inferring.policy.actor.candidates).evidence
-    play("the same, known rewards", inferring, shots)
+    play("icl, known rewards", inferring, shots)
     seeing = agent()
     seeing.policy.believed = lambda state: hidden.values()
-    play("the same, shown the goal", seeing, 0)
-    play("script that is shown the goal", Scripted(world), 0)
+    play("icl, shown the goal", seeing, 0)
+    play("teachers that are shown the goal", teachers_of(folder.config(), worlds, world), 0)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(found, indent=2) + "\n")

@@ -35,7 +35,7 @@ def test_lines_of_a_ladder_stand_below_the_arms() -> None:
     (study,) = read_studies(ROOT / "results" / "data", "ml1-v2")
     head, _, *rows = shots_table(study)
     assert head.endswith("| before | after 1 | after 2 |") and rows[0].startswith("| CatchUnderarm | icl | 3 |")
-    assert rows[-1].startswith("| CatchUnderarm | script that is shown the goal | 1 | – | 72 % |")
+    assert rows[-1].startswith("| CatchUnderarm | teachers that are shown the goal | 1 | – | 72 % |")
 
 
 def test_several_studies_share_a_table_with_means_over_classes() -> None:

@@ -66,7 +66,7 @@ def shots_table(*studies: Study) -> Iterator[str]:
     most = max(len(seeds.shares[0]) for seeds in found.values())
     rows = []
     for (name, arm), seeds in found.items():
-        shown = [mean_and_range(100.0 * np.array(each), unit=" %") for each in zip(*seeds.shares, strict=True)]
+        shown = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*seeds.shares, strict=True)]
         shown += [""] * (most - len(shown))
         made = f"{int(np.mean(seeds.steps)):,}" if seeds.steps else "–"
         rows.append([name, arm, str(len(seeds.shares)), made, *shown])
@@ -104,7 +104,7 @@ class _Seeds:
 
 
 def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
-    """By class, or suite if there are several studies, and arm; lines of ``ladder/`` beside the runs last."""
+    """By class, or suite if there are several studies, and arm: the best first, lines of ``ladder/`` last."""
     found: dict[tuple[str, str], _Seeds] = {}
 
     def add(study: Study, arm: str, classes: dict[str, list[float]], steps: Sequence[int] = ()) -> None:
@@ -128,7 +128,13 @@ def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
         for path in sorted((study.runs[0].path.parent / "ladder").glob("*.json")):
             for line, classes in read_json(path, "a ladder").items():
                 add(study, line, classes)
-    return dict(sorted(found.items(), key=lambda item: item[0][0]))  # a class's rows together, in the order they came
+
+    def place(item: tuple[tuple[str, str], _Seeds]) -> tuple[str, bool, float]:
+        (name, _), seeds = item
+        of_ladder = not seeds.steps
+        return name, of_ladder, 0.0 if of_ladder else -float(np.mean([shares[-1] for shares in seeds.shares]))
+
+    return dict(sorted(found.items(), key=place))
 
 
 def _gain(part: dict[str, Any], name: str) -> Estimate:
