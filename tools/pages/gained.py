@@ -125,7 +125,7 @@ def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
                 {name: [shot["classes"][name]["success"] for shot in by_shot] for name in names},
                 [run.content["steps"]],
             )
-        for path in sorted((study.runs[0].path.parent / "ladder").glob("*.json")):
+        for path in study.ladders:
             for line, classes in read_json(path, "a ladder").items():
                 add(study, line, classes)
 

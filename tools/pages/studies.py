@@ -93,6 +93,11 @@ class Study:
         )
 
     @property
+    def ladders(self) -> list[Path]:
+        """Files of ``ladder/`` beside its runs (:mod:`tools.ladder`)."""
+        return sorted((self.runs[0].path.parent / "ladder").glob("*.json"))
+
+    @property
     def classes(self) -> list[str]:
         """All classes of its arms."""
         return list(dict.fromkeys(name for arm in self.arms for name in arm.group.classes))
@@ -131,7 +136,8 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
 
 def digest_of(studies: Sequence[Study]) -> str:
     """Digest of all data that their pictures show."""
-    return hashlib.sha256(b"".join(run.path.read_bytes() for study in studies for run in study.runs)).hexdigest()
+    paths = [path for study in studies for path in [*(run.path for run in study.runs), *study.ladders]]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 def curves_figure(study: Study) -> Any:
