@@ -110,7 +110,7 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
     if block.show == "best":
         yield from tables.best_table(studies) if studies else ()
         return
-    parts = [[study] for study in studies] if len(names) == 1 else [studies]
+    parts = [[study] for study in studies] if len(names) == 1 or not studies else [studies]
     several = len(parts) > 1
     for number, part in enumerate(parts):
         on = ", ".join(study.on for study in part)
