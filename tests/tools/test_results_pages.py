@@ -34,7 +34,9 @@ def test_every_file_of_data_is_read_and_small() -> None:
 def test_lines_of_a_ladder_stand_below_the_arms() -> None:
     (study,) = read_studies(ROOT / "results" / "data", "ml1-v2")
     head, _, *rows = shots_table(study)
-    assert head.endswith("| before | after 1 | after 2 |") and rows[0].startswith("| CatchUnderarm | icl | 3 |")
+    assert head.endswith("| before | after 1 | after 2 | return |") and rows[0].startswith(
+        "| CatchUnderarm | icl | 3 |"
+    )
     assert rows[-1].startswith("| CatchUnderarm | teachers that are shown the goal | 1 | – | 72 % |")
 
 
@@ -44,9 +46,11 @@ def test_several_studies_share_a_table_with_means_over_classes() -> None:
     (row,) = (row for row in rows if row[:2] == ["ML20-v2", "icl"])
     classes = [cells(line) for line in shots_table(both[1])][2:]
     assert head[0] == "suite" and rows[0][:3] == ["ML1-v2", "icl", "3"]
-    assert [percent(cell) for cell in row[4:]] == pytest.approx(
-        np.mean([[percent(cell) for cell in row[4:]] for row in classes], axis=0), abs=6e-4
+    assert [percent(cell) for cell in row[4:7]] == pytest.approx(
+        np.mean([[percent(cell) for cell in row[4:7]] for row in classes], axis=0), abs=6e-4
     )
+    returns = [np.mean([float(row[7].split(" → ")[i]) for row in classes]) for i in (0, 1)]
+    assert [float(value) for value in row[7].split(" → ")] == pytest.approx(returns, rel=5e-3)
 
 
 def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:

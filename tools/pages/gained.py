@@ -56,7 +56,9 @@ def gains_table(study: Study) -> Iterator[str]:
 
 
 def shots_table(*studies: Study) -> Iterator[str]:
-    """Success after each shot, mean over seeds (least to most): a row per arm, and per line of a ladder.
+    """Success after each shot, mean over seeds (least to most), and return before and after the last.
+
+    A row per arm, and per line of a ladder.
 
     Args:
         studies: Runs with a meta-test of ``Study.split`` or of one split alone. One study has rows for each class; of
@@ -69,9 +71,10 @@ def shots_table(*studies: Study) -> Iterator[str]:
         shown = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*seeds.shares, strict=True)]
         shown += [""] * (most - len(shown))
         made = f"{int(np.mean(seeds.steps)):,}" if seeds.steps else "–"
-        rows.append([name, arm, str(len(seeds.shares)), made, *shown])
+        paid = " → ".join(f"{value:.3g}" for value in np.mean(seeds.returns, axis=0)) if seeds.returns else ""
+        rows.append([name, arm, str(len(seeds.shares)), made, *shown, paid])
     first = "class" if len(studies) == 1 else "suite"
-    return table([first, "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most))], rows)
+    return table([first, "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most)), "return"], rows)
 
 
 def shots_figure(*studies: Study) -> Any:
@@ -101,33 +104,34 @@ class _Seeds:
     shares: list[list[float]] = field(default_factory=list)
     """Success before and after each shot."""
     steps: list[int] = field(default_factory=list)
+    returns: list[list[float]] = field(default_factory=list)
+    """Before, and after the last shot."""
 
 
 def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
     """By class, or suite if there are several studies, and arm: the best first, lines of ``ladder/`` last."""
     found: dict[tuple[str, str], _Seeds] = {}
 
-    def add(study: Study, arm: str, classes: dict[str, list[float]], steps: Sequence[int] = ()) -> None:
-        mean = {study.on: np.mean(list(classes.values()), axis=0).tolist()}
-        for name, shares in (classes if len(studies) == 1 else mean).items():
-            seeds = found.setdefault((name, arm), _Seeds())
-            seeds.shares.append(shares)
-            seeds.steps += steps
+    def rows(study: Study, classes: dict[str, list[float]]) -> dict[str, list[float]]:
+        return classes if len(studies) == 1 else {study.on: np.mean(list(classes.values()), axis=0).tolist()}
 
     for study in studies:
         for run in study.runs:
             splits = run.evaluation()["splits"]
             by_shot = splits[study.split or (next(iter(splits)) if len(splits) == 1 else "test")]["by_shot"]
-            names = by_shot[0]["classes"]
-            add(
-                study,
-                run.arm,
-                {name: [shot["classes"][name]["success"] for shot in by_shot] for name in names},
-                [run.content["steps"]],
+            shares, returns = (
+                rows(study, {name: [shot["classes"][name][what] for shot in by_shot] for name in by_shot[0]["classes"]})
+                for what in ("success", "return")
             )
+            for name in shares:
+                seeds = found.setdefault((name, run.arm), _Seeds())
+                seeds.shares.append(shares[name])
+                seeds.returns.append([returns[name][0], returns[name][-1]])
+                seeds.steps.append(run.content["steps"])
         for path in study.ladders:
             for line, classes in read_json(path, "a ladder").items():
-                add(study, line, classes)
+                for name, shares in rows(study, classes).items():
+                    found.setdefault((name, line), _Seeds()).shares.append(shares)
 
     def place(item: tuple[tuple[str, str], _Seeds]) -> tuple[str, bool, float]:
         (name, _), seeds = item
