@@ -34,9 +34,8 @@ def test_every_file_of_data_is_read_and_small() -> None:
 def test_lines_of_a_ladder_stand_below_the_arms() -> None:
     (study,) = read_studies(ROOT / "results" / "data", "ml1-v2")
     head, _, *rows = shots_table(study)
-    assert head.endswith("| before | after 1 | after 2 | return |") and rows[0].startswith(
-        "| CatchUnderarm | icl | 3 |"
-    )
+    assert head.endswith("| before | after 1 | after 2 | return |")
+    assert rows[0].startswith("| CatchUnderarm | icl | 3 |")
     assert rows[-1].startswith("| CatchUnderarm | teachers that are shown the goal | 1 | – | 72 % |")
 
 
