@@ -13,6 +13,7 @@ from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import V1
+from bidex_meta.tasks.registry import name_among
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
@@ -114,7 +115,7 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
     for dataset in open_datasets(names):
         classes = source.task_classes()
         for slot in dataset.metadata["tasks"]:
-            known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
+            known_name(f"class in {source.name} of", name_among(slot.partition("/")[0], classes), classes)
         _check_goals(dataset, source)
         actions = max(task_class.action_size for task_class in classes.values())
         if dataset.action_size != actions:

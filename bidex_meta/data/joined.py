@@ -11,6 +11,7 @@ from torch import Tensor
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.part_files import Episode
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.tasks.registry import name_among
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.depth_sensor import POINT_ENTRIES
@@ -167,7 +168,9 @@ def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[
         yield from [0] * len(names)
         return
     known: Mapping[str, int] = {name: slot for slot, name in enumerate(world.task_names)}
+    classes = {slot.name: slot.task_class for slot in getattr(world, "slots", ())}  # of Meta-World's there are none
     for name in names:
-        if name not in known:
+        here = name_among(name, classes)
+        if here not in known:
             raise unknown_name("class in the world of", name, known)
-        yield known[name]
+        yield known[here]

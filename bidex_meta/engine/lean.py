@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from bidex_meta.engine import kernels
+from bidex_meta.engine.lu import ImplicitSolver
 
 _IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
 
@@ -28,6 +29,7 @@ class Lean:
         last: For those of the last substep, which gives the sensors of forces.
         integration: For the implicit integration of all substeps, if any.
         refresh: For positions, velocities and their sensors after the last substep.
+        solver: Of the fully implicit integrator, if it is the model's.
     """
 
     whole: mjw.Model
@@ -35,6 +37,7 @@ class Lean:
     last: mjw.Model
     integration: mjw.Model | None
     refresh: mjw.Model
+    solver: ImplicitSolver | None
 
     def step(self, d: mjw.Data, last: bool) -> None:
         """``mjw.step``; sensors are computed by the last substep alone, those of forces only."""
@@ -47,7 +50,10 @@ class Lean:
         if model.callback.passive is not self.whole.callback.passive:  # ours; it puts gravity back
             model.opt.disableflags |= int(mjw.DisableBit.GRAVITY)
         mjw.forward(model, d)
-        mjw.implicit(self.integration, d)
+        if self.solver is None:
+            mjw.implicit(self.integration, d)
+        else:
+            self.solver.integrate(self.integration, d)
 
 
 def lean(m: mjw.Model) -> Lean:
@@ -77,7 +83,8 @@ def lean(m: mjw.Model) -> Lean:
     for names, changes, allowed in table:
         for name in names if allowed else ():
             parts[name] = _without(parts[name], **changes)
-    return Lean(m, parts[early], parts[last], parts[integration] if implicit else None, parts[refresh])
+    solver = ImplicitSolver(m) if implicit and m.opt.integrator == mjw.IntegratorType.IMPLICIT else None
+    return Lean(m, parts[early], parts[last], parts[integration] if implicit else None, parts[refresh], solver)
 
 
 def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:

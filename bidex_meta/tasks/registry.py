@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
@@ -36,6 +37,12 @@ def module_of(name: str) -> str:
 def plain_name(name: str) -> str:
     """A class's name without the ``-v2`` that gives it the rules of version 2."""
     return name.removesuffix(_V2)
+
+
+def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
+    """A class's name among those of a suite: ``Switch-v2`` on its own is ``Switch`` in a suite of version 2."""
+    plain = plain_name(name)
+    return plain if name not in classes and plain in classes and classes[plain].rules == V2 else name
 
 
 def resolve(name: str, kind: str = "task class") -> str:

@@ -9,13 +9,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 Work = Callable[..., Any]
 """Tensors in, any nest of tensors out; on the way it may read and rebind the state."""
 
 Record = Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]
 """Takes work without inputs; gives how to do it again in the same memory, and the tensors that it then leaves there."""
+
+Together = Callable[[Sequence[Callable[[], None]]], None]
+"""Does jobs that need nothing of each other, as ``SideBySide.run``."""
 
 _BEFORE = 3
 """Plain runs of a stretch before it is recorded: libraries allocate and compile in the first ones, and a world that is
@@ -87,14 +90,12 @@ class GraphCache:
 
 def fresh(result: Any) -> Any:
     """A nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
-    copies: dict[int, Tensor] = {}
-
-    def copy(value: Tensor) -> Tensor:
-        if id(value) not in copies:
-            copies[id(value)] = value.clone()
-        return copies[id(value)]
-
-    return tree_map_only(Tensor, copy, result)
+    found = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
+    copies = {key: torch.empty_like(value) for key, value in found.items()}
+    for kind in {value.dtype for value in found.values()}:  # of one kind at once: few kernels
+        keys = [key for key, value in found.items() if value.dtype == kind]
+        torch._foreach_copy_([copies[key] for key in keys], [found[key] for key in keys])
+    return tree_map_only(Tensor, lambda value: copies[id(value)], result)
 
 
 class SideBySide:
@@ -108,8 +109,8 @@ class SideBySide:
     def run(self, jobs: Sequence[Callable[[], None]]) -> None:
         """Does the jobs.
 
-        On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
-        read must live until this ends.
+        On CUDA what comes after in the caller's stream waits for them all, and they for what came before, in a
+        recording too, where they become branches of the graph. What they read must live until this ends.
         """
         if not self._streams:
             for job in jobs:

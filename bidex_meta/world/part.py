@@ -1,6 +1,7 @@
 """The environments that one engine carries: controls, starts, observations, rewards."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from bidex_meta.utils.maths import multiply, roll_pitch_yaw, xyzw
 from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
 from bidex_meta.world.depth_sensor import DepthSensor
+from bidex_meta.world.graphs import Together
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule
 
@@ -233,8 +235,8 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
     return Judgement(terms, reward, task.solved_in(state), task.failed(state))
 
 
-def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int) -> Transition:
-    """Judges and observes all environments after a step.
+def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together) -> Transition:
+    """Judges and observes all environments after a step, part by part at the same time.
 
     ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations, whose task ids are not
     written.
@@ -242,8 +244,9 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
     n, device = len(action), action.device
     reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)
     success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=device).unbind()
-    terms: dict[str, Tensor] = {}
-    for part, rotation in zip(parts, base_rotations(parts), strict=True):
+    found: list[tuple[slice, dict[str, Tensor]]] = []
+
+    def look(part: Part, rotation: Tensor | None) -> None:
         group = part.group
         states = list(part.states(group.take(task_index)))
         out = None if group.span is None else obs[group.span]
@@ -253,8 +256,15 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
             rows, judged = member.world_rows, judge(member.scene.task, state)
             reward[rows], success[rows], failed[rows] = judged.reward, judged.success, judged.failed
             unstable[rows] = broke[where]
-            for name, value in judged.terms.items():
-                terms.setdefault(name, torch.zeros(n, device=device))[rows] = value
+            found.append((rows, judged.terms))
             if out is None:
                 obs[rows] = values[where]
+
+    rotations = base_rotations(parts)
+    together([partial(look, part, rotation) for part, rotation in zip(parts, rotations, strict=True)])
+    names = list(dict.fromkeys(name for _, own in found for name in own))
+    terms = dict(zip(names, torch.zeros(len(names), n, device=device), strict=True))
+    for rows, own in found:
+        for name, value in own.items():
+            terms[name][rows] = value
     return Transition(obs, reward, success, failed, unstable, terms)

@@ -4,9 +4,12 @@ A start depends on the row's key and the number of its episode alone. A vectoris
 longer than one for ten; drawn row by row as episodes end, starts would be a tenth of a step's time.
 """
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
+from bidex_meta.world.graphs import Together
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import uniform
 
@@ -19,11 +22,15 @@ _AHEAD = 8
 class Starts:
     """The coming episodes of every row: their tasks, elapsed shares and positions."""
 
-    def __init__(self, parts: list[Part], keys: Tensor, start_draws: int, pool_size: Tensor | None) -> None:
+    def __init__(
+        self, parts: list[Part], keys: Tensor, start_draws: int, pool_size: Tensor | None, together: Together
+    ) -> None:
         """``keys``: random keys of the world's rows, (n, 2); ``start_draws``: the most draws of any class.
 
         ``pool_size``: tasks of each row's slot, (n,), where episodes draw them; None where rows keep theirs.
+        ``together`` does a job for each part.
         """
+        self._together = together
         self._parts, self._keys, self._pool_size = parts, keys, pool_size
         self._draws = _OWN_DRAWS + start_draws
         num, device = len(keys), keys.device
@@ -60,14 +67,13 @@ class Starts:
             [qpos[rows, at[rows]] for qpos, rows, at in zip(self._qpos, chosen, places, strict=True)],
         )
 
-    def look_ahead(self, number: Tensor, task_index: Tensor) -> None:
-        """Comes before each ``take`` of a masked engine, with the same numbers and tasks: draws when it is time.
+    def all_used(self) -> bool:
+        """Whether ``draw_all`` is due; asked before each ``take`` of a masked engine.
 
-        A row begins at most one episode a call, so counting calls does instead of a look at any number.
+        A row begins at most one episode a ``take``, so counting them does instead of a look at any number.
         """
-        if self._takes % _AHEAD == 0:
-            self._draw_all(number, task_index)
         self._takes += 1
+        return (self._takes - 1) % _AHEAD == 0
 
     def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The same for all rows, without a look at any number."""
@@ -92,17 +98,22 @@ class Starts:
                 start = part.starts(engine_row[mine], signed[mine], tasks[mine])
                 qpos[engine_row[mine], ahead[mine]] = start.to(qpos.dtype)
 
-    def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
+    def draw_all(self, number: Tensor, task_index: Tensor) -> None:
+        """Fills the bank of every row; ``number`` and ``task_index`` as in the next ``take``."""
         self._first.copy_(number)
         rows = torch.arange(len(number), device=number.device)
-        for part, qpos in zip(self._parts, self._qpos, strict=True):
-            mine = part.group.take(rows)
-            ahead = torch.arange(_AHEAD, device=number.device).repeat(len(mine))
-            # A fixed length keeps repeat_interleave from asking the device for it.
-            many = mine.repeat_interleave(_AHEAD, output_size=_AHEAD * len(mine))
-            signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
-            self._task_index[mine], self._elapsed_share[mine] = tasks.view(-1, _AHEAD), share.view(-1, _AHEAD)
-            qpos.copy_(part.starts(None, signed, tasks).view(qpos.shape))
+        # A fixed length keeps repeat_interleave from asking the device for it.
+        many = rows.repeat_interleave(_AHEAD, output_size=_AHEAD * len(rows))
+        ahead = torch.arange(_AHEAD, device=number.device).repeat(len(rows))
+        signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
+        self._task_index.copy_(tasks.view(-1, _AHEAD))
+        self._elapsed_share.copy_(share.view(-1, _AHEAD))
+
+        def place(part: Part, qpos: Tensor) -> None:
+            own, tasks_of = (part.group.take(x.unflatten(0, (-1, _AHEAD))).flatten(0, 1) for x in (signed, tasks))
+            qpos.copy_(part.starts(None, own, tasks_of).view(qpos.shape))
+
+        self._together([partial(place, part, qpos) for part, qpos in zip(self._parts, self._qpos, strict=True)])
 
     def _numbers(self, rows: Tensor, episode: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draws in [-1, 1] (k, start_draws), task (k,) and elapsed share in [0, 1) (k,) of episodes of world rows."""

@@ -172,7 +172,8 @@ class World(BatchedWorld):
         if self._randomiser:
             self._randomiser.seed(self._random_keys(", randomised"))
         draws = max(slot.task_class.draws for slot in self.slots)
-        self._starts = Starts(self.parts, self._keys, draws, self._pool_size if self._uniform_tasks else None)
+        pool_size = self._pool_size if self._uniform_tasks else None
+        self._starts = Starts(self.parts, self._keys, draws, pool_size, self._side_by_side.run)
         if self._graphs is not None:  # they hold the starts and the pools
             self._graphs.forget()
 
@@ -201,8 +202,8 @@ class World(BatchedWorld):
             setattr(self if name in _STATE else self.episodes, name, value)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
-        if self._masked:
-            self._starts.look_ahead(self.episodes.number + 1, self.task_index)
+        if self._masked and self._starts.all_used():
+            self._run("look ahead", self._starts.draw_all, self.episodes.number + 1, self.task_index)
         starts = self._run(f"begin, staggered {stagger}", partial(self._draw, stagger), mask)
         chosen = [part.group.take(mask) for part in self.parts]
         jobs = [partial(p.group.engine.reset, c, s) for p, c, s in zip(self.parts, chosen, starts, strict=True)]
@@ -238,10 +239,14 @@ class World(BatchedWorld):
     def _refresh_masked(self, mask: Tensor) -> None:
         """With shapes that do not depend on the mask."""
         new = torch.empty_like(self._obs)
-        for part, rotation in zip(self.parts, base_rotations(self.parts), strict=True):
+
+        def look(part: Part, rotation: Tensor | None) -> None:
             group = part.group
             states = list(part.states(group.take(self.task_index)))
             new[group.rows] = part.observe(states, group.take(self._action), rotation)
+
+        turned = base_rotations(self.parts)
+        self._side_by_side.run([partial(look, part, of) for part, of in zip(self.parts, turned, strict=True)])
         new = self._noisy(new, self.episodes.elapsed)
         self._write_ids(new)
         self._obs = torch.where(mask[:, None], new, self._obs)
@@ -259,8 +264,7 @@ class World(BatchedWorld):
         applied = self._action
         if self._randomiser:
             applied, self._past = self._randomiser.act(self._action, self._past, self.episodes.elapsed)
-        for part in self.parts:
-            part.control(part.group.take(applied))
+        self._side_by_side.run([partial(part.control, part.group.take(applied)) for part in self.parts])
 
     def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
         if not self._masked:
@@ -278,7 +282,7 @@ class World(BatchedWorld):
         return None if self.autoreset_mode == AutoresetMode.SAME_STEP else active
 
     def _collect(self) -> Transition:
-        transition = collect(self.parts, self.task_index, self._action, self.observation_size)
+        transition = collect(self.parts, self.task_index, self._action, self.observation_size, self._side_by_side.run)
         obs = self._noisy(transition.obs, self.episodes.elapsed + 1)
         self._write_ids(obs)
         return transition._replace(obs=obs)

@@ -26,7 +26,7 @@ def whole_step(engine: WarpEngine) -> None:
     mjw.sensor_vel(engine._m, engine._d)
 
 
-@pytest.mark.parametrize("name", ["CatchUnderarm", "BottleCap", "OpenScissors"])
+@pytest.mark.parametrize("name", ["CatchUnderarm", "BottleCap", "OpenPenCap"])
 def test_steps_are_those_of_mujoco_warp_bit_for_bit(name: str) -> None:
     """Of the classes the second has friction in joints, the third the fully implicit integrator."""
     scene = compile_scene(registry.get(name, True))

@@ -1,6 +1,7 @@
 """bidex-meta run --dataset, from recording to evaluation; data sets in the form of a world."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -132,7 +133,7 @@ def alone(slot: int, size: int) -> list[Any]:
 def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) -> None:
     both, world = [alone(0, 1), alone(1, 3)], opposite_bandits(rows=2)
     world.single_observation_space = Box(-np.inf, np.inf, (5,), np.float32)  # 3 and the one-hot
-    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0) for i in (0, 1)]  # type: ignore
+    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0, task_class=None) for i in (0, 1)]  # type: ignore
     sets = [
         stored(tmp_path, f"{i}-v0", both[i], [f"task{i}"], reward_scales={f"task{i}": 4.0 * i + 1.0}) for i in (0, 1)
     ]
@@ -174,6 +175,23 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
     assert torch.equal(join([shown], masked).observations, torch.cat(seen))
     plain.close()
     masked.close()
+
+
+def test_data_of_a_class_of_version_2_are_known_in_suites_of_it_alone(tmp_path: Path) -> None:
+    alone = task_slot("Switch-v2")
+    of_suite, of_version_1 = replace(alone, name="Switch"), task_slot("Switch")
+    made = [World([slot], 1, autoreset_mode="DISABLED", threads=1) for slot in (alone, of_suite, of_version_1)]
+    episodes: list[Any] = []
+    recorder = EpisodeCollector(made[0], episodes.append)
+    recorder.reset(seed=3)
+    for _ in range(alone.task_class.episode_steps):
+        recorder.step(torch.full((1, 52), 0.1))
+    data = stored(tmp_path, "a-v0", episodes, ["Switch-v2"], hides_goals=False)
+    assert torch.equal(join([data], made[0]).observations, join([data], made[1]).observations)
+    with pytest.raises(BidexError, match="'Switch-v2'"):
+        join([data], made[2])
+    for each in made:
+        each.close()
 
 
 def clouds(points: int, state: int, ids: int) -> list[Any]:

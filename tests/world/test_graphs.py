@@ -104,7 +104,7 @@ def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tupl
     a, b = play(plain, actions), play(taped_world, actions)
     assert_same(a, b)
     assert number_of_ends(a) >= 9 and a[40]["info/unstable"][3]
-    assert len(count) == 4  # controls, transitions, starts, first observations
+    assert len(count) == 5  # controls, transitions, starts drawn ahead and taken, first observations
 
 
 def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[..., tuple[World, list[int]]]) -> None:
