@@ -5,6 +5,7 @@ Eliminating from the last one on fills none in. The numbers are mujoco_warp's, b
 """
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportOptionalMemberAccess=false
 
 import mujoco_warp as mjw
 import numpy as np

@@ -94,7 +94,7 @@ def fresh(result: Any) -> Any:
     copies = {key: torch.empty_like(value) for key, value in found.items()}
     for kind in {value.dtype for value in found.values()}:  # of one kind at once: few kernels
         keys = [key for key, value in found.items() if value.dtype == kind]
-        torch._foreach_copy_([copies[key] for key in keys], [found[key] for key in keys])
+        torch._foreach_copy_([copies[k] for k in keys], [found[k] for k in keys])  # pyright: ignore
     return tree_map_only(Tensor, lambda value: copies[id(value)], result)
 
 
