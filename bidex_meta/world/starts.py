@@ -67,13 +67,13 @@ class Starts:
             [qpos[rows, at[rows]] for qpos, rows, at in zip(self._qpos, chosen, places, strict=True)],
         )
 
-    def all_used(self) -> bool:
-        """Whether ``draw_all`` is due; asked before each ``take`` of a masked engine.
+    def count_take(self) -> bool:
+        """Comes before each ``take`` of a masked engine; whether ``draw_all`` must come between.
 
         A row begins at most one episode a ``take``, so counting them does instead of a look at any number.
         """
         self._takes += 1
-        return (self._takes - 1) % _AHEAD == 0
+        return self._takes % _AHEAD == 1
 
     def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The same for all rows, without a look at any number."""

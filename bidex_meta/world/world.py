@@ -202,7 +202,7 @@ class World(BatchedWorld):
             setattr(self if name in _STATE else self.episodes, name, value)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
-        if self._masked and self._starts.all_used():
+        if self._masked and self._starts.count_take():
             self._run("look ahead", self._starts.draw_all, self.episodes.number + 1, self.task_index)
         starts = self._run(f"begin, staggered {stagger}", partial(self._draw, stagger), mask)
         chosen = [part.group.take(mask) for part in self.parts]
