@@ -235,6 +235,7 @@ def make_task_world(
     object: str | None = None,
     randomisation: Randomisation | None = None,
     pixels: int = 0,
+    task_seed: int | None = None,
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -246,13 +247,17 @@ def make_task_world(
     - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
     - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
     - `randomisation`: what is drawn anew for environments (docs/randomisation.md); left out, nothing.
+    - `task_seed`: draws the 50 tasks in the place of `seed`.
     - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """
     task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
-    tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", 50)
+    of_tasks = whole_number("seed", seed, 0)
+    if task_seed is not None:
+        of_tasks = whole_number("task_seed", task_seed, 0)
+    tasks = _drawn(task_class.variation_space, of_tasks, task_name, "train", 50)
     slot = Slot(name_with_object(task_name, object), task_class, tasks)
     return World(
         [slot],

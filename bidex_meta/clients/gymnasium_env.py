@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.clients.gymnasium_ids import check_render_mode
+from bidex_meta.clients.gymnasium_ids import both_seeds, check_render_mode
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import Info, Options
 
@@ -13,22 +13,32 @@ from bidex_meta.world.contract import Info, Options
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
-    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Raises BidexError for an unknown task class or
-    a render mode other than None and `"rgb_array"`.
+    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`; without it the tasks are those of seed 0, and
+    the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
+    other than None and `"rgb_array"`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (Gymnasium's own convention)
 
     def __init__(
-        self, task_name: str, render_mode: str | None = None, seed: int = 0, device: str | torch.device = "cpu"
-    ) -> None:
+        self, task_name: str, render_mode: str | None = None, seed: int | None = None,
+        device: str | torch.device = "cpu"
+    ) -> None:  # fmt: skip
         check_render_mode(render_mode)
         self.render_mode = render_mode
+        task_seed, start_seed = both_seeds(seed)
         self.world = make_task_world(
-            task_name, num_envs=1, device=device, seed=seed, autoreset_mode="DISABLED", task_sampling="uniform"
+            task_name,
+            num_envs=1,
+            device=device,
+            seed=start_seed,
+            autoreset_mode="DISABLED",
+            task_sampling="uniform",
+            task_seed=task_seed,
         )
         self.observation_space = self.world.single_observation_space
         self.action_space = self.world.single_action_space
+        self._over = True
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode, the same for the same seed: observation (d,), float32, and an empty info. No options."""
@@ -36,18 +46,22 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if options:
             raise BidexError(f"Expected no reset options, got {', '.join(map(str, options))}.")
         obs, _ = self.world.reset(seed=seed)
+        self._over = False
         return obs[0].cpu().numpy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Advances 1/60 s by an action (a,) in [-1, 1]: observation (d,) float32, reward, terminated, truncated, info.
 
         `info`: ``success`` (of this state), ``unstable``, ``reward_terms``, and at an episode's end ``is_success`` (at
-        any step).
+        any step). Raises BidexError where no episode runs: its end would count twice.
         """
+        if self._over:
+            raise BidexError("Expected reset() before step(): no episode runs.")
         obs, reward, terminated, truncated, batch = self.world.step(torch.as_tensor(action)[None])
         info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
-        if terminated[0] or truncated[0]:
+        self._over = bool(terminated[0] or truncated[0])
+        if self._over:
             info["is_success"] = bool(batch["so_far"]["success"][0])
         return obs[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 

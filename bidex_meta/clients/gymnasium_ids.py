@@ -1,5 +1,6 @@
 """Gymnasium ids of every shipped suite (vector entry points alone) and every task class (both)."""
 
+import secrets
 from typing import Any
 
 import gymnasium
@@ -51,32 +52,51 @@ def make_suite_world(
 ) -> VectorEnv:  # fmt: skip
     """The world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, environments over all classes.
 
-    `seed` (None: 0) chooses tasks, starts and task draws; `benchmark_seed` the tasks instead, and the rest without a
-    seed. Both render modes, None and `"rgb_array"`, are the same: a world draws on request. The rest as in
-    `Benchmark.make_world`, except that `stagger` is off: wrappers would count shortened episodes. `vector_strategy`,
-    `meta_batch_size`, `total_tasks_per_cls` or `env_name` give Meta-World's single environments of NumPy arrays side by
-    side, whatever `num_envs` says.
+    `seed` chooses tasks, starts and task draws; `benchmark_seed` chooses the tasks instead, and the rest too if there
+    is no `seed`. Without both, the tasks are those of seed 0, and starts and draws differ each time. Both render modes,
+    None and `"rgb_array"`, are the same: a world draws on request. The rest as in `Benchmark.make_world`, except that
+    `stagger` is off: wrappers would count shortened episodes. `vector_strategy`, `meta_batch_size`,
+    `total_tasks_per_cls` or `env_name` give Meta-World's single environments of NumPy arrays side by side, whatever
+    `num_envs` says.
     """
     check_render_mode(render_mode)
-    of_tasks = next(given for given in (benchmark_seed, seed, 0) if given is not None)
+    task_seed, start_seed = both_seeds(seed, benchmark_seed)
     if options.keys() & {"vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name"}:
         from bidex_meta.metaworld.vector_envs import make_split
 
-        return make_split(suite, split, of_tasks, **options)
+        return make_split(suite, split, task_seed, start_seed, **options)
     from bidex_meta.benchmark import Benchmark
 
-    benchmark = Benchmark(suite, seed=of_tasks)
-    return benchmark.make_world(split, num_envs=num_envs, seed=seed, stagger=stagger, **options)
+    benchmark = Benchmark(suite, seed=task_seed)
+    return benchmark.make_world(split, num_envs=num_envs, seed=start_seed, stagger=stagger, **options)
 
 
 def make_class_world(
-    task_name: str, num_envs: int = 1, render_mode: str | None = None, stagger: bool = False, **options: Any
-) -> VectorEnv:
-    """The world of `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)`, as by `make_task_world`."""
+    task_name: str, num_envs: int = 1, seed: int | None = None, benchmark_seed: int | None = None,
+    render_mode: str | None = None, stagger: bool = False, **options: Any
+) -> VectorEnv:  # fmt: skip
+    """Make the world of `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)`.
+
+    Seeds, render modes and `stagger` are those of `make_suite_world`, other options those of `make_task_world`.
+    """
     from bidex_meta.benchmark import make_task_world
 
     check_render_mode(render_mode)
-    return make_task_world(task_name, num_envs=num_envs, stagger=stagger, **options)
+    task_seed, start_seed = both_seeds(seed, benchmark_seed)
+    return make_task_world(
+        task_name, num_envs=num_envs, seed=start_seed, task_seed=task_seed, stagger=stagger, **options
+    )
+
+
+def both_seeds(seed: int | None, benchmark_seed: int | None = None) -> tuple[int, int]:
+    """Return the seeds of tasks and of starts for what Gymnasium makes, from the seeds that were given.
+
+    Gymnasium draws starts from a random seed where none is given. The tasks are part of the benchmark: they stay.
+    """
+    given = seed if benchmark_seed is None else benchmark_seed
+    if given is None:
+        return 0, secrets.randbits(63)
+    return given, given if seed is None else seed
 
 
 def check_render_mode(render_mode: str | None) -> None:

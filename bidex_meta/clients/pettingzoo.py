@@ -25,7 +25,7 @@ class HandsEnv(ParallelEnv):
     metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
 
     def __init__(
-        self, task: str, agents: Agents = "hands", render_mode: str | None = None, seed: int = 0,
+        self, task: str, agents: Agents = "hands", render_mode: str | None = None, seed: int | None = None,
         device: str | torch.device = "cpu"
     ) -> None:  # fmt: skip
         self._env, self.render_mode = TaskEnv(task, render_mode, seed, device), render_mode

@@ -63,15 +63,18 @@ make_ml_envs_train = partial(make_ml_envs, terminate_on_success=False, task_sele
 make_ml_envs_test = partial(make_ml_envs, terminate_on_success=True, task_select="pseudorandom", split="test")
 
 
-def make_split(suite: str, split: str, seed: int, env_name: str | None = None, **options: Option) -> VectorEnv:
+def make_split(
+    suite: str, split: str, task_seed: int, seed: int, env_name: str | None = None, **options: Option
+) -> VectorEnv:
     """The environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
-    For the ids of ML1 `env_name` replaces the suite, as in Meta-World; with another suite it raises BidexError. Options
-    are those of `make_mt_envs` or `make_ml_envs`.
+    `task_seed` chooses the tasks, `seed` the starts and the task draws. For the ids of ML1 `env_name` replaces the
+    suite, as in Meta-World; with another suite it raises BidexError. Options are those of `make_mt_envs` or
+    `make_ml_envs`.
     """
     if env_name is not None and suite != "ML1":
         raise BidexError(f"env_name goes with the ids of ML1, got it with {suite}. For one class: make_mt_envs(name).")
-    benchmark = ML1(env_name, seed) if env_name is not None else Benchmark(suite, seed)
+    benchmark = ML1(env_name, task_seed) if env_name is not None else Benchmark(suite, task_seed)
     if benchmark.suite.kind == "multi-task":
         return _multi_task(benchmark, seed, **options)
     select = {"task_select": "pseudorandom", "terminate_on_success": split == "test"}

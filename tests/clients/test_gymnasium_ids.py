@@ -2,12 +2,16 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 
 import bidex_meta
+from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.clients.gymnasium_ids import register_ids, suite_ids, task_id
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
@@ -74,6 +78,66 @@ def test_single_environment_passes_gymnasiums_checker(env: gymnasium.Env) -> Non
 def test_single_environment_draws_a_new_task_each_episode(env: gymnasium.Env) -> None:
     world = env.unwrapped.world  # type: ignore[attr-defined]
     assert len({int(world.task_index[0]) for seed in (0, *[None] * 5) if env.reset(seed=seed)}) > 1
+
+
+ID = "bidex-meta/CatchUnderarm-v2"
+
+
+def starts(envs: gymnasium.vector.VectorEnv) -> np.ndarray:
+    return np.asarray(envs.reset()[0])
+
+
+def test_copies_without_a_seed_start_differently() -> None:
+    envs = gymnasium.make_vec(ID, num_envs=4, vectorization_mode="sync")
+    assert len(np.unique(starts(envs), axis=0)) == 4
+    pools = [env.unwrapped.world.pools[0] for env in envs.envs]  # type: ignore[attr-defined]
+    assert all(np.array_equal(pool, pools[0]) for pool in pools), "the tasks are the benchmark's"
+    first, again = starts(envs), np.asarray(envs.reset(seed=3)[0])
+    assert not np.array_equal(first, again) and np.array_equal(again, np.asarray(envs.reset(seed=3)[0]))
+
+
+@pytest.mark.parametrize("env_id", [ID, "bidex-meta/MT1-v2"])
+def test_worlds_of_make_vec_start_differently_unless_seeded(env_id: str) -> None:
+    options: dict[str, Any] = {"num_envs": 4, "device": "cpu", "threads": 1}
+    worlds: list[Any] = [gymnasium.make_vec(env_id, **options) for _ in range(2)]
+    one, two = map(starts, worlds)
+    assert not np.array_equal(one, two)
+    assert all(map(np.array_equal, worlds[0].unwrapped.pools, worlds[1].unwrapped.pools))
+    seed = worlds[0].unwrapped.seed
+    assert np.array_equal(starts(gymnasium.make_vec(env_id, seed=seed, benchmark_seed=0, **options)), one)
+    five, other = (starts(gymnasium.make_vec(env_id, seed=5, **options)) for _ in range(2))
+    assert np.array_equal(five, other)
+
+
+def test_meta_worlds_environments_start_differently_unless_seeded() -> None:
+    options: dict[str, Any] = {"vector_strategy": "sync"}
+    one, two = (starts(gymnasium.make_vec("bidex-meta/MT1-v2", **options)) for _ in range(2))
+    assert not np.array_equal(one, two)
+    one, two = (starts(gymnasium.make_vec("bidex-meta/MT1-v2", seed=2, **options)) for _ in range(2))
+    assert np.array_equal(one, two)
+    other = starts(gymnasium.make_vec("bidex-meta/MT1-v2", seed=3, benchmark_seed=2, **options))
+    assert not np.array_equal(one, other), "`seed` decides the starts whatever `benchmark_seed` says"
+
+
+def test_our_own_functions_start_alike() -> None:
+    one, two = (bidex_meta.make_task_world("CatchUnderarm-v2", 4, "cpu", threads=1) for _ in range(2))
+    assert torch.equal(one.reset()[0], two.reset()[0])
+    other = bidex_meta.make_task_world("CatchUnderarm-v2", 4, "cpu", threads=1, seed=7, task_seed=0)
+    assert np.array_equal(other.pools[0], one.pools[0]) and not torch.equal(other.reset()[0], two.reset()[0])
+
+
+def test_a_single_environment_is_not_stepped_beyond_its_end() -> None:
+    """Its end would be counted again."""
+    env = TaskEnv("CatchUnderarm", seed=0)
+    with pytest.raises(BidexError, match=r"Expected reset\(\) before step\(\)"):
+        env.step(np.zeros(52, np.float32))
+    env.reset()
+    while not any(env.step(np.zeros(52, np.float32))[2:4]):
+        pass
+    with pytest.raises(BidexError, match=r"Expected reset\(\) before step\(\)"):
+        env.step(np.zeros(52, np.float32))
+    env.reset()
+    env.step(np.zeros(52, np.float32))
 
 
 def test_single_environment_info_has_gymnasiums_keys_alone(env: gymnasium.Env) -> None:
