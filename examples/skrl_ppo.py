@@ -34,7 +34,8 @@ def main(
         log: Whether any are written.
     """
     set_seed(seed)
-    env, rollout = SkrlEnv(make_task_world(task, num_envs=num_envs, seed=seed)), 16
+    env = SkrlEnv(make_task_world(task, num_envs=num_envs, seed=seed, autoreset_mode="NEXT_STEP"))
+    rollout = 16
     spaces = {
         "observation_space": env.observation_space,
         "state_space": env.state_space,

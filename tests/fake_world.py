@@ -97,7 +97,7 @@ class FakeWorld(ABC):
             self._seed_rows(checked_seed(seed, mask))
         first = not self._ready or seed is not None
         self._ready = True
-        self._begin(mask, first and self.autoreset_mode == AutoresetMode.SAME_STEP)
+        self._begin(mask, first and self.autoreset_mode != AutoresetMode.DISABLED)
         self._obs = torch.where(mask[:, None], self._observe(), self._obs)
         return self._obs.clone(), {}
 
@@ -155,6 +155,10 @@ class FakeWorld(ABC):
         else:
             episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
             episodes.finished = episodes.finished | ended
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            terminated, truncated = terminated & active, truncated & active
+            self._begin(~active)
+            self._obs = torch.where(active[:, None], self._obs, self._observe())
         return self._obs.clone(), reward.clone(), terminated, truncated, info
 
     def state_dict(self) -> State:

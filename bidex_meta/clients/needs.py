@@ -20,9 +20,11 @@ def extra(name: str) -> Iterator[None]:
         raise BidexError(f"{what}. Add it: pip install 'bidex-meta[{name}]'.") from error
 
 
-def check_training(world: VectorWorld, stagger: bool) -> None:
-    """Raises BidexError for a world in another autoreset mode than SAME_STEP; sets whether it staggers."""
-    if (mode := world.metadata["autoreset_mode"]) != AutoresetMode.SAME_STEP:
-        what = f"Expected a world in autoreset mode SAME_STEP, got {mode.name}"
-        raise BidexError(f"{what}; make it without autoreset_mode.")
+def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
+    """Set whether a world staggers; raise BidexError for one in another autoreset mode than the library needs."""
+    given = world.metadata["autoreset_mode"]
+    if given != mode:
+        usual = mode == AutoresetMode.SAME_STEP
+        mend = "without autoreset_mode" if usual else f"with autoreset_mode={mode.name!r}"
+        raise BidexError(f"Expected a world in autoreset mode {mode.name}, got {given.name}; make it {mend}.")
     set_stagger(world, stagger)

@@ -1,5 +1,6 @@
 """A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`. Extra: `sb3`."""
 
+import math
 from collections import defaultdict, deque
 from collections.abc import Iterable
 from typing import Any
@@ -30,6 +31,7 @@ class SB3VecEnv(vec_env.VecEnv):
         self.world: Any = world
         self._names = [world.task_names[task] for task in world.task_id.tolist()]
         super().__init__(world.num_envs, world.single_observation_space, world.single_action_space)
+        self.metadata = world.metadata
 
     def reset(self) -> np.ndarray:
         """Starts all episodes; observations (num_envs, d)."""
@@ -75,6 +77,15 @@ class SB3VecEnv(vec_env.VecEnv):
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
         """True for `Monitor` alone: like it, `infos` reports whole episodes, and SB3 counts those in evaluations."""
         return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
+
+    def get_images(self) -> list[np.ndarray]:
+        """Return a picture of each environment, uint8; SB3's `render` and `VecVideoRecorder` tile them.
+
+        One environment has 640 x 480 pixels; several share about 1280 x 960, at least 32 x 24 each.
+        """
+        columns = math.ceil(math.sqrt(self.num_envs))
+        width = max(32, min(640, 1280 // columns // 4 * 4))
+        return [self.world.render(row=row, width=width, height=width * 3 // 4) for row in range(self.num_envs)]
 
     def close(self) -> None:
         """Frees the world."""

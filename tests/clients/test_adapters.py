@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from importlib import import_module
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -46,8 +47,8 @@ def points(mode: str = "SAME_STEP") -> Staggered:
     return Staggered(ROWS, {"Near": ring(3), "Far": 2 * ring(3)}, (8, 12), ends=True, breaks=(1, 30), mode=mode)
 
 
-def real() -> World:
-    return suite_world("MT4", 8)
+def real(mode: str = "SAME_STEP") -> World:
+    return suite_world("MT4", 8, mode)
 
 
 class Seen(NamedTuple):
@@ -114,7 +115,8 @@ def of_skrl(world: PooledWorld, actions: Tensor) -> Seen:
     obs, _ = env.reset()
     for action in actions:
         obs, reward, terminated, truncated, infos = env.step(action)
-        assert torch.equal(env.reset()[0], obs) and reward.shape == terminated.shape == (env.num_envs, 1)
+        assert reward.shape == terminated.shape == (env.num_envs, 1)
+        assert (terminated | truncated).any() or torch.equal(env.reset()[0], obs)
         for row in (terminated | truncated).squeeze(1).nonzero().squeeze(1).tolist():
             seen.finals.append(infos["final_obs"][row].numpy())
             seen.ends.append((row, bool(truncated[row])))
@@ -147,15 +149,17 @@ def of_torchrl(world: PooledWorld, actions: Tensor) -> Seen:
 
 
 CLIENTS = {"sb3": of_sb3, "rsl_rl": of_rsl_rl, "skrl": of_skrl, "torchrl": of_torchrl}
+MODES = dict.fromkeys(CLIENTS, "SAME_STEP") | {"skrl": "NEXT_STEP"}
+"""The autoreset mode that each library takes."""
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-@pytest.mark.parametrize(("make", "steps", "least"), [(points, 260, 1000), (real, 150, 10)], ids=["points", "MT4"])
-def test_episodes_are_the_worlds_own(client: str, make: Callable[[], PooledWorld], steps: int, least: int) -> None:
-    world = make()
+@pytest.mark.parametrize(("make", "steps", "least"), [(points, 300, 1000), (real, 160, 10)], ids=["points", "MT4"])
+def test_episodes_are_the_worlds_own(client: str, make: Callable[[str], PooledWorld], steps: int, least: int) -> None:
+    world = make(MODES[client])
     generator = torch.Generator().manual_seed(0)
     actions = 2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1
-    expected, found = own(make(), actions), CLIENTS[client](world, actions)
+    expected, found = own(make(MODES[client]), actions), CLIENTS[client](world, actions)
     assert len(expected.episodes) >= least and len(expected.episodes) < len(expected.ends)
     np.testing.assert_allclose(found.episodes, expected.episodes, rtol=1e-6, atol=1e-6)
     assert found.ends == expected.ends and len({cut for _, cut in found.ends}) == 2
@@ -165,8 +169,59 @@ def test_episodes_are_the_worlds_own(client: str, make: Callable[[], PooledWorld
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_adapters_refuse_evaluation_worlds(client: str) -> None:
-    with pytest.raises(BidexError, match="SAME_STEP, got DISABLED"):
+    with pytest.raises(BidexError, match=f"{MODES[client]}, got DISABLED"):
         CLIENTS[client](points("DISABLED"), torch.zeros(1, ROWS, 2))
+
+
+def test_skrl_refuses_a_world_whose_last_observations_it_would_not_see() -> None:
+    with pytest.raises(BidexError, match="NEXT_STEP, got SAME_STEP; make it with autoreset_mode='NEXT_STEP'"):
+        adapt("skrl", points())
+
+
+def test_skrls_trainer_records_the_last_observation_of_each_episode() -> None:
+    """PPO bootstraps from `next_observations` at time limits; TD3, DDPG and SAC store them."""
+    world = PointWorld(6, {"Near": ring(3), "Far": 2 * ring(3)}, (8, 12), ends=True, mode="NEXT_STEP")
+    env = adapt("skrl", world)
+    agents = import_module("skrl.agents.torch")
+    recorded: list[dict[str, Any]] = []
+
+    class Recorder(agents.Agent):
+        def act(self, observations: Tensor, states: object, **more: object) -> tuple[Tensor, dict]:
+            return torch.full((world.num_envs, 2), 0.3), {}
+
+        def record_transition(self, **given: Any) -> None:
+            recorded.append({name: value for name, value in given.items() if isinstance(value, Tensor)})
+            recorded[-1]["last"] = given["infos"]["final_obs"], given["infos"]["_final_obs"]
+
+        def pre_interaction(self, **given: object) -> None: ...
+
+        def post_interaction(self, **given: object) -> None: ...
+
+        def update(self, **given: object) -> None: ...
+
+    spaces = {"observation_space": env.observation_space, "state_space": None, "action_space": env.action_space}
+    config = agents.AgentCfg(experiment={"write_interval": 0, "checkpoint_interval": 0})
+    agent = Recorder(models={}, memory=None, device="cpu", cfg=config, **spaces)
+    settings = {"timesteps": 40, "headless": True, "close_environment_at_exit": False, "disable_progressbar": True}
+    import_module("skrl.trainers.torch").SequentialTrainer(env=env, agents=agent, cfg=settings).train()
+    cut = 0
+    for step, after in pairwise(recorded):
+        final, ended = step["last"]
+        assert torch.equal((step["terminated"] | step["truncated"]).squeeze(1), ended)
+        assert torch.equal(step["next_observations"][ended], final[ended])
+        assert not after["rewards"][ended].any() and not (after["terminated"] | after["truncated"])[ended].any()
+        cut += int(step["truncated"].sum())
+    assert cut > 10
+
+
+def test_a_single_environment_of_skrl_starts_its_next_episode_when_it_is_reset() -> None:
+    env = adapt("skrl", PointWorld(1, {"Near": ring(3)}, (8,), mode="NEXT_STEP"))
+    env.reset()
+    for _ in range(3):
+        for _ in range(8):
+            obs, _, _, truncated, infos = env.step(torch.ones(1, 2))
+        assert truncated.all() and torch.equal(obs, infos["final_obs"])
+        assert not torch.equal(env.reset()[0], obs) and env.world.episodes.elapsed.item() == 0
 
 
 def test_a_missing_package_is_one_line() -> None:
@@ -218,6 +273,14 @@ def test_sb3_seeds_options_and_attributes() -> None:
         env.reset()
 
 
+@pytest.mark.parametrize(("rows", "size"), [(1, (480, 640)), (4, (480, 640)), (9, (318, 424)), (256, (60, 80))])
+def test_pictures_for_sb3_share_the_size_of_a_film(rows: int, size: tuple[int, int]) -> None:
+    env = adapt("sb3", points())
+    env.num_envs = rows
+    env.world.render = lambda row, width, height: (height, width)
+    assert env.get_images() == [size] * rows
+
+
 def test_rsl_rl_groups_limits_and_lengths() -> None:
     world = real()
     env = adapt("rsl_rl", world, policy=("right_hand", "goal"))
@@ -267,7 +330,7 @@ def test_torchrl_specs_seeds_and_part_resets() -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_no_first_episode_is_shortened_unless_asked(client: str) -> None:
-    world = class_world("CatchUnderarm", 4)
+    world = class_world("CatchUnderarm", 4, MODES[client])
     env = adapt(client, world)
     env.get_observations() if client == "rsl_rl" else env.reset()
     assert world.episodes.counts.all() and not world.episodes.elapsed.any()
