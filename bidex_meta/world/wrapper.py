@@ -87,8 +87,10 @@ class NumpyWorld(VectorEnv):
 
     ``info`` has ``success``, ``unstable``, ... of every environment, and where one ended ``final_obs`` (an array of
     objects: observations, None in the others) and ``final_info``, whose ``episode`` has r, l, t, success, unscaled.
-    ``episode`` itself is left to ``RecordEpisodeStatistics``. With ``stagger`` a training world's first episodes begin
-    at random elapsed steps, and wrappers that count for themselves count them too short.
+    ``episode`` itself is left to ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be stepped, as
+    in the world, but its end is reported once, in the step that ended it: later steps would count as episodes. With
+    ``stagger`` a training world's first episodes begin at random elapsed steps, and wrappers that count for themselves
+    count them too short.
     """
 
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
@@ -119,7 +121,7 @@ class NumpyWorld(VectorEnv):
                 info["final_obs"][row] = obs
             info |= {name: _arrays(step_info[name]) for name in ("final_info", "_final_info")}
         obs, reward, terminated, truncated = map(_arrays, flags)
-        return obs, reward, terminated, truncated, info
+        return obs, reward, terminated & ended, truncated & ended, info
 
     def render(self) -> tuple[np.ndarray, ...]:
         """A picture of each environment, (height, width, 3), uint8."""

@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,7 +33,7 @@ def films(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
             assert fps == 60
             self.frames = frames
 
-        def write_videofile(self, path: str, logger: Any) -> None:
+        def write_videofile(self, path: str, logger: Any = None) -> None:
             written[Path(path).name] = self.frames
 
     for name in ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"):
@@ -139,6 +140,40 @@ def test_video_of_the_numpy_form(films: dict[str, list[np.ndarray]], tmp_path: P
     env.close()
     (frames,) = films.values()
     assert [frame.shape for frame in frames] == [(8, 12, 3)] * 6 and set(np.unique(frames[0])) == {0, 1, 2, 3}
+
+
+def test_video_of_stable_baselines3(films: dict[str, list[np.ndarray]], tmp_path: Path) -> None:
+    vec_env = pytest.importorskip("stable_baselines3.common.vec_env", reason="needs the extra sb3")
+    world = import_module("bidex_meta.clients.sb3_env").SB3VecEnv(class_world("CatchUnderarm", 4))
+    env = vec_env.VecVideoRecorder(world, str(tmp_path), lambda step: step == 0, video_length=5)
+    env.reset()
+    for _ in range(6):
+        env.step(np.zeros((4, 52), np.float32))
+    env.close()
+    (frames,) = films.values()
+    assert len(frames) == 6 and {frame.shape for frame in frames} == {(8, 12, 3)}
+    assert set(np.unique(frames[0])) == {0, 1, 2, 3}
+
+
+def test_an_end_is_reported_once_where_nothing_resets_by_itself() -> None:
+    """Of a DISABLED world, whose own flags stay until a reset."""
+    env = wrap.RecordEpisodeStatistics(NumpyWorld(points("DISABLED")), buffer_length=10_000)
+    env.reset(seed=0)
+    action = np.full((ROWS, 2), 0.3, np.float32)
+    ends, told = np.zeros(ROWS, int), 0
+    for _ in range(50):
+        _, reward, terminated, truncated, info = env.step(action)
+        assert not reward[ends > 0].any()
+        ends += terminated | truncated
+        told += int(info["_episode"].sum()) if "episode" in info else 0
+    assert (ends == 1).all() and env.episode_count == told == ROWS
+    first = np.arange(ROWS) < 3
+    env.reset(options={"reset_mask": first.copy()})
+    for _ in range(15):
+        _, _, terminated, truncated, _ = env.step(action)
+        ends += terminated | truncated
+    assert ends.tolist() == [2] * 3 + [1] * (ROWS - 3) and env.episode_count == ROWS + 3
+    assert max(env.length_queue) <= 12
 
 
 def test_other_wrappers_of_the_numpy_form() -> None:
