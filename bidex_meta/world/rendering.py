@@ -1,5 +1,6 @@
 """Pictures of a row: its scene from a fixed camera, with its goal as a ghost."""
 
+import threading
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -30,8 +31,11 @@ Ghost = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A goal: position (3,), quaternion (w, x, y, z), semi-axes (3,), world, metres."""
 
 
-class Painter:
-    """Draws rows of a world; renderers are cached. A copy starts without any: they cannot be copied."""
+class Painter(threading.local):
+    """Draws rows of a world; renderers are cached. A copy starts without any: they cannot be copied.
+
+    A renderer draws in the thread that made it alone. Each thread therefore has its own cache, which ends with it.
+    """
 
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int, int], tuple[mujoco.Renderer, mujoco.MjData]] = {}
@@ -91,7 +95,7 @@ class Painter:
         return self._renderers[key]
 
     def close(self) -> None:
-        """Frees the renderers."""
+        """Free the renderers of this thread."""
         while self._renderers:
             self._renderers.popitem()[1][0].close()
 

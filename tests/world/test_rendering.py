@@ -1,6 +1,7 @@
 """Pictures: which renderers are made. What they show is looked at by people."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -73,6 +74,21 @@ def test_pixels_come_with_every_observation_and_change_nothing_else(world, monke
     for wrong in (-1, 2000, 1.5):
         with pytest.raises(BidexError, match="pixels"):
             make_task_world("CatchUnderarm", num_envs=1, pixels=wrong)  # type: ignore[arg-type]
+
+
+def test_every_thread_draws():
+    try:
+        gl_backend.prepare()
+    except BidexError as error:
+        pytest.skip(str(error))
+    world = make_task_world("CatchUnderarm", 2, "cpu", seed=0, threads=1, autoreset_mode="DISABLED")
+    world.reset(seed=0)
+    here = world.render(1, 48, 36)
+    for _ in range(2):  # the second is likely to have the number of the first
+        with ThreadPoolExecutor(1) as thread:
+            assert np.array_equal(thread.submit(world.render, 1, 48, 36).result(), here)
+    assert np.array_equal(world.render(1, 48, 36), here)
+    world.close()
 
 
 def test_pixels_show_what_moves():
