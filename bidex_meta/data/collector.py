@@ -36,6 +36,9 @@ class EpisodeCollector(PooledWorldWrapper):
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
         super().__init__(world)  # type: ignore[arg-type]  # without pools there are no variations
+        if world.metadata["autoreset_mode"].name == "NEXT_STEP":
+            what = "Expected a world in autoreset mode SAME_STEP or DISABLED to record, got NEXT_STEP"
+            raise BidexError(f"{what}; make it without autoreset_mode.")
         chosen = range(world.num_envs) if rows is None else rows
         if len(set(chosen)) != len(chosen) or not all(0 <= row < world.num_envs for row in chosen):
             most = world.num_envs - 1

@@ -133,3 +133,8 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     other.open(tmp_path / "other")
     with pytest.raises(BidexError, match="of other rows"):
         other.load_state_dict(state)
+
+
+def test_a_world_whose_later_episodes_would_be_missed_is_refused():
+    with pytest.raises(BidexError, match="SAME_STEP or DISABLED to record, got NEXT_STEP"):
+        EpisodeCollector(rough(mode="NEXT_STEP"), lambda episode: None)
