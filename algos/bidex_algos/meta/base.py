@@ -228,7 +228,11 @@ class MetaLearner(Learner):
             first = self.env_steps == 0 and self.steps_with_tasks == 0
             obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
-        earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
+        earned = torch.zeros(len(running), device=self.device)
+        # A slice counts an episode if the suite's rule does where slice or episode ends, and it meets the goal within.
+        success = torch.zeros_like(running)
+        ended_well = torch.zeros_like(running)
+        met = torch.zeros_like(running)
         steps = torch.zeros_like(self.elapsed[0])
         for t in range(horizon):
             normal = policy.observations(obs)
@@ -249,7 +253,9 @@ class MetaLearner(Learner):
                 ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
             )  # fmt: skip
             earned += info["reward_unscaled"].masked_fill(~valid, 0.0)
-            success |= info["success"] & valid
+            success = torch.where(running, info["so_far"]["success"], success)
+            ended_well |= success & over & running
+            met |= info["success"] & valid
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
             if self.config.slice_steps is None:
                 running = running & ~over
@@ -257,7 +263,7 @@ class MetaLearner(Learner):
                     break
         self.obs = obs
         self.steps_with_tasks += len(stage)
-        return stage, Outcome(earned, success, steps)
+        return stage, Outcome(earned, (success | ended_well) & met, steps)
 
     def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
         last = k == self.config.inner_steps

@@ -174,7 +174,7 @@ def play(
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
             earned, whole = earned + reward, whole & (valid | ~playing)
-            success = success | (info["success"] & playing)
+            success = torch.where(playing, info["so_far"]["success"], success)
             playing = playing & ~ended
             if maths.may_look(device) and not playing.any():
                 break
