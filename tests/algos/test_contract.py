@@ -153,6 +153,17 @@ def test_an_episode_that_is_cut_is_judged_where_it_is_cut(name: str) -> None:
     assert {value for tag, value in found.items() if "success" in tag} == {0.75}
 
 
+@pytest.mark.parametrize("name", ["rl2", "varibad", "icl", "maml", "promp"])
+def test_episodes_of_a_trial_are_whole_by_default(name: str) -> None:
+    case = CASES[name]
+    options = {**case.options, "episodes_per_trial": 1}
+    known = {key: value for key, value in options.items() if hasattr(case.config, key) and key != "max_adapt_steps"}
+    learner = Case(case.algo, known).make(world=PointGoals(8, classes=(PointClass(steps=170, count=2),)))
+    learner.iterate()
+    stages = 2 if name in ("maml", "promp") else 1
+    assert learner.env_steps == stages * 8 * 170
+
+
 @pytest.mark.parametrize("name", ["maml slices", "promp slices"])
 def test_a_slice_is_judged_where_it_ends(name: str) -> None:
     """Three quarters lose the goal before the first slice ends; the second holds the ends of the other episodes."""

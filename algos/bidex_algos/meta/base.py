@@ -141,6 +141,7 @@ class MetaLearner(Learner):
             raise BidexError(f"{self.name}: learns in one process, got {world_size()}. Start it without torchrun.")
         super().__init__(world, config, seed)
         self.policy.seed = seed
+        self.adapt_steps = config.max_adapt_steps or int(world.max_episode_steps.max())
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
@@ -181,7 +182,7 @@ class MetaLearner(Learner):
         return norm
 
     def _iterate(self) -> dict[str, float]:
-        if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
+        if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.adapt_steps:
             self._draw_tasks()
         adapter = self.policy.adapter
         adapter.project()
@@ -220,7 +221,7 @@ class MetaLearner(Learner):
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
         """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
         policy, rows, stage = self.policy, self.rows, Stage()
-        longest = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
+        longest = min(int(self.world.max_episode_steps.max()), self.adapt_steps)
         horizon = self.config.slice_steps or longest
         obs = self.obs
         if obs is None or self.config.slice_steps is None:
