@@ -12,7 +12,18 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Randomisation, Split, Suite, SuiteClass, load_suite
+from bidex_meta.suite import (
+    MOST_POINTS,
+    OTHER_SEED,
+    OTHERS,
+    SPLITS,
+    ListedTask,
+    Randomisation,
+    Split,
+    Suite,
+    SuiteClass,
+    load_suite,
+)
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
@@ -120,6 +131,11 @@ class Benchmark:
         return list(self._tasks["test"])
 
     @property
+    def others(self) -> "Benchmark":
+        """The suite with as many other tasks, whose train tasks no run trained on."""
+        return Benchmark(self.suite, self.seed + OTHER_SEED)
+
+    @property
     def padded_size(self) -> int:
         """Width to which every observation is padded, before a one-hot: the widest class of the suite, both splits."""
         return max(task_class.observation_size for task_class in self._classes.values())
@@ -143,7 +159,8 @@ class Benchmark:
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo their number.
 
         Args:
-            split: `"train"` or `"test"`.
+            split: `"train"`, `"test"`, or `"others"`: as many tasks of the train classes that no run trained on, drawn
+                by another seed.
             num_envs: Environments over all classes, divided evenly; left out, 1024 on the CPU, 8192 on an accelerator.
             device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
             seed: Seed of starts and task draws; left out, the benchmark's.
@@ -159,6 +176,10 @@ class Benchmark:
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
+        if split == OTHERS:
+            return self.others.make_world(
+                "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels
+            )
         slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
         if randomisation is None:
             randomisation = mode.name != "DISABLED"
@@ -201,9 +222,9 @@ class Benchmark:
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
-            raise BidexError(
-                f"{self.name} has the splits {', '.join(self.suite.splits)}, got {shortened(split)}. Name one of these."
-            )
+            known = ", ".join(self.suite.splits)
+            what = f"{self.name} has the splits {known}, got {shortened(split)}"
+            raise BidexError(f"{what}. Name one of these, or {OTHERS}.")
         return cast(Split, split)
 
     def _slots(self, split: Split) -> list[Slot]:

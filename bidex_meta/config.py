@@ -87,8 +87,8 @@ class RunConfig(Generic[LearnerSettings]):
     algo: Text
     """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
     preset: Text = "auto"
-    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
-    CPU, on a GPU paper (of maml and promp laptop there too)."""
+    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, v2 for one
+    of version 2 if the learner has it, else laptop on a CPU, on a GPU paper (of maml and promp laptop there too)."""
     learner: LearnerSettings
     num_envs: Environments
     """Environments stepped together by each process, over all tasks."""

@@ -20,6 +20,8 @@ from bidex_meta.utils.validation import check_fields, check_rising, parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
+OTHERS, OTHER_SEED = "others", 500_000
+"""Name of the tasks of train classes that no run trained on, and what is added to a run's seed to draw them."""
 MOST_POINTS = 16_384
 """Of a cloud: more than a coarse image has pixels are no finer."""
 METAWORLD_SUITES: dict[str, tuple[str, ...]] = {

@@ -26,6 +26,7 @@ class FakeWorld(ABC):
     """
 
     kept: tuple[str, ...] = ()
+    success_at_end = False
 
     def __init__(
         self,
@@ -136,13 +137,13 @@ class FakeWorld(ABC):
         """Tells the step, and begins new episodes or keeps the flags of ended ones."""
         episodes, ended = self.episodes, (terminated | truncated) & active
         info: Info = {
-            "success": success.clone(),
+            "success": episodes.solved_at_end.clone() if self.success_at_end else success.clone(),
             "unstable": broken,
             "reward_unscaled": unscaled.clone(),
             "reward_terms": {"all": unscaled},
             "final_obs": final_obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(at_end=False),
+            "so_far": episodes.statistics(self.success_at_end),
             "counted": ended & episodes.counts,
         }
         if ended.any():

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import spread
-from bidex_meta.cli.metatest import OTHERS, adapt_steps_of, others_of
+from bidex_meta.cli.metatest import adapt_steps_of
 from bidex_meta.cli.policies import load_policy
 from bidex_meta.cli.run_teachers import teachers_of
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.runs import RunFolder
+from bidex_meta.suite import OTHERS
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.worlds import Worlds
 
@@ -40,7 +41,7 @@ def ladder(
     if folder.config().algo != ICL.name:
         raise BidexError(f"Expected a run of icl, got one of {folder.config().algo}.")
     worlds = Worlds.open(folder.config().to_json())
-    worlds, split = (others_of(worlds), "train") if split == OTHERS else (worlds, split)
+    worlds, split = (worlds.others, "train") if split == OTHERS else (worlds, split)
     world: Any = worlds.world(split, tasks * len(worlds.tasks(split)))
     hidden, found = HiddenParts(world), dict[str, dict[str, list[float]]]()
     longest = adapt_steps_of(folder.config())

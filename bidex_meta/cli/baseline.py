@@ -12,7 +12,7 @@ from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation import references
-from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.runs.versions import collect_versions
@@ -90,7 +90,7 @@ def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
         witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
         agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
         names = list(witnesses)
-    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED, references={})
+    found = evaluate(agent, world, flags.episodes, references={})
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 
@@ -103,6 +103,6 @@ def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
         raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {flags.suite}.")
     world = worlds.world()
     assert isinstance(world, World)
-    found = evaluate(Scripted(world, names=names), world, flags.episodes, seed=EVALUATION_SEED, references={})
+    found = evaluate(Scripted(world, names=names), world, flags.episodes, references={})
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})

@@ -13,7 +13,7 @@ from bidex_meta.cli.tables import Json, gained, percent, plain, print_table, say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.control_arms import Control, arms, control
-from bidex_meta.evaluation.play import EVALUATION_SEED
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.world.threads import set_up_torch
@@ -35,7 +35,7 @@ class ControlFlags:
     shots: Shots = 1  # Adapt so often, one after the other.
     rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, but 40 at most.
     num_envs: Environments = 1024  # Environments stepped together at most; bounds memory.
-    seed: Seed | None = None  # Seed of the episodes' starts; None: one that training does not use.
+    seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False
@@ -115,11 +115,13 @@ def _play(folder: RunFolder, flags: ControlFlags) -> Control:
     size = metatest.environments_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
     say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
     test, train = (worlds.world(split, size) for split in ("test", "train"))
-    seed = EVALUATION_SEED if flags.seed is None else flags.seed
+    protocol = Protocol(
+        "test", flags.seed, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
+        max_adapt_steps=metatest.adapt_steps_of(config)
+    )  # fmt: skip
     found = control(
-        policy_loader(folder, device)[0], test, train, flags.shots, say=say, rollouts=rollouts,
-        episodes_per_task=flags.episodes, trials=flags.trials, max_adapt_steps=metatest.adapt_steps_of(config),
-        seed=seed, references=worlds.references(),
+        policy_loader(folder, device)[0], test, train, flags.shots, say=say, protocol=protocol,
+        references=worlds.references(),
     )  # fmt: skip
     test.close()
     train.close()

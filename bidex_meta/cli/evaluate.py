@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import OTHERS, Options, check_worlds, meta_test, others_of, print_tables, splits_of
+from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.policies import load_policy, policy_loader
 from bidex_meta.cli.tables import Json, evaluation_table, print_table, result_table, say
@@ -20,6 +20,7 @@ from bidex_meta.evaluation.play import RandomAgent, Watched
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.versions import package_versions
+from bidex_meta.suite import OTHERS
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
@@ -105,7 +106,7 @@ def judged_on_others(
     brief: bool = False,
 ) -> tuple[Json, Table]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
-    others = others_of(worlds)
+    others = worlds.others
     title = f"{algo} on {others.name}, other tasks (seed {others.seed})"
     found, table = judged(others, policy, step, split, options, random, title, brief)
     return {"task_seed": others.seed, **found}, table
@@ -127,11 +128,12 @@ def judged(
     """
     world = worlds.world(split, options.num_envs)
     longest = int(world.max_episode_steps.max())
-    found = worlds.judge(Watched(policy, longest, "Evaluating"), world, options.episodes, options.starts)
-    result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
+    protocol = worlds.protocol(split, options.episodes, options.seed)
+    found = worlds.judge(Watched(policy, longest, "Evaluating"), world, protocol)
+    result, other = {"steps": step, "split": split, "seed": protocol.seed, "policy": found.to_json()}, None
     if random:
         uniform = Watched(RandomAgent(world.action_space), longest, "A random policy")
-        other = worlds.judge(uniform, world, options.episodes, options.starts)
+        other = worlds.judge(uniform, world, protocol)
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
         result |= {"random": other.to_json(), "return_above_random": differences}
     world.close()
@@ -151,7 +153,7 @@ def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, world
     if not flags.json:
         print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
     tests = {split: result.to_json() for split, result in found.items()}
-    return {"steps": step, "seed": flags.starts, "splits": tests}
+    return {"steps": step, "seed": flags.seed, "splits": tests}
 
 
 def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:

@@ -1,20 +1,19 @@
 """The meta-test of a run whose learner adapts: its size, its worlds, its tables."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, MetaEvaluation, meta_evaluate
-from bidex_meta.evaluation.play import EVALUATION_SEED
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
+from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
+from bidex_meta.suite import OTHERS
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.worlds import Worlds
 
-OTHER_SEED = 500_000  # added to a run's seed for tasks that it was not trained on
-OTHERS = "others"  # the split of train classes with such tasks
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
 _ROLLOUTS, _MOST_ROLLOUTS = 10, 40  # episodes of a task in a shot where the config has none; the most taken from it
 _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
@@ -36,12 +35,7 @@ class Options:
     num_envs: Environments | None = None
     """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
     class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
-    seed: Seed | None = None  # Seed of the episodes' starts; None: one that training does not use.
-
-    @property
-    def starts(self) -> int:
-        """The seed of the episodes' starts."""
-        return EVALUATION_SEED if self.seed is None else self.seed
+    seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
 
 
 def meta_test(
@@ -54,36 +48,43 @@ def meta_test(
     ``algo``, ``num_envs`` and ``learner`` are read; ``say`` is called with what begins.
     """
     check_worlds(worlds, config.algo)
-    found, own = {}, worlds
-    limit = options.num_envs or _ENVIRONMENTS
-    for name in splits:
-        worlds, split = (others_of(own), "train") if name == OTHERS else (own, name)
-        counts = [len(pool) for pool in worlds.tasks(split).values()]
-        rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
-        tasks = min(options.tasks or TASKS, max(counts))
-        trials = options.trials or -(-TASKS // tasks)
-        num_envs = environments_for(len(counts), tasks * trials, rollouts, limit)
-        shots = 1 if options.shots is None else options.shots
-        episodes = options.episodes or rollouts  # which the same environments play at once
-        often = f", each {trials} times" if trials > 1 else ""
-        kind = "other" if name == OTHERS else name
+    found = {}
+    for split in splits:
+        source, part = (worlds.others, "train") if split == OTHERS else (worlds, split)
+        counts = [len(pool) for pool in source.tasks(part).values()]
+        limit = options.num_envs or _ENVIRONMENTS
+        protocol = _protocol(worlds, config, options, split, counts, limit)
+        rollouts = protocol.rollouts or 1
+        num_envs = environments_for(len(counts), (protocol.tasks or 1) * protocol.trials, rollouts, limit)
+        often = f", each {protocol.trials} times" if protocol.trials > 1 else ""
+        kind = "other" if split == OTHERS else split
         say(
-            f"Meta-test on {kind} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
-            f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
-            f"episodes, {num_envs} environments."
+            f"Meta-test on {kind} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {protocol.tasks} of "
+            f"{max(counts)} tasks of each{often}, {protocol.shots} shot{'s' * (protocol.shots != 1)} of {rollouts} "
+            f"episodes, {protocol.episodes_per_task} evaluation episodes, {num_envs} environments."
         )
-        world = worlds.world(split, num_envs)
-        found[name] = meta_evaluate(
-            load(), world, shots, rollouts=rollouts, episodes_per_task=episodes, tasks=tasks, trials=trials,
-            max_adapt_steps=adapt_steps_of(config), seed=options.starts, references=worlds.references(), split=name,
-        )  # fmt: skip
+        world = source.world(part, num_envs)
+        found[split] = meta_evaluate(load(), world, protocol=protocol, references=source.references())
         world.close()
     return found
 
 
-def adapt_steps_of(config: RunConfig) -> int:
-    """Longest episode that a run's learner adapts to."""
-    return config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS)
+def _protocol(
+    worlds: Worlds, config: RunConfig, options: Options, split: str, counts: list[int], limit: int
+) -> Protocol:
+    """What is played of a split whose classes have ``counts`` tasks, in ``limit`` environments at most."""
+    rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
+    tasks = min(options.tasks or TASKS, max(counts))
+    return Protocol(
+        split, options.seed, tasks, shots=1 if options.shots is None else options.shots, rollouts=rollouts,
+        episodes_per_task=options.episodes or rollouts,  # which the same environments play at once
+        trials=options.trials or -(-TASKS // tasks), max_adapt_steps=adapt_steps_of(config)
+    )  # fmt: skip
+
+
+def adapt_steps_of(config: RunConfig) -> int | None:
+    """Return the longest episode that a run's learner adapts to; None: whole episodes."""
+    return config.learner_values.get("max_adapt_steps")
 
 
 def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int) -> int:
@@ -122,11 +123,6 @@ def check_worlds(worlds: Worlds, algo: str) -> None:
             f"{algo} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite: "
             "--suite ML1, ML4, ML20, or a file of kind meta."
         )
-
-
-def others_of(worlds: Worlds) -> Worlds:
-    """Worlds of as many tasks of each class, drawn by another seed."""
-    return Worlds.open(replace(worlds.config, task_seed=worlds.seed + OTHER_SEED))
 
 
 def splits_of(worlds: Worlds, asked: str) -> list[str]:

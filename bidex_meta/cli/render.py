@@ -27,8 +27,8 @@ class RenderFlags(LookFlags):
     out: Path | None = None
     """File: .png (picture), .mp4 (film) or .webp (film for web pages); None, of a run: a film in its videos/."""
     tiled: Switch = False
-    """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
-    first success to the end of the episode."""
+    """All classes of the suite beside each other; where an episode ends the next one begins. A name is green while
+    the episode counts as a success: from its first success on; in version 2 while the goal is held."""
     large: Switch = False
     """With --tiled: one class at a time large beside all."""
     steps: Steps | None = None

@@ -260,7 +260,7 @@ def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes, tasks=flags.tasks)
     load = partial(plan.kind.make.load_policy, learner.policy_state_dict(), device)
     result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), say)
-    report = {"steps": learner.env_steps, "seed": options.starts}
+    report = {"steps": learner.env_steps, "seed": options.seed}
     report["splits"] = {split: each.to_json() for split, each in result.items()}
     write_json(folder.evaluation_path, report | {"conditions": conditions(source)})
     metatest.print_tables(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)

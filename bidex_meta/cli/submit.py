@@ -6,7 +6,6 @@ from pathlib import Path
 
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import others_of
 from bidex_meta.cli.parsing import Device, RunPaths, parse
 from bidex_meta.cli.policies import load_policy
 from bidex_meta.cli.tables import Json, say
@@ -14,7 +13,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.leaderboard import class_rows, estimate, iqm, read_entry
-from bidex_meta.evaluation.play import EVALUATION_SEED, Watched
+from bidex_meta.evaluation.play import Watched
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
@@ -100,7 +99,7 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     config = stored.to_json()
     config |= {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": "auto"}
     worlds = Worlds.open(config)
-    others = others_of(worlds)
+    others = worlds.others
     set_up_torch(stored.threads)
     policy, steps = load_policy(folder, config["device"])
     found = []
@@ -108,6 +107,6 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
         say(f"{folder.path}: playing {what}.")
         world = where.world("train")
         watched = Watched(policy, int(world.max_episode_steps.max()), "Playing")
-        found.append(where.judge(watched, world, flags.episodes, EVALUATION_SEED))
+        found.append(where.judge(watched, world, where.protocol("train", flags.episodes)))
         world.close()
     return found[0], found[1], steps, conditions(worlds)

@@ -14,7 +14,7 @@ from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.policies import load_policy
 from bidex_meta.cli.tables import Json, plain_table, print_table, say
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import EVALUATION_SEED, HeldAgent, RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability
 from bidex_meta.runs import RunFolder
@@ -149,7 +149,7 @@ def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, di
     for name, (agent, classes) in agents.items():
         if classes:
             say(f"{name} actions in all tasks")
-            found = evaluate(agent, world, 1, seed=EVALUATION_SEED, references={}).classes
+            found = evaluate(agent, world, 1, references={}).classes
             for each in classes:
                 results[each][name] = found[each]
     rules = {slot.name: slot.task_class.rules for slot in world.slots}
@@ -159,7 +159,7 @@ def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, di
         config = replace(WorldConfig.of(folder.config().to_json()), task_seed=flags.seed, threads=flags.threads)
         own = Worlds.open(config)
         agent, _ = load_policy(folder, "cpu")
-        for name, result in own.judge(agent, own.world(), 1, EVALUATION_SEED).classes.items():
+        for name, result in own.judge(agent, own.world(), own.protocol("train", 1)).classes.items():
             if rules.get(plain_name(name)) == own.task_classes()[name].rules:
                 results[plain_name(name)][folder.path.name] = result
     return results

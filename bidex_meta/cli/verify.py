@@ -9,7 +9,7 @@ from typing import NotRequired, TypedDict
 
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import OTHERS, TASKS, Options, meta_test
+from bidex_meta.cli.metatest import TASKS, Options, meta_test
 from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
 from bidex_meta.cli.policies import checkpoint, policy_of
 from bidex_meta.cli.tables import Json, percent, plain, print_table, ranged, say, titled
@@ -17,6 +17,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
 from bidex_meta.runs import RunFolder, schemas
+from bidex_meta.suite import OTHERS
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
 from bidex_meta.utils.validation import parse as parse_content
@@ -39,6 +40,7 @@ class _Split(TypedDict):
     shots: Shots
     rollouts: Few
     trials: Few
+    max_adapt_steps: NotRequired[Few]
     before: _Part
     after: _Part
 
@@ -174,9 +176,9 @@ def _again(
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
-        world = worlds.world(recorded.get("split", "train"), num_envs)
-        episodes = recorded.get("policy", recorded)["episodes_per_task"]
-        found = worlds.judge(load(), world, episodes, recorded["seed"])
+        split, episodes = recorded.get("split", "train"), recorded.get("policy", recorded)["episodes_per_task"]
+        world = worlds.world(split, num_envs)
+        found = worlds.judge(load(), world, worlds.protocol(split, episodes, recorded["seed"]))
         world.close()
         return {"policy": found.to_json()}
     splits = {}
@@ -189,6 +191,8 @@ def _again(
             tasks=max(row.get("tasks", TASKS) for row in before["classes"].values()),
             num_envs=num_envs, seed=recorded["seed"],
         )  # fmt: skip
+        if "max_adapt_steps" in part:
+            config = replace(config, learner={**config.learner, "max_adapt_steps": part["max_adapt_steps"]})
         splits[split] = meta_test(worlds, config, load, options, [split], say)[split].to_json()
     return {"splits": splits}
 

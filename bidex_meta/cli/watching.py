@@ -16,7 +16,7 @@ from bidex_meta.cli.run_config import RunPlan
 from bidex_meta.cli.tables import say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.filming import film_tiles
-from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import Recorder, RunFolder
 from bidex_meta.runs.video import check_films
@@ -95,7 +95,7 @@ class Watch:
                 first = zip(world.task_names, world.pools, strict=True)
                 world.set_tasks({name: pool[:tasks] for name, pool in first})
         world, policy = self._worlds["evaluation"], self._policy(self._device)
-        return evaluate(policy, world, episodes, seed=EVALUATION_SEED, references=source.references())
+        return evaluate(policy, world, episodes, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""

@@ -52,8 +52,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Advances 1/60 s by an action (a,) in [-1, 1]: observation (d,) float32, reward, terminated, truncated, info.
 
-        `info`: ``success`` (of this state), ``unstable``, ``reward_terms``, and at an episode's end ``is_success`` (at
-        any step). Raises BidexError where no episode runs: its end would count twice.
+        `info`: ``success`` (of this state; in version 2 whether the goal has been held for 0.25 s), ``unstable``,
+        ``reward_terms``, and at an episode's end ``is_success``: whether the episode is a success, in version 1 at any
+        step, in version 2 at its end. Raises BidexError where no episode runs: its end would count twice.
         """
         if self._over:
             raise BidexError("Expected reset() before step(): no episode runs.")

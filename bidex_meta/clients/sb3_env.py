@@ -21,9 +21,9 @@ class SB3VecEnv(vec_env.VecEnv):
     """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
 
     `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
-    observation) and, unless it was a shortened first episode, `episode` (r, l, t), `is_success` (at any step), `task`.
-    `stagger`: shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does. Raises
-    BidexError for a world in another autoreset mode than SAME_STEP.
+    observation) and, unless it was a shortened first episode, `episode` (r, l, t), `is_success` (by the suite's rule)
+    and `task`. `stagger`: shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does.
+    Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:

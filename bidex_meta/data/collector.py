@@ -61,7 +61,7 @@ class EpisodeCollector(PooledWorldWrapper):
         self._observations = np.zeros((num, room + 1, d), np.float32)
         self._actions = np.zeros((num, room, a), np.float32)
         self._rewards = np.zeros((2, num, room), np.float32)  # as given, and unscaled
-        self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
+        self._running = np.zeros(num, bool)
         self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
@@ -82,9 +82,7 @@ class EpisodeCollector(PooledWorldWrapper):
         if not self._running.any():
             self._begin_again(info, obs)
             return result
-        unstable, ended, counted, success = (
-            self._own(info[name]) for name in ("unstable", "_final_obs", "counted", "success")
-        )
+        unstable, ended, counted = (self._own(info[name]) for name in ("unstable", "_final_obs", "counted"))
         good = np.flatnonzero(self._running & ~unstable)
         self._make_room(int(self._length.max()) + 1)
         at = self._length[good]
@@ -93,13 +91,13 @@ class EpisodeCollector(PooledWorldWrapper):
         self._rewards[1, good, at] = self._own(info["reward_unscaled"])[good]
         self._observations[good, at + 1] = self._own(info["final_obs"])[good]
         self._length[good] += 1
-        self._success[good] |= success[good]
         self.left_out[BROKEN] += int((self._running & unstable).sum())
         over = np.flatnonzero(self._running & ended)
         if len(over):
             true_end = self._own(terminated)
+            success = self._own(info["so_far"]["success"])
             for row in over.tolist():
-                self._end(row, bool(true_end[row]), bool(unstable[row]), bool(counted[row]))
+                self._end(row, bool(true_end[row]), bool(unstable[row]), bool(counted[row]), bool(success[row]))
             self._running[over] = False
         self._begin_again(info, obs)
         return result
@@ -118,12 +116,12 @@ class EpisodeCollector(PooledWorldWrapper):
         self._running &= ~mask
         mask = mask & self.active
         self._observations[mask, 0] = obs[mask]
-        self._length[mask], self._success[mask] = 0, False
+        self._length[mask] = 0
         self._running |= mask
         if isinstance(self.world, TaskWorld):
             self._task = np.where(mask, self._own(self.world.task_index), self._task)
 
-    def _end(self, row: int, terminated: bool, unstable: bool, counted: bool) -> None:
+    def _end(self, row: int, terminated: bool, unstable: bool, counted: bool, success: bool) -> None:
         """Hands an episode on, unless it was shortened or has no good transition."""
         length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
         if not counted:
@@ -143,7 +141,7 @@ class EpisodeCollector(PooledWorldWrapper):
                 task_name=self.world.task_names[slot],
                 task_index=task,
                 variation=self._pools[slot][task].copy() if self._pools else np.zeros(0),
-                success=bool(self._success[row]),
+                success=success,
                 broken=unstable,
                 return_unscaled=float(unscaled.sum(dtype=np.float64)),
                 row=self.rows[row],
@@ -168,7 +166,7 @@ class EpisodeCollector(PooledWorldWrapper):
         """The running episodes, for a checkpoint: tensors, copied."""
         most = int(self._length.max(initial=0))
         arrays = {"observations": self._observations[:, : most + 1], "actions": self._actions[:, :most]}
-        arrays |= {"rewards": self._rewards[:, :, :most], "running": self._running, "success": self._success}
+        arrays |= {"rewards": self._rewards[:, :, :most], "running": self._running}
         arrays |= {"length": self._length, "task": self._task, "rows": np.array(self.rows, np.int64)}
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
@@ -184,7 +182,7 @@ class EpisodeCollector(PooledWorldWrapper):
             self._make_room(self._actions.shape[1] + 1)
         self._observations[:, : most + 1], self._actions[:, :most] = given["observations"], given["actions"]
         self._rewards[:, :, :most] = given["rewards"]
-        self._running, self._success = given["running"].copy(), given["success"].copy()
+        self._running = given["running"].copy()
         self._length, self._task = given["length"].copy(), given["task"].copy()
         self._read_pools()
 

@@ -57,7 +57,7 @@ class Episode:
     task_name: str = ""  # its name: a class, or ``Class/task``
     task_index: int = 0  # task of the slot's pool
     variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: what that task freezes, if any
-    success: bool = False  # whether the goal was met after any transition
+    success: bool = False  # by the suite's rule: the goal was met at any step, or held at the end
     broken: bool = False  # whether physics broke in the next transition, which is left out
     return_unscaled: float = 0.0  # sum of the rewards by the printed formula, before the suite's scale
     row: int = 0  # environment of the process's world

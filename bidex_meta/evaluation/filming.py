@@ -44,9 +44,10 @@ def film_tiles(
 ) -> Iterator[np.ndarray]:
     """So many steps of several environments, tiles beside each other; each begins its next episode when one ends.
 
-    An environment's name is green from its first success on, until its episode ends. The world is in autoreset mode
-    DISABLED; the size is that of a tile. ``large``: left of the tiles, as high as they are, one environment after the
-    other, each for an equal share of the steps.
+    An environment's name is green while its episode counts as a success: from the first success to the end of the
+    episode, or, where success counts at the end, while the goal is held. The world is in autoreset mode DISABLED; the
+    size is that of a tile. ``large``: left of the tiles, as high as they are, one environment after the other, each for
+    an equal share of the steps.
     """
     names = [world.task_names[int(world.task_id[row])] for row in rows]
     obs, _ = world.reset(seed=seed)
@@ -64,7 +65,7 @@ def film_tiles(
         if step == steps:
             return
         obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
-        solved = solved | info["success"]
+        solved = info["so_far"]["success"]
         ended = terminated | truncated
         if bool(ended.any()):
             obs, _ = world.reset(options={"reset_mask": ended})

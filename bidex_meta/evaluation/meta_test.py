@@ -16,16 +16,14 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.gains import Gains, paired_gains
-from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
+from bidex_meta.evaluation.play import DEFAULT, check_world, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
-from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
-
-MAX_ADAPT_STEPS = 150  # steps after which an episode is long enough to adapt to, by default
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
 
@@ -37,11 +35,13 @@ class MetaEvaluation:
     by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
-    rollouts: int  # episodes of each task that a shot adapted to
-    trials: int  # adaptations of each task, each from the start
-    max_adapt_steps: int  # longest episode of adaptation
+    protocol: Protocol  # what was played, with the rollouts and the longest exploring episode that this came to
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
-    split: str = ""  # name of these tasks
+
+    @property
+    def rollouts(self) -> int:
+        """Episodes of each task that a shot adapted to."""
+        return self.protocol.rollouts or 1
 
     @property
     def before(self) -> Evaluation:
@@ -61,17 +61,19 @@ class MetaEvaluation:
         """Everything but the single episodes, ready for JSON."""
         by_shot = [found.to_json() for found in self.by_shot]
         return {
-            "split": self.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts, "trials": self.trials,
-            "max_adapt_steps": self.max_adapt_steps, "adapt_steps": self.adapt_steps, "before": by_shot[0],
-            "after": by_shot[-1], "gain": self.gains().to_json(), "by_shot": by_shot,
+            "split": self.protocol.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts,
+            "trials": self.protocol.trials, "max_adapt_steps": self.protocol.max_adapt_steps,
+            "adapt_steps": self.adapt_steps, "before": by_shot[0], "after": by_shot[-1],
+            "gain": self.gains().to_json(), "by_shot": by_shot,
         }  # fmt: skip
 
 
 def meta_evaluate(
-    agent: Agent, world: TaskWorld, shots: int = 1, *, rollouts: int | None = None, episodes_per_task: int = 4,
-    tasks: int | None = None, trials: int = 1, max_adapt_steps: int = MAX_ADAPT_STEPS, seed: int = EVALUATION_SEED,
+    agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
+    episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
+    max_adapt_steps: int | None = None, seed: int | None = None, protocol: Protocol = DEFAULT,
     references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
-    evaluated: Collection[int] | None = None, split: str = ""
+    evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent as ``evaluate`` does, ``shots`` times after exploring episodes of each task and adaptation.
 
@@ -82,46 +84,53 @@ def meta_evaluate(
     Args:
         agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: How often it adapts, one after the other.
-        rollouts: Episodes of each task in a shot; None: one in each environment that plays it.
-        episodes_per_task: Evaluation episodes of each task, after each trial.
-        tasks: Only the first so many of each pool; None takes all.
-        trials: How often each task is adapted to, from the start and with other episodes.
-        max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
-        seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
+        shots: Entry of ``protocol`` to replace, if not None; so are the next six.
+        rollouts: Likewise: exploring episodes of each task in a shot.
+        episodes_per_task: Likewise: evaluation episodes of each task, after each trial.
+        tasks: Likewise: only the first so many of each pool.
+        trials: Likewise: how often each task is adapted to, from the start and with other episodes.
+        max_adapt_steps: Likewise: steps after which exploring episodes are cut.
+        seed: Likewise. Without adaptation, and with all tasks in the world at once, starts are those of ``evaluate``.
+        protocol: What is played.
         references: As in ``evaluate``.
         adapt_world: Where to play episodes of adaptation instead, with the same starts: of as many environments, tasks.
         evaluated: After how many shots to evaluate (0: before all); None: always.
-        split: Name of the tasks, for the result.
 
     Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
+    protocol = protocol.changed(
+        shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
+        max_adapt_steps=max_adapt_steps, seed=seed
+    )  # fmt: skip
+    shots, seed = protocol.shots, protocol.seed
     worlds = [world] if adapt_world is None else [world, adapt_world]
-    _check(agent, worlds, shots, episodes_per_task, max_adapt_steps)
+    _check(agent, worlds, shots)
     found = {s: list[dict[str, np.ndarray]]() for s in range(shots + 1) if evaluated is None or s in evaluated}
     if not found:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
-    portions, field, adapt_steps = Portions(world, rollouts, tasks, trials), worlds[-1], [0] * shots
+    portions = Portions(world, protocol.rollouts, protocol.tasks, protocol.trials)
+    field = worlds[-1]
+    longest = protocol.max_adapt_steps or int(field.max_episode_steps.max())
+    adapt_steps = [0] * shots
     with portions.applied_to(worlds) as numbered:
         for number in numbered:
             learner = _begin(agent, world, field)
             for shot in range(shots + 1):
                 if shot > 0:
                     starts = _seed(seed, "adaptation", number, shot)
-                    adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, max_adapt_steps, starts)
+                    adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, longest, starts)
                 if shot in found:
                     starts = seed if number == 0 else _seed(seed, "evaluation", number)
-                    played = play_tasks(agent, world, episodes_per_task, starts)
+                    played = play_tasks(agent, world, protocol.episodes_per_task, starts)
                     found[shot].append(portions.labelled(played, number))
     joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
     references = references_of(world) if references is None else references
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
     first = joined[0]
     return MetaEvaluation(
-        by_shot=[Evaluation(classes, episodes_per_task) for classes in by_class],
+        by_shot=[Evaluation(classes, protocol.episodes_per_task) for classes in by_class],
         adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
-        rollouts=portions.rollouts, trials=trials, max_adapt_steps=max_adapt_steps, adapt_steps=adapt_steps,
-        split=split,
+        protocol=protocol.changed(rollouts=portions.rollouts, max_adapt_steps=longest), adapt_steps=adapt_steps
     )  # fmt: skip
 
 
@@ -183,9 +192,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
     return int(steps)
 
 
-def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int, episodes_per_task: int, max_steps: int) -> None:
-    whole_number("shots", shots, 0)
-    whole_number("max_adapt_steps", max_steps, 1)
+def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int) -> None:
     lacking = [name for name in _ADAPTS if not hasattr(agent, name)]
     if shots and lacking:
         raise BidexError(
@@ -193,7 +200,7 @@ def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int, episodes_per_t
             f"{', '.join(lacking)}. Give such an agent, or shots=0."
         )
     for world in worlds:
-        check_world(world, episodes_per_task)
+        check_world(world)
     sizes = [(w.num_envs, w.single_observation_space.shape, w.single_action_space.shape) for w in worlds]
     if sizes[0] != sizes[-1]:
         raise BidexError(

@@ -17,38 +17,45 @@ from gymnasium.vector import AutoresetMode
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.suite import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
-from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
+DEFAULT = Protocol()
 _SECONDS = 15.0  # from one sign of life of ``Watched`` to the next
-EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains with it, so they are new to the policy
 
 
 def evaluate(
-    agent: Agent, world: TaskWorld, episodes_per_task: int = 4, *, seed: int | None = None,
-    references: Mapping[str, Reference] | None = None
+    agent: Agent, world: TaskWorld, episodes_per_task: int | None = None, *, seed: int | None = None,
+    protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None
 ) -> Evaluation:  # fmt: skip
-    """Play every task of ``world`` ``episodes_per_task`` times and report per class.
+    """Play every task of ``world`` equally often, from the starts of the protocol's seed, and report per class.
 
     The world is in autoreset mode DISABLED, with at least one environment for each task; those that share a task share
-    its episodes. Without ``seed`` its own goes on. ``references``, by class, are what the normalised score and broken
-    episodes are measured against; by default those that the installation stores of the world's classes.
+    its episodes. ``episodes_per_task`` (4) and ``seed`` (``EVALUATION_SEED``, as in the commands) replace those of
+    ``protocol``. ``references``, by class, are what the normalised score and broken episodes are measured against; by
+    default those that the installation stores of the world's classes.
 
-    Raises BidexError where the world resets by itself or lacks environments, ``episodes_per_task`` is not positive, or
-    torch's default precision is not single.
+    Raises BidexError where the world resets by itself or lacks environments, a number is out of range, the protocol
+    names fewer tasks than all, or torch's default precision is not single.
     """
+    protocol = protocol.changed(episodes_per_task=episodes_per_task, seed=seed)
+    if protocol.tasks is not None:
+        raise BidexError(
+            f"evaluate plays all tasks of a world, got a protocol with tasks={protocol.tasks}. Give the world fewer "
+            "(set_tasks), or call meta_evaluate with shots=0."
+        )
     check_precision()
-    check_world(world, episodes_per_task)
-    episodes = play_tasks(agent, world, episodes_per_task, seed)
+    check_world(world)
+    episodes = play_tasks(agent, world, protocol.episodes_per_task, protocol.seed)
     references = references_of(world) if references is None else references
-    return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)
+    return Evaluation(results_by_class(world.task_names, episodes, references), protocol.episodes_per_task)
 
 
-def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
+def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int) -> dict[str, np.ndarray]:
     """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them, as arrays ``(episodes,)``.
 
     They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule), ``once``
@@ -70,9 +77,8 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
     return {"slot": world.task_id.cpu().numpy()[row], "task": tasks.cpu().numpy()[row], **episodes}
 
 
-def check_world(world: TaskWorld, episodes_per_task: int) -> None:
+def check_world(world: TaskWorld) -> None:
     """Raises BidexError where a world cannot be evaluated on."""
-    whole_number("episodes_per_task", episodes_per_task, 1, 1_000_000)
     if not hasattr(world, "metadata") or not isinstance(world.metadata, Mapping):
         raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
     mode = world.metadata.get("autoreset_mode")

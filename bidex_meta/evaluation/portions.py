@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
@@ -26,13 +25,10 @@ class Portions:
     """Which adaptations are played together: the first so many ``tasks`` of each pool (None: all), in all ``trials``.
 
     ``rollouts`` are episodes of each task in a shot; None: one in each of its environments, with all tasks at once.
-    Raises BidexError for a number below 1; the world is not touched.
+    The numbers are from 1 on; the world is not touched.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
-        for name, number in (("rollouts", rollouts), ("tasks", tasks), ("trials", trials)):
-            if number is not None:
-                whole_number(name, number, 1)
         self._pool_sizes = list(world.num_slot_tasks)
         # The task of each adaptation, for each slot.
         self._adaptations = [np.tile(np.arange(min(tasks or size, size)), trials) for size in self._pool_sizes]

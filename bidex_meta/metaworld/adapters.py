@@ -159,10 +159,13 @@ class MetaWorldEnvs(VectorEnv):
         """Advances every environment by actions (num_envs, a) in [-1, 1].
 
         Returns observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
-        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``).
+        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). Where success
+        counts at the end of an episode there is none before its last step, and ``terminate_on_success`` shortens none.
         """
         obs, reward, terminated, truncated, info = self.world.step(torch.as_tensor(np.asarray(actions)))
         success = info["success"]
+        if self.world.success_at_end:
+            success = success & (terminated | truncated)
         if self.terminate_on_success:
             terminated = terminated | success
             truncated = truncated & ~success

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.play import check_world, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.metaworld.library import (
@@ -130,7 +131,7 @@ class MetaWorldWorld(ForeignWorld):
 
 
 def evaluate_all_tasks(
-    agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int | None = None
+    agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int = EVALUATION_SEED
 ) -> Evaluation:
     """``evaluate`` over all tasks of all classes, as many at a time as the world has environments.
 
@@ -138,13 +139,14 @@ def evaluate_all_tasks(
     plays every episode of a task alike, and one is enough. ``world`` is a ``MetaWorldWorld`` in autoreset mode
     DISABLED; it is left with other pools.
     """
-    check_world(world, episodes_per_task)
+    protocol = Protocol(seed=seed, episodes_per_task=episodes_per_task)
+    check_world(world)
     at_once = min(rows.stop - rows.start for rows in world.slot_rows)
     parts: list[dict[str, np.ndarray]] = []
     for first in range(0, TASKS_PER_CLASS, at_once):
         pool = np.arange(first, min(first + at_once, TASKS_PER_CLASS))
         world.set_tasks({name: pool for name in world.task_names})
-        played = play_tasks(agent, world, episodes_per_task, seed)
+        played = play_tasks(agent, world, protocol.episodes_per_task, protocol.seed)
         parts.append(played | {"task": played["task"] + first})
     episodes = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return Evaluation(results_by_class(world.task_names, episodes), episodes_per_task)

@@ -42,7 +42,7 @@ class Stage:
         self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
-        self._success |= info["success"].cpu().numpy()
+        self._success = info["so_far"]["success"].cpu().numpy().copy()
         ended = terminated | truncated
         if bool(ended.any()):
             over = ended.cpu().numpy()
@@ -98,6 +98,7 @@ class Stage:
             "class": self.names[row],
             "step": f"{self._steps[row]} of {most}",
             "return": f"{self._returns[row]:.3g}",
+            # Where success counts at the end it is "yes" while the goal is held, and may be lost again.
             "success": "yes" if self._success[row] else "not yet",
             "episodes": f"{self._solved[row]} of {self._episodes[row]} solved",
         }

@@ -60,8 +60,7 @@ class BatchedWorld(VectorEnv, ABC):
     action_space: Box
     num_id_columns: int
     observation_groups: tuple[ObservationGroup, ...]
-    _at_end = False
-    """Whether success counts at the end of episodes."""
+    success_at_end = False
     _masked = False
     """Whether nothing in a step may look at a number (accelerators)."""
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
@@ -221,13 +220,13 @@ class BatchedWorld(VectorEnv, ABC):
         if self._masked or not valid.all():  # on the CPU looking costs less than a pass over all observations
             obs = torch.where(valid[:, None], obs, self._obs)
         info: Info = {
-            "success": episodes.solved_at_end if self._at_end else solved,
+            "success": episodes.solved_at_end if self.success_at_end else solved,
             "solved": solved,
             "unstable": unstable & active,
             "reward_unscaled": unscaled,
             "final_obs": obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(self._at_end),
+            "so_far": episodes.statistics(self.success_at_end),
             "counted": ended & episodes.counts,
         }
         if transition.terms:

@@ -29,6 +29,11 @@ so_far                 dict of (N,)          r (return, float32), l (length, int
 counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
+The world decides what a successful episode is, by the suite's rule, and reports it in ``so_far["success"]``: the entry
+of an episode's last step is the success of the episode, and the entry of any other step is its success if it is cut
+there. Nothing else decides: success at several steps must not be combined, because where success counts at the end an
+episode can lose it again.
+
 For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
 (``episodes.py``) where a row ended, and on the warp engine, which would have to wait for the answer, in every step:
 zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may add keys
@@ -151,6 +156,8 @@ class TaskWorld(VectorWorld, Protocol):
     of a slot keeps task j mod n; elsewhere each episode may draw one."""
     max_episode_steps: Tensor
     """Time limit of each environment, int64 (N,)."""
+    success_at_end: bool
+    """Whether an episode must hold its goal at the end to be a success; else it must meet the goal at any step."""
 
 
 @runtime_checkable

@@ -82,8 +82,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
     where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
-    has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable` (physics broke: the episode is
-    truncated).
+    has `success` (1.0 or 0.0), `unscaled_reward` and `unstable` (physics broke: the episode is truncated). In version 1
+    `success` says whether the goal is met in this state. In version 2 success counts at the end of an episode, so that
+    `success` is 0.0 before the last step. An episode is a success if any of its steps has `success` 1.0.
 
     `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
     `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the paper's:
@@ -183,12 +184,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         """One control step of 1/60 s under an action (a,) in [-1, 1].
 
         Returns observation (d,), float32, reward, terminated (what was to be held is lost; with `terminate_on_success`
-        also success), truncated (time is up, or physics broke), and info. Raises BidexError where no episode runs.
+        also success), truncated (time is up, or physics broke), and info. In version 2 nothing is a success before the
+        episode ends, so that `terminate_on_success` shortens no episode. Raises BidexError where no episode runs.
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")
         obs, reward, terminated, truncated, info = self._world.step(torch.as_tensor(np.asarray(action))[None])
-        success = bool(info["success"])
+        ended = bool(terminated | truncated)
+        success = bool(info["success"]) and (ended or not self._world.success_at_end)
         lost = bool(terminated) or (self.terminate_on_success and success)
         self._over = lost or bool(truncated)
         step_info = {"success": float(success), "unscaled_reward": float(info["reward_unscaled"])}
@@ -196,7 +199,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return _array(obs), float(reward), lost, bool(truncated) and not lost, step_info
 
     def toggle_terminate_on_success(self, on: bool) -> None:
-        """Whether an episode ends at its first success."""
+        """Whether an episode ends at its first success; in version 2 there is none before the time limit."""
         self.terminate_on_success = bool(on)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

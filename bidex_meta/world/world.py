@@ -108,7 +108,7 @@ class World(BatchedWorld):
         super().__init__(Slots(names, steps, scales, gammas), num_envs, place, autoreset_mode, stagger)
         self.metadata |= {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}
         self.render_mode = "rgb_array"
-        self._at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
+        self.success_at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
         self.points, self.hides_goals = points, observation == "masked"

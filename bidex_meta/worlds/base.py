@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_randomisation, load_suite, suite_names
+from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class Worlds(ABC):
     object: str | None = None
     moving_base: bool | None = None  # whether the bases of a single class move; None: as it has them
     on_gpu: ClassVar[bool] = True  # whether a GPU is of use to its worlds
-    preset: ClassVar[tuple[str, str] | None] = None
+    preset: tuple[str, str] | None = None
     """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
     default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
 
@@ -111,6 +112,11 @@ class Worlds(ABC):
         """The splits there are: ``train``, and ``test`` for a meta suite."""
         return [split for split in ("train", "test") if self.tasks(split)]
 
+    @property
+    def others(self) -> "Worlds":
+        """Worlds of as many tasks, whose train tasks no run trained on: they are drawn by another seed."""
+        return Worlds.open(replace(self.config, task_seed=self.seed + OTHER_SEED))
+
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """Environments of a training world, and steps of a run over all of them, of a learner that adapts or not."""
         if not device.startswith("cpu"):
@@ -135,12 +141,18 @@ class Worlds(ABC):
         as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
         return references() if self.moving_bases and as_printed else {}
 
-    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
-        """Evaluates a policy on all tasks of a split (mode DISABLED), ``default_episodes`` or so many of each."""
+    def protocol(self, split: str, episodes: int | None = None, seed: int = EVALUATION_SEED) -> Protocol:
+        """What an evaluation of a policy plays: ``default_episodes``, or so many, of each task of a split."""
+        return Protocol(split, seed, episodes_per_task=self.default_episodes if episodes is None else episodes)
+
+    def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
+        """Evaluates a policy on all tasks of a world (mode DISABLED)."""
         from bidex_meta.evaluation.play import evaluate
 
-        episodes = self.default_episodes if episodes is None else episodes
-        return evaluate(agent, world, episodes, seed=seed, references=self.references())
+        return evaluate(agent, world, protocol=protocol, references=self.references())
+
+
+V2_PRESET = "v2", "success counts at the end of the episodes, as in version 2"
 
 
 def physics_of(classes: "Mapping[str, TaskClass]") -> str:

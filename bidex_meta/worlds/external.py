@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import metaworld_classes
@@ -82,11 +83,11 @@ class MetaWorldSuite(Foreign):
         """As in ``Worlds``."""
         return _TRAINING_SIZE * len(self.class_names), _TRAINING_STEPS * len(self.class_names)
 
-    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
+    def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
         """As in ``Worlds``: the fifty tasks of each class a few at a time, as many as the world has environments."""
         from bidex_meta.metaworld.batched import evaluate_all_tasks
 
-        return evaluate_all_tasks(agent, world, self.default_episodes if episodes is None else episodes, seed=seed)
+        return evaluate_all_tasks(agent, world, protocol.episodes_per_task, seed=protocol.seed)
 
 
 class HumanoidTask(Foreign):

@@ -8,7 +8,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.worlds.base import Identity, WorldConfig, Worlds, physics_of
+from bidex_meta.worlds.base import V2_PRESET, Identity, WorldConfig, Worlds, physics_of
 
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import PooledWorld, TaskClass
@@ -25,6 +25,8 @@ class OwnSuite(Worlds):
         super().__init__(name, config)
         suite = load_suite(name)
         self.suite = replace(suite, points=self.points) if self.points else suite
+        if self.suite.rules.success == "at-end":
+            self.preset = V2_PRESET
         self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
 
     @cached_property
@@ -71,6 +73,8 @@ class SingleClass(Worlds):
         super().__init__(name, config)
         self.moving_base = {"own": None, "moving": True, "fixed": False}[config.base]
         self.class_name, self.object = name, config.object
+        if registry.plain_name(name) != name:
+            self.preset = V2_PRESET
         self.name = name_with_object(name, self.object)
         if self.object is not None:
             self.task_classes()  # refuses an unknown one now

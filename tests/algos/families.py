@@ -112,6 +112,25 @@ def shot(agent: MetaLearningAgent, world: PointGoals, seed: int | None = None) -
     agent.adapt()
 
 
+class Passing(PointGoals):
+    """Points whose success counts at the end and depends on the clock alone, in episodes of 20 steps.
+
+    Environments 0, 4, 8, ... hold the goal from step 5 to the end. The others hold it for 16 steps, from step 2 on, and
+    lose it.
+    """
+
+    success_at_end = True
+
+    def __init__(self, rows: int = 16, autoreset_mode: str = "DISABLED"):
+        super().__init__(rows, classes=(PointClass(steps=20, count=4),), autoreset_mode=autoreset_mode)
+
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        reward, _, failed = super()._advance(action, active)
+        elapsed = self.episodes.elapsed
+        passing = (elapsed >= 1) & (elapsed < 17)
+        return reward, torch.where(torch.arange(self.num_envs) % 4 == 0, elapsed >= 4, passing), failed
+
+
 class Recall(FakePools):
     """Two tasks, 1 and -1. The first reward of an episode is the task, the last one is paid for an action of its sign.
 

@@ -12,10 +12,11 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
-from tests.algos.families import PointClass, PointGoals
+from tests.algos.families import Passing, PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import resumed, same
 from tests.algos.toy import ToyWorld, nearness
+from tests.fakes import run_config
 from tests.offline.stored import as_data, noisy, played
 
 ON: dict[str, Any] = {"hidden": (16, 16), "rollout_steps": 8, "autocast": "off"}
@@ -127,6 +128,48 @@ def test_a_transition_that_broke_physics_teaches_nothing(case: Case) -> None:
         learner.iterate()
         states.append(learner.state_dict())
     assert same(states[0], states[1]) and same(states[0], states[2])
+
+
+@each({name: case for name, case in PLAYING.items() if "slices" not in name and "policy_heads" not in case.options})
+def test_training_counts_success_by_the_worlds_rule(case: Case) -> None:
+    """A quarter of the episodes hold the goal at the end; the others had held it long enough, and lost it."""
+    if case.algo == "dagger":  # whose figures leave out what teachers play
+        case = Case(case.algo, case.options | {"teacher_steps": 0})
+    learner = case.make(world=Passing(16, learner_kind(case.algo).make.autoreset_mode(case.config)))
+    found: dict[str, float] = {}
+    while "Train/success_rate" not in found:
+        found = learner.iterate()
+    told = {tag: value for tag, value in found.items() if "success" in tag}
+    assert told and set(told.values()) == {0.25}, told
+    assert run_config(stop_at_success=0.9).early_end(found) is None
+    assert run_config(stop_at_success=0.2).early_end(found) == "Train/success_rate"
+
+
+@pytest.mark.parametrize("name", ["rl2", "varibad", "maml", "promp"])
+def test_an_episode_that_is_cut_is_judged_where_it_is_cut(name: str) -> None:
+    """After 17 steps three quarters have held the goal for 16 steps, and the others for 13."""
+    case = CASES[name]
+    found = Case(case.algo, case.options | {"max_adapt_steps": 17}).make(world=Passing()).iterate()
+    assert {value for tag, value in found.items() if "success" in tag} == {0.75}
+
+
+@pytest.mark.parametrize("name", ["rl2", "varibad", "icl", "maml", "promp"])
+def test_episodes_of_a_trial_are_whole_by_default(name: str) -> None:
+    case = CASES[name]
+    options = {**case.options, "episodes_per_trial": 1}
+    known = {key: value for key, value in options.items() if hasattr(case.config, key) and key != "max_adapt_steps"}
+    learner = Case(case.algo, known).make(world=PointGoals(8, classes=(PointClass(steps=170, count=2),)))
+    learner.iterate()
+    stages = 2 if name in ("maml", "promp") else 1
+    assert learner.env_steps == stages * 8 * 170
+
+
+@pytest.mark.parametrize("name", ["maml slices", "promp slices"])
+def test_a_slice_is_judged_where_it_ends(name: str) -> None:
+    """Three quarters lose the goal before the first slice ends; the second holds the ends of the other episodes."""
+    case = CASES[name]
+    found = Case(case.algo, case.options | {"slice_steps": 19}).make(world=Passing(16, "SAME_STEP")).iterate()
+    assert found["Before/success_rate"] == found["Train/success_rate"] == 0.25
 
 
 @each(CASES)

@@ -68,6 +68,12 @@ def test_presets_that_go_on_fit_what_mtppo_learns_on_a_laptop(presets, preset):
         assert getattr(tuned, name) == getattr(given, name)
 
 
+@pytest.mark.parametrize("presets", [PROMP_PRESETS, MAML_PRESETS])
+def test_presets_of_version_2_fit_each_other(presets):
+    for name in ("hidden", "activation", "normalise_observations", "gamma"):
+        assert getattr(presets["v2"], name) == getattr(PPO_PRESETS["v2"], name)
+
+
 def test_a_squashed_policy_must_have_the_same_bounds_and_another_kind_is_refused():
     config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
     world = PointGoals(rows=16, autoreset_mode="SAME_STEP")

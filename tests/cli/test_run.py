@@ -13,6 +13,7 @@ from bidex_meta.cli import COMMANDS, main
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.worlds import Worlds
 from tests.algos.ranks import same
+from tests.pages import ROOT
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
 SMALL += ["--learner.hidden", "8", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
@@ -139,6 +140,34 @@ def test_preset_sets_what_no_flag_sets(shown):
     flags = [*SMALL[:2], "--device", "cpu", "--preset", "paper", "--learner.epochs", "3", "--print-config"]
     learner = json.loads(shown("run", *flags))["learner"]
     assert (learner["hidden"], learner["gamma"], learner["epochs"]) == ([2048, 1024, 512], 0.96, 3)
+
+
+TABLE = {"rl2": "RL2", "varibad": "VariBAD", "pearl": "PEARL", "promp": "ProMP", "maml": "MAML"}
+"""Learners that adapt, and their arms of docs/results/adaptation.md."""
+
+
+@pytest.mark.parametrize("algo", TABLE)
+def test_a_suite_of_version_2_is_trained_on_as_in_our_table(shown, algo):
+    flags = ["run", "--algo", algo, "--device", "cpu", "--print-config", "--suite"]
+    config = json.loads(shown(*flags, "ML1-v2"))
+    recorded = json.loads((ROOT / f"results/data/ml1-v2/ML1-v2-{TABLE[algo]}-seed0.json").read_text())["config"]
+    ignored = {"max_adapt_steps": None, "tasks_per_class": None}  # whole episodes; tasks are split over environments
+    assert config["preset"] == "v2" and config["learner"]["max_adapt_steps"] is None
+    assert config["learner"] | ignored == recorded["learner"] | ignored
+    assert json.loads(shown(*flags, "ML1"))["preset"] == "laptop"
+
+
+@pytest.mark.parametrize(
+    ("words", "preset", "gamma"),
+    [
+        ("mtppo --suite MT20-v2", "v2", 0.96), ("ppo --task DoorOpenOutward-v2", "v2", 0.96),
+        ("mtppo --suite MT20-v2 --preset laptop", "laptop", 0.93), ("mtppo --suite MT20", "laptop", 0.93),
+        ("mtsac --suite MT20-v2", "laptop", 0.93), ("ppo --task DoorOpenOutward", "laptop", 0.93),
+    ],
+)  # fmt: skip
+def test_the_discount_fits_the_suite(shown, words, preset, gamma):
+    config = json.loads(shown("run", "--algo", *words.split(), "--device", "cpu", "--print-config"))
+    assert (config["preset"], config["learner"]["gamma"]) == (preset, gamma)
 
 
 # Run, resume, evaluate, plot, render.

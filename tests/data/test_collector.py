@@ -14,6 +14,7 @@ from bidex_meta.data.collector import BROKEN, CUT, SHORTENED, EpisodeCollector, 
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import State
+from tests.algos.families import Passing
 from tests.data.worlds import Plain, Rough, rough, same
 
 pytest.importorskip("h5py", reason="needs the extra data")
@@ -30,6 +31,16 @@ def actions(seed: int, step: int, num: int) -> torch.Tensor:
     if step % 11 == 7:
         drawn[step % num, 0] = torch.nan
     return drawn
+
+
+@pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
+def test_an_episode_is_a_success_by_the_worlds_rule(mode: str) -> None:
+    episodes: list[Episode] = []
+    recorder = EpisodeCollector(Passing(8, mode), episodes.append)
+    recorder.reset(seed=0)
+    for _ in range(20):
+        recorder.step(torch.zeros(8, 2))
+    assert {each.row: each.success for each in episodes} == {row: row % 4 == 0 for row in range(8)}
 
 
 @settings(max_examples=25, deadline=None)

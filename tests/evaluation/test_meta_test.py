@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli.metatest import others_of
+from bidex_meta import Benchmark
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import RandomAgent, evaluate
@@ -186,7 +187,7 @@ def test_json_is_complete_and_of_the_first_tasks_alone_if_asked():
     few = meta_evaluate(Still(), world(20, 5, 5), 1, tasks=2, rollouts=5, episodes_per_task=1)
     assert few.before.classes["Near"].tasks.tolist() == [0, 1]
     references = {"Near": Reference(-10.0, 0.0), "Far": Reference(-20.0, 0.0)}
-    found = meta_evaluate(Finder(), world(), 3, rollouts=2, references=references, split="test").to_json()
+    found = meta_evaluate(Finder(), world(), 3, rollouts=2, references=references, protocol=Protocol("test")).to_json()
     json.dumps(found, allow_nan=False)
     assert (found["split"], found["shots"], found["rollouts"], len(found["by_shot"])) == ("test", 3, 2, 4)
     assert found["before"] == found["by_shot"][0] and found["after"] == found["by_shot"][3]
@@ -250,7 +251,31 @@ def test_refusals_name_the_mend(agent, place, keywords, expected):
     assert "\n" not in str(error.value)
 
 
-def test_others_are_tasks_of_another_seed():
-    worlds = Worlds.open({"suite": "ML1", "threads": 1})
-    own, others = (each.world("train", 2).pools[0] for each in (worlds, others_of(worlds)))
+def test_exploring_episodes_are_whole_by_default():
+    agent, place = Still(), world(10, steps=(160, 200))
+    found = meta_evaluate(agent, place, 1, rollouts=1, episodes_per_task=1)
+    assert found.adapt_steps == [3 * 160 + 2 * 200]
+    assert found.to_json()["max_adapt_steps"] == found.protocol.max_adapt_steps == 200
+    cut = meta_evaluate(agent, place, 1, rollouts=1, episodes_per_task=1, max_adapt_steps=150)
+    assert cut.adapt_steps == [5 * 150]
+
+
+def test_one_protocol_says_what_is_played():
+    protocol = Protocol(seed=3, tasks=2, episodes_per_task=2, shots=2, rollouts=3, trials=2, max_adapt_steps=6)
+    by_object = meta_evaluate(Finder(), world(), protocol=protocol)
+    by_words = meta_evaluate(
+        Finder(), world(), 2, rollouts=3, episodes_per_task=2, tasks=2, trials=2, max_adapt_steps=6, seed=3
+    )
+    assert by_object.to_json() == by_words.to_json() and by_object.protocol == by_words.protocol == protocol
+    assert len(meta_evaluate(Finder(), world(), 1, protocol=protocol).adapt_steps) == 1
+
+
+@pytest.mark.parametrize("suite", ["ML1", "MT4-v2"])
+def test_others_are_tasks_of_another_seed(suite):
+    worlds = Worlds.open({"suite": suite, "threads": 1, "seed": 7})
+    own, others = (each.world("train", 4).pools[0] for each in (worlds, worlds.others))
     assert own.shape == others.shape and not (own == others).all(1).any()
+    benchmark = Benchmark(suite, seed=7)
+    by_name = benchmark.make_world("others", 4, device="cpu", autoreset_mode="DISABLED", threads=1)
+    assert np.array_equal(by_name.pools[0], others)
+    assert len(set(benchmark.train_tasks) & set(benchmark.others.train_tasks)) == 0

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from bidex_meta.cli.metatest import Options
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
 from bidex_meta.evaluation.statistics import bootstrap_interval, mean
+from bidex_meta.worlds import Worlds
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
 
@@ -63,6 +66,41 @@ def test_same_seed_same_evaluation():
 
     assert once() == once()
     json.dumps(once(), allow_nan=False)
+
+
+def test_python_and_the_commands_play_the_same_starts():
+    """Whatever seed the world was made with."""
+    found = []
+    for seed in (0, 5):
+        place = ToyWorld(6, "DISABLED")
+        place.reset(seed=seed)
+        found.append(evaluate(ZeroAgent(place.action_space), place, 1).to_json())
+    options = Options(episodes=1)
+    protocol = Worlds.open({"suite": "MT4"}).protocol("train", options.episodes, options.seed)
+    for seed in (EVALUATION_SEED, protocol.seed):
+        place = ToyWorld(6, "DISABLED")
+        found.append(evaluate(ZeroAgent(place.action_space), place, 1, seed=seed).to_json())
+    place = ToyWorld(6, "DISABLED")
+    found.append(evaluate(ZeroAgent(place.action_space), place, protocol=protocol).to_json())
+    assert all(each == found[0] for each in found)
+
+
+@pytest.mark.parametrize(
+    ("entries", "told"),
+    [
+        ({"split": "tests"}, "split: expected one of train, test, others, got 'tests'."),
+        ({"seed": -1}, "seed: expected a whole number from 0 on, got -1."),
+        ({"shots": 1.0}, "shots: expected a whole number from 0 on, got 1.0."),
+        ({"trials": None}, "trials: expected a whole number from 1 on, got None."),
+        ({"episodes_per_task": 0}, "episodes_per_task: expected a whole number from 1 to 1000000, got 0."),
+    ],
+)
+def test_a_protocol_refuses_what_cannot_be_played(entries, told):
+    with pytest.raises(BidexError) as error:
+        Protocol(**entries)
+    assert str(error.value) == told
+    with pytest.raises(BidexError, match="plays all tasks of a world, got a protocol with tasks=2"):
+        evaluate(Seeker(), ToyWorld(6, "DISABLED"), protocol=Protocol(tasks=2))
 
 
 def test_random_agent_is_uniform_and_ignores_torchs_global_generator():

@@ -16,6 +16,7 @@ from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import ZeroAgent, evaluate
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
 from bidex_meta.metaworld.evaluation import known_to_metaworld
+from tests.algos.families import Passing
 from tests.points import SPEED, Finder, PointWorld, Still, ring
 
 
@@ -138,6 +139,15 @@ def test_a_real_world_in_their_evaluation_gives_our_numbers():
     ours = evaluate(ZeroAgent(place.action_space), world(), 1).classes["CatchUnderarm"]
     assert (success, returns["CatchUnderarm"]) == (ours.success, pytest.approx(ours.returns.tolist(), rel=1e-5))
     assert mean == pytest.approx(ours.mean_return, rel=1e-5)
+
+
+def test_where_success_counts_at_the_end_their_evaluation_counts_it_there():
+    """A quarter of the episodes hold the goal at the end; the others had held it long enough before, and lost it."""
+    envs, zero = MetaWorldEnvs(Passing(16)), ForMetaWorld(ZeroAgent(Passing(16).action_space))
+    with known_to_metaworld(envs):
+        success, *_ = theirs.evaluation(zero, envs, num_episodes=16)  # type: ignore[arg-type]
+    assert success == 0.25
+    assert evaluate(ZeroAgent(envs.action_space), Passing(16), 4).classes["PointGoals"].success == 0.25
 
 
 def test_tasks_are_sampled_in_turns():

@@ -259,6 +259,26 @@ def test_an_environment_ends_as_its_class_says_and_at_success_if_asked(monkeypat
     assert env.step(np.zeros(52, np.float32))[2:4] == (False, False)
 
 
+@pytest.mark.parametrize("terminate", [False, True])
+def test_in_version_2_success_counts_at_the_end_alone(monkeypatch: pytest.MonkeyPatch, terminate: bool) -> None:
+    benchmark = Benchmark("MT1-v2", 0)
+    env = benchmark.train_classes["CatchUnderarm"]()
+    env.set_task(benchmark.train_tasks[0])
+    env.toggle_terminate_on_success(terminate)
+    solved, limit = [False], env.max_path_length
+    monkeypatch.setattr(type(env.task_class), "success", lambda self, state: torch.tensor(solved))
+    monkeypatch.setattr(type(env.task_class), "failed", lambda self, state: torch.zeros(1, dtype=torch.bool))
+    for held, expected in ((range(20), 0.0), (range(limit - 15, limit), 1.0)):
+        env.reset(seed=0)
+        told = []
+        for step in range(limit):
+            solved[0] = step in held
+            _, _, terminated, truncated, info = env.step(np.zeros(52, np.float32))
+            told.append(info["success"])
+            assert (terminated or truncated) == (step == limit - 1)
+        assert told == [0.0] * (limit - 1) + [expected]
+
+
 def test_seeds_repeat_an_episode_and_tasks_hold_from_the_next_reset() -> None:
     ml1 = ours.ML1("HandOver", 0)
     env = ml1.train_classes["HandOver"]()

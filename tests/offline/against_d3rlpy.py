@@ -25,7 +25,6 @@ from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.run_data import implied, task_seed
 from bidex_meta.data import open_dataset
 from bidex_meta.data.joined import Joined, join
-from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.worlds import Worlds
 
 ALGOS = ("td3bc", "iql")
@@ -105,7 +104,7 @@ def main() -> None:
     world, tested = source.world("train", len(source.tasks("train")), "SAME_STEP"), source.world()
 
     def judge(agent: Any) -> float:
-        classes = source.judge(agent, tested, flags.episodes, EVALUATION_SEED).classes.values()
+        classes = source.judge(agent, tested, source.protocol("train", flags.episodes)).classes.values()
         return float(np.mean([each.mean_return if each.score is None else each.score for each in classes]))
 
     found = against(join([dataset], world), world, judge, flags.python, flags.updates, flags.seeds)

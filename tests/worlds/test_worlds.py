@@ -66,6 +66,8 @@ def test_defaults_follow_the_source() -> None:
     assert [s.on_gpu for s in (own, alone, foreign)] == [True, True, False]
     assert [s.default_episodes for s in (own, alone, foreign)] == [4, 4, 1]
     assert [s.preset and s.preset[0] for s in (own, alone, foreign)] == [None, None, "metaworld"]
+    of_version_2 = (Worlds.open(config) for config in ({"suite": "ML1-v2"}, {"task": "HandOver-v2"}))
+    assert [s.preset and s.preset[0] for s in of_version_2] == ["v2", "v2"]
     assert own.rows_and_steps("cpu", adapts=True) == (300, 20_000_000)
     assert alone.rows_and_steps("cuda:0", adapts=False) == (8192, 200_000_000)
     assert foreign.rows_and_steps("cpu", adapts=False) == (40, 20_000_000)
@@ -88,7 +90,7 @@ def test_references_are_of_moving_bases() -> None:
 def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
     source = Worlds.open({"task": "Switch", "threads": 1})
     world = source.world()
-    found = source.judge(ZeroAgent(world.action_space), world, 1, seed=3)
+    found = source.judge(ZeroAgent(world.action_space), world, source.protocol("train", 1, 3))
     world.close()
     assert len(found.classes["Switch"].returns) == 50 and found.classes["Switch"].reference is not None
 

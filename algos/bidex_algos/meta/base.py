@@ -141,6 +141,7 @@ class MetaLearner(Learner):
             raise BidexError(f"{self.name}: learns in one process, got {world_size()}. Start it without torchrun.")
         super().__init__(world, config, seed)
         self.policy.seed = seed
+        self.adapt_steps = config.max_adapt_steps or int(world.max_episode_steps.max())
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
@@ -181,7 +182,7 @@ class MetaLearner(Learner):
         return norm
 
     def _iterate(self) -> dict[str, float]:
-        if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
+        if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.adapt_steps:
             self._draw_tasks()
         adapter = self.policy.adapter
         adapter.project()
@@ -220,7 +221,7 @@ class MetaLearner(Learner):
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
         """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
         policy, rows, stage = self.policy, self.rows, Stage()
-        longest = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
+        longest = min(int(self.world.max_episode_steps.max()), self.adapt_steps)
         horizon = self.config.slice_steps or longest
         obs = self.obs
         if obs is None or self.config.slice_steps is None:
@@ -228,7 +229,11 @@ class MetaLearner(Learner):
             first = self.env_steps == 0 and self.steps_with_tasks == 0
             obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
-        earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
+        earned = torch.zeros(len(running), device=self.device)
+        # A slice counts an episode if the suite's rule does where slice or episode ends, and it meets the goal within.
+        success = torch.zeros_like(running)
+        ended_well = torch.zeros_like(running)
+        met = torch.zeros_like(running)
         steps = torch.zeros_like(self.elapsed[0])
         for t in range(horizon):
             normal = policy.observations(obs)
@@ -249,7 +254,9 @@ class MetaLearner(Learner):
                 ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
             )  # fmt: skip
             earned += info["reward_unscaled"].masked_fill(~valid, 0.0)
-            success |= info["success"] & valid
+            success = torch.where(running, info["so_far"]["success"], success)
+            ended_well |= success & over & running
+            met |= info["success"] & valid
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
             if self.config.slice_steps is None:
                 running = running & ~over
@@ -257,7 +264,7 @@ class MetaLearner(Learner):
                     break
         self.obs = obs
         self.steps_with_tasks += len(stage)
-        return stage, Outcome(earned, success, steps)
+        return stage, Outcome(earned, (success | ended_well) & met, steps)
 
     def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
         last = k == self.config.inner_steps

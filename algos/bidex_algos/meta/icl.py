@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
+from bidex_algos.meta.config import USUAL_STEPS
 from bidex_algos.meta.taught_trials import Steps, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import Trials
@@ -47,7 +48,7 @@ class ICLConfig(LearnerConfig):
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
-    max_adapt_steps: Count = 1000  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
     blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
     reward_unit: Positive = 0.3
@@ -63,8 +64,8 @@ class ICLConfig(LearnerConfig):
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base, for episodes of 300 steps: how long they are is not known here."""
-        steps = self.episodes_per_trial * min(self.max_adapt_steps, 300)
+        """As in the base."""
+        steps = self.episodes_per_trial * min(self.max_adapt_steps or USUAL_STEPS, USUAL_STEPS)
         kept = (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
         return kept + network_bytes(self.head, width, 1)
 

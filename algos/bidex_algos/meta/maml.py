@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
-from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, V2, OuterConfig
 from bidex_algos.trust_region import trust_region_step
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 
@@ -37,6 +37,7 @@ PRESETS: dict[str, MAMLConfig] = {
     "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
     "tuned": MAMLConfig(**TUNED),
     "unseen": MAMLConfig(**UNSEEN),
+    "v2": MAMLConfig(**V2),
     "laptop": MAMLConfig(),
 }
 

@@ -45,14 +45,16 @@ class PEARLConfig(MTSACConfig):
     the critics gain by knowing the task, the posterior stays the prior; Loss/divergence shows it."""
     episodes_per_trial: Annotated[int, Meta(ge=2, le=1000)] = 3
     """Episodes after which an environment forgets what its task has shown: those played to adapt, and one more."""
-    max_adapt_steps: Count = 1000  # Steps after which an exploring episode of a meta-test is cut.
+    max_adapt_steps: Count | None = None
+    """Steps after which an exploring episode of a meta-test is cut; None: whole episodes."""
     reward_unit: Positive = 0.3  # The encoder reads asinh(reward / reward_unit), normalised by running statistics.
     value_heads: bool = False  # Give each critic an output per class; the latent variable then need not say which.
     replay_steps: Count = 4000  # Vector steps that the replay keeps, if replay_memory allows.
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 
-PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig()}
+# v2: as of MT-PPO.
+PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.96)}
 
 
 class PEARL(MTSAC):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
-from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, V2, OuterConfig
 from bidex_algos.onpolicy.ppo import factor_of
 from bidex_meta.utils.validation import Count, NonNegative, Positive, check_rising
 
@@ -48,6 +48,7 @@ PRESETS: dict[str, ProMPConfig] = {
     # lost a third of the return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
+    "v2": ProMPConfig(**V2, outer_learning_rate=1e-4, desired_kl=0.0125),
     "laptop": ProMPConfig(),
 }  # fmt: skip
 

@@ -1,5 +1,6 @@
 """What the learners of a policy with a memory share: trials, tasks by turns, statistics of first and last episodes."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -36,6 +37,8 @@ class TrialLearner(Learner):
     going_on = ("trials_played", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: Any, seed: int):
+        if config.max_adapt_steps is None:  # memories are made to last for a trial
+            config = replace(config, max_adapt_steps=int(world.max_episode_steps.max()))
         super().__init__(world, config, seed)
         self.agent = MemoryAgent(self.policy, own_seed(seed))
         self.trials_played = 0

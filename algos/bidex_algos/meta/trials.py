@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.advantages import explained_variance, gae, normalise_per_task, task_moments
+from bidex_algos.meta.config import USUAL_STEPS
 from bidex_algos.nets.networks import Activation, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
@@ -31,7 +32,7 @@ class TrialConfig(LearnerConfig):
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
-    max_adapt_steps: Count = 150  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
     blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
@@ -42,8 +43,8 @@ class TrialConfig(LearnerConfig):
 
     @property
     def trial_steps(self) -> int:
-        """Most steps of a trial."""
-        return self.episodes_per_trial * self.max_adapt_steps
+        """Most steps of a trial; of whole episodes a guess, until a learner knows its world."""
+        return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
@@ -174,7 +175,7 @@ def play(
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
             earned, whole = earned + reward, whole & (valid | ~playing)
-            success = success | (info["success"] & playing)
+            success = torch.where(playing, info["so_far"]["success"], success)
             playing = playing & ~ended
             if maths.may_look(device) and not playing.any():
                 break

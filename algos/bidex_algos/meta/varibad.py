@@ -34,7 +34,6 @@ class VariBADConfig(RL2Config):
     latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
     kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
     belief_learning_rate: Positive = 1e-3  # Adam's step size for encoder and decoder.
-    max_adapt_steps: Count = 300  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
 
@@ -50,7 +49,8 @@ class VariBADConfig(RL2Config):
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig()}
+# v2: as of RL².
+PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig(), "v2": VariBADConfig(gamma=0.96)}
 
 
 class BeliefActor(RecurrentNet):
