@@ -15,10 +15,10 @@ from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
-from bidex_meta.tasks.scene import SceneObject, Table
+from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
-from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
+from bidex_meta.utils.maths import conjugate, constant, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
 from bidex_meta.utils.validation import whole_number
 
 FLOOR, MOUTH, RIM = -0.049, 0.0345, 0.0445
@@ -131,6 +131,9 @@ _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _SINK, _DEEPEST = 5.0, 0.2
 """How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
 most, metres."""
+_TROUGH_TILT = 0.541
+_TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
+"""Of the box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
 
@@ -216,6 +219,14 @@ class PourWater(ReachTask):
         for i in range(self.water):
             for k, axis in enumerate("xyz"):
                 qpos[f"water{i}/{axis}"][:, 0] = drops[:, i, k]
+
+    def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
+        """Return the trough of the kettle, which reaches under the left forefinger."""
+        kettle = qpos["kettle"]
+        turn = xyzw(kettle[:, 3:])
+        centre = kettle[:, :3] + rotate(turn, constant(_TROUGH, kettle))
+        tilt = xyzw(constant(quaternion_from_rpy((0.0, _TROUGH_TILT, 0.0)), kettle))
+        return [("left", torch.cat((centre, multiply(turn, tilt)), dim=1), _TROUGH_HALF)]
 
     def _fill(self, like: Tensor) -> Tensor:
         """Positions of the drops in the kettle's frame, metres, (water, 3)."""

@@ -17,12 +17,16 @@ from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.reach import ReachTask, apart
-from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
-from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
+from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rotate, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
+_HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
+"""Where the leaves turn, right and left, in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
+_PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
+"""Centres of the panels in the leaves' frames, and their half sizes, metres."""
 _LEAST_SHARE = 0.1
 """Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
 pushed against its stop, which yields, more than 0.5 m."""
@@ -109,6 +113,17 @@ class _Door(ReachTask):
         return within(self.errors(state))
 
 
+def _on_leaf(base: Tensor, leaf: int, angle: Tensor, point: Point) -> Tensor:
+    """Return poses (n, 7) of a point of a leaf, given in its frame, metres, at an angle (n, 1) of its hinge.
+
+    ``base``: the door's poses (n, 7); ``leaf``: 0 for the right one, 1 for the left one. Quaternions (x, y, z, w).
+    """
+    half = 0.5 * (angle if leaf else -angle)
+    turn = multiply(base[:, 3:], torch.cat((torch.zeros_like(half), torch.zeros_like(half), half.sin(), half.cos()), 1))
+    hinge = base[:, :3] + rotate(base[:, 3:], constant(_HINGES[leaf], base))
+    return torch.cat((hinge + rotate(turn, constant(point, base)), turn), dim=1)
+
+
 def _hinges(state: TaskState) -> Tensor:
     """Angles of both leaves, rad, (n, 2)."""
     return torch.cat([state[f"object/hinge{leaf}_angle"] for leaf in (1, 2)], dim=1)
@@ -193,6 +208,15 @@ class DoorCloseInward(_Close):
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
     camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
     wide_space = _closed_to(0.05)  # farther the leaves would start in the hands
+
+    def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
+        """Return the panel of each leaf; an open one ends beside the fingertips of its hand."""
+        door = qpos["object"]
+        base = torch.cat((door[:, :3], xyzw(door[:, 3:])), dim=1)
+        return [
+            (side, _on_leaf(base, i, qpos[f"object/hinge{i + 1}"], _PANELS[i]), _PANEL_HALF)
+            for i, side in enumerate(SIDES)
+        ]
 
 
 class DoorOpenInward(_Open):
