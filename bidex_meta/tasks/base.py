@@ -16,6 +16,7 @@ from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import meets_box, noisy_joints
 from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
+from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
@@ -253,8 +254,8 @@ class TaskClass(ABC):
         first = next(iter(state.frozen.values()))
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Goals to draw in pictures: poses (n, 7), quaternion (x, y, z, w), and semi-axes of an ellipsoid, metres."""
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return the goals to draw in pictures of a state; none by default. Suites that hide goals draw none."""
         return []
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
@@ -103,6 +103,9 @@ class GraspAndPlace(ReachTask):
         inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
         return [inside, *_bucket_error(state)]
 
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        return _bucket_ghosts(state)
+
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
 
@@ -124,6 +127,12 @@ def _bucket_error(state: TaskState) -> list[Error]:
     """How far the bucket is from its goal, where it has one."""
     goal = state.frozen.get("goal")
     return [] if goal is None else [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
+
+
+def _bucket_ghosts(state: TaskState) -> list[Ghost]:
+    """Return where the bucket shall stand, where it has a goal."""
+    goal = state.frozen.get("goal")
+    return [] if goal is None else [Ghost(goal, (0.065, 0.065, 0.06))]
 
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
@@ -226,7 +235,7 @@ class PourWater(ReachTask):
         turn = xyzw(kettle[:, 3:])
         centre = kettle[:, :3] + rotate(turn, constant(_TROUGH, kettle))
         tilt = xyzw(constant(quaternion_from_rpy((0.0, _TROUGH_TILT, 0.0)), kettle))
-        return [("left", torch.cat((centre, multiply(turn, tilt)), dim=1), _TROUGH_HALF)]
+        return [("left", posed(centre, multiply(turn, tilt)), _TROUGH_HALF)]
 
     def _fill(self, like: Tensor) -> Tensor:
         """Positions of the drops in the kettle's frame, metres, (water, 3)."""
@@ -242,6 +251,9 @@ class PourWater(ReachTask):
         position = frozen["goal"][:, :3] if self.rules.wide else _goal(state)
         pose = torch.cat((position, frozen["goal_rotation"]), dim=1)
         return {"goal_pose": pose, "goal_rotation_difference": difference}
+
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        return _bucket_ghosts(state)
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * (0.5 - _spout_off(state))

@@ -14,7 +14,7 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject
@@ -27,6 +27,10 @@ _HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
 """Where the leaves turn, right and left, in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
 _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
 """Centres of the panels in the leaves' frames, and their half sizes, metres."""
+_HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
+"""The hands' points in the leaves' frames, metres; of an Inward door at -x."""
+_POLE = (0.025, 0.025, 0.65)
+"""Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
 _LEAST_SHARE = 0.1
 """Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
 pushed against its stop, which yields, more than 0.5 m."""
@@ -74,9 +78,12 @@ class _Door(ReachTask):
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         self.objects[0].add_to(scene)
         if self.inward:
-            for side in ("right", "left"):
-                handle = scene.site(f"object/{side}_handle")
-                handle.pos = (-0.04, *handle.pos[1:])
+            for side, handle in zip(SIDES, self._handles, strict=True):
+                scene.site(f"object/{side}_handle").pos = handle
+
+    @property
+    def _handles(self) -> list[Point]:
+        return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
@@ -105,6 +112,14 @@ class _Door(ReachTask):
             return self.narrow_errors(state)
         return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
 
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the handles shall be, with wide variation."""
+        if not self.rules.wide:
+            return []
+        base, angles = posed(state["object/position"], state.quaternion("object/quaternion")), state.frozen["leaves"]
+        handles = enumerate(self._handles)
+        return [Ghost(_on_leaf(base, i, angles[:, i : i + 1], handle), _POLE) for i, handle in handles]
+
     @abstractmethod
     def narrow_errors(self, state: TaskState) -> list[Error]:
         """``errors`` without angles of a task."""
@@ -121,7 +136,7 @@ def _on_leaf(base: Tensor, leaf: int, angle: Tensor, point: Point) -> Tensor:
     half = 0.5 * (angle if leaf else -angle)
     turn = multiply(base[:, 3:], torch.cat((torch.zeros_like(half), torch.zeros_like(half), half.sin(), half.cos()), 1))
     hinge = base[:, :3] + rotate(base[:, 3:], constant(_HINGES[leaf], base))
-    return torch.cat((hinge + rotate(turn, constant(point, base)), turn), dim=1)
+    return posed(hinge + rotate(turn, constant(point, base)), turn)
 
 
 def _hinges(state: TaskState) -> Tensor:
@@ -212,7 +227,7 @@ class DoorCloseInward(_Close):
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
         """Return the panel of each leaf; an open one ends beside the fingertips of its hand."""
         door = qpos["object"]
-        base = torch.cat((door[:, :3], xyzw(door[:, 3:])), dim=1)
+        base = posed(door[:, :3], xyzw(door[:, 3:]))
         return [
             (side, _on_leaf(base, i, qpos[f"object/hinge{i + 1}"], _PANELS[i]), _PANEL_HALF)
             for i, side in enumerate(SIDES)

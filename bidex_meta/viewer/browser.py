@@ -8,7 +8,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.world.rendering import GHOST
+from bidex_meta.world.rendering import GHOST_ALPHA
 
 _TYPE = mujoco.mjtGeom
 _Handle = Any  # viser's, which is not imported before something is shown
@@ -142,15 +142,14 @@ class Browser:
     def _show_ghosts(self, stage: Stage) -> None:
         ghosts = stage.ghosts()
         if len(ghosts) != len(self._ghosts):
-            *rgb, alpha = GHOST.tolist()
             self._ghosts = [
                 self._server.scene.add_icosphere(
-                    f"/goals/{i}", radius=1.0, scale=size, color=tuple(rgb), opacity=alpha, subdivisions=3
+                    f"/goals/{i}", radius=1.0, scale=ghost.size, color=ghost.colour, opacity=GHOST_ALPHA, subdivisions=3
                 )
-                for i, (_, _, size) in enumerate(ghosts)
+                for i, ghost in enumerate(ghosts)
             ]
-        for handle, (position, turned, _) in zip(self._ghosts, ghosts, strict=True):
-            handle.position, handle.wxyz = position, turned
+        for handle, ghost in zip(self._ghosts, ghosts, strict=True):
+            handle.position, handle.wxyz = ghost.position, ghost.quaternion
 
     def close(self) -> None:
         """Stops the server."""
