@@ -26,7 +26,8 @@ STRIP = 5
 _HEAD = """# The task classes
 
 Pictures show the start of task 0 of version 1; green is a goal. [Version 2](looking.md#pictures-and-films) draws a goal
-in every class. Sizes are with moving bases. d is a distance in metres, r an angle in radians. *left* and *right* are distances from a [hand's point](figures.md#hand-point) to its point on the object.
+in every class. Sizes are with moving bases. d is a distance in metres, r an angle in radians. *left* and *right* are
+distances from a [hand's point](figures.md#hand-point) to its point on the object.
 
 | entry | meaning |
 |---|---|

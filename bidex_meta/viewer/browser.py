@@ -100,6 +100,8 @@ class Browser:
         self.paused, self.speed, stage.tour = bool(self._pause.value), float(self._pace.value), bool(self._tour.value)
         if self._class.value != self._chosen:
             stage.row = stage.names.index(self._class.value)
+            stage.tour = False  # the chosen class stays
+            self._tour.value = False
             self.show(stage)
         while self._asked:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
