@@ -25,9 +25,8 @@ STRIP = 5
 """Pictures per witness."""
 _HEAD = """# The task classes
 
-Pictures show the start of task 0 of version 1; green is a goal. [Version 2](looking.md#pictures-and-films) draws a goal
-in every class. Sizes are with moving bases. d is a distance in metres, r an angle in radians. *left* and *right* are
-distances from a [hand's point](figures.md#hand-point) to its point on the object.
+Pictures show the start of task 0; green is a goal. Sizes are with moving bases. d is a distance in metres, r an angle
+in radians. *left* and *right* are distances from a [hand's point](figures.md#hand-point) to its point on the object.
 
 | entry | meaning |
 |---|---|
