@@ -86,9 +86,8 @@ def main(arguments: Sequence[str]) -> None:
     else:
         frames, count = film_row(agent, world, rows[0], steps, flags.seed, every, **look), steps // every + 1
     frames = counted(frames, count, "frames")
-    write = {".mp4": video.write_video, ".webp": video.write_animation}.get(suffix)
-    if write is not None:
-        write(out, frames, CONTROL_RATE / every)
+    if suffix in video.FILMS:
+        video.write_film(out, frames, CONTROL_RATE / every)
     else:
         for frame in frames:  # a tiled picture comes after the first frame
             video.write_image(out, frame)

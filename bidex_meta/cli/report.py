@@ -22,6 +22,7 @@ from bidex_meta.evaluation.comparison import History, estimates, read_groups, re
 from bidex_meta.runs import plots, training_seconds
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.runs.stored import Run
+from bidex_meta.runs.video import FILMS
 from bidex_meta.utils.files import is_file
 
 FILM_BYTES = 40_000_000  # films of a page together at most; what is above is named alone
@@ -152,18 +153,22 @@ def _cell(value: object) -> str:
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
-    """Run, file and content of the newest film of each kind (its name before ``_<step>``); None where it is large."""
+    """Yield run, file and content of the newest film of each kind (its name before ``_<step>``); None if it is large.
+
+    The content is a data address of a video or, of a WebP, of an image.
+    """
     room = FILM_BYTES
     for run in runs:
         newest: dict[str, Path] = {}
-        films = filter(is_file, run.videos_path.glob("*.mp4"))  # a pipe of that name would never end
+        named = (path for path in run.videos_path.glob("*") if path.suffix.lower() in FILMS)
+        films = filter(is_file, named)  # a pipe of that name would never end
         for path in sorted(films, key=lambda path: path.stat().st_mtime):
             kind, _, step = path.stem.rpartition("_")
             newest[kind if step.isdigit() and kind else path.stem] = path
         for path in newest.values():
             fits = path.stat().st_size <= room
             room -= path.stat().st_size if fits else 0
-            yield names[run.path], path.name, _data(path.read_bytes(), "video/mp4") if fits else None
+            yield names[run.path], path.name, _data(path.read_bytes(), FILMS[path.suffix.lower()]) if fits else None
 
 
 def _picture(draw: Callable[[], Any]) -> str | None:

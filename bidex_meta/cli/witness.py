@@ -24,7 +24,7 @@ class WitnessFlags:
     task: str | None = None  # Task class.
     all: Switch = False  # All classes.
     file: Path | None = None  # Replay this file, not the stored witness.
-    out: Path | None = None  # Also write a film (.mp4) of the witness, or a picture (.png) of its last step.
+    out: Path | None = None  # Also write a film (.mp4, .webp) of the witness, or a picture (.png) of its last step.
     camera: str | None = None  # front, side, top or back.
     threads: Threads | None = None  # Threads of the physics; None: one per core.
     json: JsonSwitch = False
@@ -47,8 +47,8 @@ def main(arguments: Sequence[str]) -> None:
         from bidex_meta.witness.replay import frames
 
         pictures = frames(names[0], load_witness(names[0], flags.file), camera=flags.camera)
-        if video.check_suffix(flags.out) == ".mp4":
-            video.write_video(flags.out, pictures, CONTROL_RATE)
+        if video.check_suffix(flags.out) in video.FILMS:
+            video.write_film(flags.out, pictures, CONTROL_RATE)
         else:
             *_, last = pictures
             video.write_image(flags.out, last)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
-from bidex_meta.utils.maths import constant, dot, norm
+from bidex_meta.hands.poses import HandPose
+from bidex_meta.utils.maths import conjugate, constant, dot, norm, rotate, xyzw
 
 _WRIST = (0.0, 0.01, 0.256)
 """Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (docs/figures.md,
@@ -31,6 +32,8 @@ _THUMB_ABOVE_PALM = _THUMB_RADIUS + 0.009 - _PALM_HALF_THICKNESS
 _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
+_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Where on a link's centre line its distance to a box is measured, from its joint on."""
 _SLACK = 0.002
 """Overlap left at a start, metres: contacts carry the object from the first step; 5 mm would be allowed."""
 _MAX_CROSSING = 0.1
@@ -120,11 +123,34 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
     return _clear(joints, centre, axes[1], reach, support)
 
 
+def meets_box(joints: Tensor, pose: HandPose, box: Tensor, half: tuple[float, float, float]) -> Tensor:
+    """Tell in which starts a finger sticks in a box by more than the slack. Shape (n,), bool.
+
+    Joint angles, rad, (n, 24), of a hand that starts at ``pose``; the box's poses (n, 7), quaternion (x, y, z, w), and
+    its half sizes, metres. A link is looked at in five points of its centre line.
+    """
+    start, along, length = _finger_segments(joints)
+    share = constant(_SHARES, joints)
+    in_palm = start[..., None, :] + along[..., None, :] * (length[:, None] * share)[..., None]
+    x, y, z = (axis[:, None, None, None] for axis in _palm_axes(joints))
+    palm = constant(_WRIST, joints) + _PALM_OFFSET * _wrist_axis(joints)
+    in_mount = palm[:, None, None, None] + in_palm[..., :1] * x + in_palm[..., 1:2] * y + in_palm[..., 2:] * z
+    in_world = constant(pose.position, joints) + rotate(xyzw(constant(pose.quaternion, joints)), in_mount)
+    centre, turn = box[:, None, None, None].split((3, 4), dim=-1)
+    beyond = rotate(conjugate(turn), in_world - centre).abs() - constant(half, joints)
+    gap = norm(beyond.clamp(min=0.0)) + beyond.amax(dim=-1).clamp(max=0.0)
+    return (gap - constant(_RADII, joints)[:, None] < -_SLACK).flatten(1).any(dim=1)
+
+
 def _in_palm(position: Tensor, joints: Tensor, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    a = joints[:, 0]
-    z = torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)  # of the wrist
-    relative = position - constant(_WRIST, position) - _PALM_OFFSET * z
+    relative = position - constant(_WRIST, position) - _PALM_OFFSET * _wrist_axis(joints)
     return torch.stack([dot(relative, a) for a in axes], dim=1)
+
+
+def _wrist_axis(joints: Tensor) -> Tensor:
+    """Return the direction from the wrist to the palm in the mount frame, (n, 3)."""
+    a = joints[:, 0]
+    return torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)
 
 
 def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,9 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
-SUFFIXES = (".png", ".mp4", ".webp")
+FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
+"""Endings of films, and the media types that web pages know them by."""
+SUFFIXES = (".png", *FILMS)
 LABEL = 20
 """Height of a name under a tile, pixels."""
 _BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
@@ -52,6 +54,12 @@ def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
     animation = {} if kind == "PNG" else {"save_all": True, "append_images": pictures, "loop": 0}
     next(pictures).save(out, kind, **animation, **options)
     return out.getvalue()
+
+
+def write_film(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write frames as the film that the path's ending, one of ``FILMS``, asks for."""
+    write = write_video if path.suffix.lower() == ".mp4" else write_animation
+    write(path, frames, fps)
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 60) -> None:

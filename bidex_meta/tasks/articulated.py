@@ -11,11 +11,11 @@ from torch.nn.functional import pad
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
-from bidex_meta.tasks.scene import Point, SceneObject, Table
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import (
@@ -98,15 +98,17 @@ class OpenScissors(ReachTask):
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state))
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
-        return [(frozen["ghost"], (0.02, 0.02, 0.01))]
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the right handle shall be; in version 1 with the shears at the task's start."""
+        pose = self.observe(state)["goal_pose"] if self.rules.wide else state.frozen["ghost"]
+        return [Ghost(pose, (0.02, 0.02, 0.01))]
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
     """Pose (n, 7) of the right handle's point on the half that is opened by ``turn`` (n, 4) from the other half."""
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
-    return torch.cat((pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened), dim=1)
+    return posed(pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened)
 
 
 def _missing(state: TaskState) -> Tensor:
@@ -167,6 +169,14 @@ class OpenPenCap(ReachTask):
     def target(self, state: TaskState) -> Tensor:
         return 5.0 * apart(state, *self.points)
 
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the cap shall be: with wide variation its gap from the pen's body, wherever that lies."""
+        if not self.rules.wide:
+            return super().ghosts(state)
+        pen = state.quaternion("pen/quaternion")
+        cap = state["pen/body_position"] + rotate(pen, pad(-state.frozen["gap"], (2, 0)))
+        return [Ghost(posed(cap, pen), (0.018, 0.018, 0.06))]
+
     def hides(self) -> tuple[Hidden, ...]:
         return (Hidden(("gap",), _GAP),) if self.rules.wide else ()
 
@@ -186,6 +196,9 @@ _PRESSED = (-0.0241, -0.001, 0.0427)
 """The button point at full travel from the base, world axes: hinge origin and point lie flush with the face there."""
 _PRESSED_QUATERNION = quaternion_product(quaternion_from_rpy(_FACE_UP), quaternion_from_rpy((0.0, _TRAVEL, 0.0)))
 """Orientation (w, x, y, z) of the rocker at full travel."""
+
+_BAR = (0.005, 0.09, 0.005)
+"""Semi-axes of the goal in pictures, metres: a bar across the button that reaches out of the housing."""
 
 
 class Switch(ReachTask):
@@ -263,6 +276,21 @@ class Switch(ReachTask):
         if self.rules.wide:
             return [Error(off, 0.08) for off in (rockers - state.frozen["angles"]).abs().unbind(1)]
         return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
+
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the buttons' points shall be, with wide variation."""
+        if not self.rules.wide:
+            return []
+        found = []
+        for i, missing in enumerate((state.frozen["angles"] - _rockers(state)).split(1, dim=1), start=1):
+            hinge, rocker = state[f"switch{i}/position"], state.quaternion(f"switch{i}/quaternion")
+            half = 0.5 * missing
+            turn = multiply(
+                rocker, torch.cat((torch.zeros_like(half), half.sin(), torch.zeros_like(half), half.cos()), 1)
+            )
+            button = rotate(conjugate(rocker), state[f"switch{i}/button_position"] - hinge)
+            found.append(Ghost(posed(hinge + rotate(turn, button), turn), _BAR))
+        return found
 
     def target(self, state: TaskState) -> Tensor:
         first, second = (norm(state[f"switch{i}/button_position"] - state.frozen[f"goal{i}"]) for i in (1, 2))

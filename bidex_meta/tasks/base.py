@@ -13,9 +13,10 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.hands.starts import noisy_joints
+from bidex_meta.hands.starts import meets_box, noisy_joints
 from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
+from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
@@ -189,12 +190,25 @@ class TaskClass(ABC):
             return
         sizes = [self.start_draws, *[24] * len(self.jittered_hands), *[2] * len(self.jittered_fixtures)]
         _, *parts = draws.split(sizes, dim=1)
+        steady = {side: qpos[f"{side}/joints"].clone() for side in self.jittered_hands}
         for side, part in zip(self.jittered_hands, parts, strict=False):
             joints = qpos[f"{side}/joints"]
             low, high = (constant(tuple(ends.tolist()), joints) for ends in (hand().low, hand().high))
             joints.copy_((joints + noisy_joints(part, JOINT_NOISE)).clamp(low, high))
         for name, part in zip(self.jittered_fixtures, parts[len(self.jittered_hands) :], strict=True):
             qpos[name][:, :2] += JITTER * part
+        for side, pose, half in self.obstacles(qpos):
+            joints = qpos[f"{side}/joints"]
+            meets = meets_box(joints, getattr(self, side), pose, half)
+            joints.copy_(torch.where(meets[:, None], steady[side], joints))
+
+    def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, tuple[float, float, float]]]:
+        """Return boxes so near to a hand that joint noise might push its fingers into them; none by default.
+
+        Each is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A hand
+        that noise would push into its box starts without noise.
+        """
+        return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The blocks of the layout that no sensor gives, by name, each (n, size); none by default."""
@@ -240,8 +254,8 @@ class TaskClass(ABC):
         first = next(iter(state.frozen.values()))
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Goals to draw in pictures: poses (n, 7), quaternion (x, y, z, w), and semi-axes of an ellipsoid, metres."""
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return the goals to draw in pictures of a state; none by default. Suites that hide goals draw none."""
         return []
 
     def __repr__(self) -> str:

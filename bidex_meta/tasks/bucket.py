@@ -11,14 +11,14 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
-from bidex_meta.tasks.scene import SceneObject, Table
+from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
-from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
+from bidex_meta.utils.maths import conjugate, constant, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
 from bidex_meta.utils.validation import whole_number
 
 FLOOR, MOUTH, RIM = -0.049, 0.0345, 0.0445
@@ -103,6 +103,9 @@ class GraspAndPlace(ReachTask):
         inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
         return [inside, *_bucket_error(state)]
 
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        return _bucket_ghosts(state)
+
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
 
@@ -126,11 +129,20 @@ def _bucket_error(state: TaskState) -> list[Error]:
     return [] if goal is None else [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
 
 
+def _bucket_ghosts(state: TaskState) -> list[Ghost]:
+    """Return where the bucket shall stand, where it has a goal."""
+    goal = state.frozen.get("goal")
+    return [] if goal is None else [Ghost(goal, (0.065, 0.065, 0.06))]
+
+
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _SINK, _DEEPEST = 5.0, 0.2
 """How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
 most, metres."""
+_TROUGH_TILT = 0.541
+_TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
+"""Of the box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
 
@@ -217,6 +229,14 @@ class PourWater(ReachTask):
             for k, axis in enumerate("xyz"):
                 qpos[f"water{i}/{axis}"][:, 0] = drops[:, i, k]
 
+    def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
+        """Return the trough of the kettle, which reaches under the left forefinger."""
+        kettle = qpos["kettle"]
+        turn = xyzw(kettle[:, 3:])
+        centre = kettle[:, :3] + rotate(turn, constant(_TROUGH, kettle))
+        tilt = xyzw(constant(quaternion_from_rpy((0.0, _TROUGH_TILT, 0.0)), kettle))
+        return [("left", posed(centre, multiply(turn, tilt)), _TROUGH_HALF)]
+
     def _fill(self, like: Tensor) -> Tensor:
         """Positions of the drops in the kettle's frame, metres, (water, 3)."""
         i = torch.arange(self.water, device=like.device)
@@ -231,6 +251,9 @@ class PourWater(ReachTask):
         position = frozen["goal"][:, :3] if self.rules.wide else _goal(state)
         pose = torch.cat((position, frozen["goal_rotation"]), dim=1)
         return {"goal_pose": pose, "goal_rotation_difference": difference}
+
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        return _bucket_ghosts(state)
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * (0.5 - _spout_off(state))

@@ -13,22 +13,30 @@ from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, PALM_UP_AWAY,
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.aligned import Error, Hidden, within
 from bidex_meta.tasks.base import FAST, FIRM, TaskClass
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import GREEN, Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed
 from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join, orientation
-from bidex_meta.utils.maths import constant, multiply, norm, rotation_angle, wxyz, xyzw
+from bidex_meta.utils.maths import constant, multiply, norm, rotate, rotation_angle, wxyz, xyzw
 
+_RED, _BLUE = (0.85, 0.43, 0.30), (0.24, 0.52, 0.74)
+"""Colours of the first cube and of the second, which has that of its file."""
 _EDGE, _HALF = 0.05, (0.025, 0.025, 0.025)
 """Edge of a cube and its half sizes, metres."""
+_RODS = (
+    ((0.05, 0.0, 0.0), (0.05, 0.006, 0.006), (0.9, 0.1, 0.1)),
+    ((0.0, 0.05, 0.0), (0.006, 0.05, 0.006), (0.1, 0.9, 0.1)),
+    ((0.0, 0.0, 0.05), (0.006, 0.006, 0.05), (0.1, 0.1, 0.9)),
+)
+"""Middle and semi-axes, metres, and colour of rods along x, y and z that reach out of a cube."""
 
 
 def _cubes(name: str, first: Point, second: Point) -> tuple[SceneObject, SceneObject]:
     """Two cubes at positions in the world, metres; the first is red."""
-    red = SceneObject(f"{name}1", "cube", first, colour=(0.85, 0.43, 0.30, 1.0))
+    red = SceneObject(f"{name}1", "cube", first, colour=(*_RED, 1.0))
     return red, SceneObject(f"{name}2", "cube", second)
 
 
@@ -58,14 +66,15 @@ class _TwoBlocks(ReachTask):
         first, second = self.distances(state)
         return self.weight * (self.widest - (first + second))
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
-        return [(_unturned(frozen[f"goal{i}"]), _HALF) for i in (1, 2)]
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return the targets, with wide variation in the colours of their blocks."""
+        colours = (_RED, _BLUE) if self.rules.wide else (GREEN, GREEN)
+        return [Ghost(_unturned(state.frozen[f"goal{i}"]), _HALF, colours[i - 1]) for i in (1, 2)]
 
 
 def _unturned(position: Tensor) -> Tensor:
     """Poses (n, 7) with the world's axes at positions (n, 3)."""
-    turn = position.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(position), 4)
-    return torch.cat((position, turn), dim=1)
+    return posed(position, position.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(position), 4))
 
 
 class PushBlock(_TwoBlocks):
@@ -282,8 +291,20 @@ class ReOrientation(TaskClass):
         """Per cube its distance (m) and rotation (rad) to its goal, each (n,)."""
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
-        return [(frozen[f"goal{i}"], _HALF) for i in (1, 2)]
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return the goals, with wide variation their axes x, y and z in red, green and blue: a ball shows no turn."""
+        goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
+        if not self.rules.wide:
+            return [Ghost(goal, _HALF) for goal in goals]
+        return [axis for goal in goals for axis in _axes(goal)]
+
+
+def _axes(goal: Tensor) -> list[Ghost]:
+    """Return three rods from a pose (n, 7) on along its axes."""
+    return [
+        Ghost(posed(goal[:, :3] + rotate(goal[:, 3:], constant(middle, goal)), goal[:, 3:]), size, colour)
+        for middle, size, colour in _RODS
+    ]
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:

@@ -14,15 +14,23 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST
-from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.reach import ReachTask, apart
-from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
-from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
+from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rotate, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
+_HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
+"""Where the leaves turn, right and left, in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
+_PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
+"""Centres of the panels in the leaves' frames, and their half sizes, metres."""
+_HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
+"""The hands' points in the leaves' frames, metres; of an Inward door at -x."""
+_POLE = (0.025, 0.025, 0.65)
+"""Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
 _LEAST_SHARE = 0.1
 """Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
 pushed against its stop, which yields, more than 0.5 m."""
@@ -70,9 +78,12 @@ class _Door(ReachTask):
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         self.objects[0].add_to(scene)
         if self.inward:
-            for side in ("right", "left"):
-                handle = scene.site(f"object/{side}_handle")
-                handle.pos = (-0.04, *handle.pos[1:])
+            for side, handle in zip(SIDES, self._handles, strict=True):
+                scene.site(f"object/{side}_handle").pos = handle
+
+    @property
+    def _handles(self) -> list[Point]:
+        return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
@@ -101,12 +112,31 @@ class _Door(ReachTask):
             return self.narrow_errors(state)
         return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
 
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the handles shall be, with wide variation."""
+        if not self.rules.wide:
+            return []
+        base, angles = posed(state["object/position"], state.quaternion("object/quaternion")), state.frozen["leaves"]
+        handles = enumerate(self._handles)
+        return [Ghost(_on_leaf(base, i, angles[:, i : i + 1], handle), _POLE) for i, handle in handles]
+
     @abstractmethod
     def narrow_errors(self, state: TaskState) -> list[Error]:
         """``errors`` without angles of a task."""
 
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state))
+
+
+def _on_leaf(base: Tensor, leaf: int, angle: Tensor, point: Point) -> Tensor:
+    """Return poses (n, 7) of a point of a leaf, given in its frame, metres, at an angle (n, 1) of its hinge.
+
+    ``base``: the door's poses (n, 7); ``leaf``: 0 for the right one, 1 for the left one. Quaternions (x, y, z, w).
+    """
+    half = 0.5 * (angle if leaf else -angle)
+    turn = multiply(base[:, 3:], torch.cat((torch.zeros_like(half), torch.zeros_like(half), half.sin(), half.cos()), 1))
+    hinge = base[:, :3] + rotate(base[:, 3:], constant(_HINGES[leaf], base))
+    return posed(hinge + rotate(turn, constant(point, base)), turn)
 
 
 def _hinges(state: TaskState) -> Tensor:
@@ -193,6 +223,15 @@ class DoorCloseInward(_Close):
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
     camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
     wide_space = _closed_to(0.05)  # farther the leaves would start in the hands
+
+    def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
+        """Return the panel of each leaf; an open one ends beside the fingertips of its hand."""
+        door = qpos["object"]
+        base = posed(door[:, :3], xyzw(door[:, 3:]))
+        return [
+            (side, _on_leaf(base, i, qpos[f"object/hinge{i + 1}"], _PANELS[i]), _PANEL_HALF)
+            for i, side in enumerate(SIDES)
+        ]
 
 
 class DoorOpenInward(_Open):

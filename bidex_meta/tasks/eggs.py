@@ -13,7 +13,7 @@ from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.tasks.aligned import Error, Hidden, within
 from bidex_meta.tasks.base import JITTER, JOINT_NOISE, LIGHT, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
+from bidex_meta.tasks.goals import Ghost, frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import Point, SceneObject
@@ -209,6 +209,6 @@ class EggTask(TaskClass):
             ends.append(norm(point - constant(anchor, point)) >= 0.1)
         return torch.stack(ends).any(dim=0)
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
+    def ghosts(self, state: TaskState) -> list[Ghost]:
         size = SEMI_AXES if self.held is None else self.held.half_extents
-        return [(frozen[f"goal{i}"], size) for i in self.numbers]
+        return [Ghost(state.frozen[f"goal{i}"], size) for i in self.numbers]

@@ -1,9 +1,31 @@
-"""What classes with a goal pose share: the frozen goal and the two goal blocks of the observation."""
+"""What classes with a goal pose share: the frozen goal, the goal blocks of the observation, and goals in pictures."""
 
+from typing import NamedTuple
+
+import torch
 from torch import Tensor
 
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import conjugate, multiply
+
+GREEN = (0.25, 0.75, 0.40)
+"""Colour of goals in pictures."""
+
+
+class Ghost(NamedTuple):
+    """A goal in pictures: a translucent ellipsoid."""
+
+    pose: Tensor
+    """Position (world, metres) and quaternion (x, y, z, w), (n, 7)."""
+    size: tuple[float, float, float]
+    """Semi-axes, metres."""
+    colour: tuple[float, float, float] = GREEN
+    """Red, green and blue in [0, 1]."""
+
+
+def posed(position: Tensor, quaternion: Tensor) -> Tensor:
+    """Return poses (n, 7) of positions (n, 3) with orientations (x, y, z, w), (n, 4)."""
+    return torch.cat((position, quaternion), dim=1)
 
 
 def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:

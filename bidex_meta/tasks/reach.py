@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.goals import observe_goal
+from bidex_meta.tasks.goals import Ghost, observe_goal
 from bidex_meta.tasks.placement import place_all
 from bidex_meta.tasks.scene import Point, SceneObject, Table, add_table
 from bidex_meta.tasks.state import TaskState
@@ -84,5 +84,5 @@ class ReachTask(TaskClass):
     def guides(self, state: TaskState) -> list[Tensor]:
         return [reach(state, side, point) for side, point in zip(("left", "right"), self.points, strict=True)]
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
-        return [(frozen["goal"], self.ghost)] if self.ghost else []
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        return [Ghost(state.frozen["goal"], self.ghost)] if self.ghost else []

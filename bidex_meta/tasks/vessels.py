@@ -11,7 +11,7 @@ from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, FIRM
-from bidex_meta.tasks.goals import frozen_goal, rotation_difference
+from bidex_meta.tasks.goals import Ghost, frozen_goal, posed, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place, placed, yaw_quaternion
@@ -19,7 +19,7 @@ from bidex_meta.tasks.reach import apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
-from bidex_meta.utils.maths import constant, dot, indices, multiply, norm, rotation_angle, uprightness, xyzw
+from bidex_meta.utils.maths import constant, dot, indices, multiply, norm, rotate, rotation_angle, uprightness, xyzw
 
 _START = (0.0, -0.6, 0.465)
 
@@ -99,6 +99,8 @@ _LIFT, _AHEAD = 0.006, 0.015
 and along the fingers, so that it can be turned without meeting the thumb."""
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
+_DISC = (0.1, 0.1, 0.003)
+"""Semi-axes of the goal in pictures, metres: a disc about the cap, wider than the hand."""
 _DROPPED = 0.25
 """Height of the bottle below which it no longer lies in the hand, metres: half of where it starts."""
 
@@ -164,6 +166,14 @@ class BottleCap(OwnObjectClass):
         if self.rules.wide:
             return [Error((slide - state.frozen["slide"][:, 0]).abs(), 0.005)]
         return [at_least(slide, 0.03, 0.005)]
+
+    def ghosts(self, state: TaskState) -> list[Ghost]:
+        """Return where the cap shall stand on the bottle, with wide variation."""
+        if not self.rules.wide:
+            return []
+        turn = state.quaternion("bottle/quaternion")
+        missing = pad(state.frozen["slide"] - state["bottle/slide"], (2, 0))
+        return [Ghost(posed(state["bottle/cap_position"] + rotate(turn, missing), turn), _DISC)]
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         for side in ("right", "left"):

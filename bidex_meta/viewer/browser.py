@@ -8,7 +8,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.world.rendering import GHOST
+from bidex_meta.world.rendering import GHOST_ALPHA
 
 _TYPE = mujoco.mjtGeom
 _Handle = Any  # viser's, which is not imported before something is shown
@@ -100,6 +100,8 @@ class Browser:
         self.paused, self.speed, stage.tour = bool(self._pause.value), float(self._pace.value), bool(self._tour.value)
         if self._class.value != self._chosen:
             stage.row = stage.names.index(self._class.value)
+            stage.tour = False  # the chosen class stays
+            self._tour.value = False
             self.show(stage)
         while self._asked:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
@@ -142,15 +144,14 @@ class Browser:
     def _show_ghosts(self, stage: Stage) -> None:
         ghosts = stage.ghosts()
         if len(ghosts) != len(self._ghosts):
-            *rgb, alpha = GHOST.tolist()
             self._ghosts = [
                 self._server.scene.add_icosphere(
-                    f"/goals/{i}", radius=1.0, scale=size, color=tuple(rgb), opacity=alpha, subdivisions=3
+                    f"/goals/{i}", radius=1.0, scale=ghost.size, color=ghost.colour, opacity=GHOST_ALPHA, subdivisions=3
                 )
-                for i, (_, _, size) in enumerate(ghosts)
+                for i, ghost in enumerate(ghosts)
             ]
-        for handle, (position, turned, _) in zip(self._ghosts, ghosts, strict=True):
-            handle.position, handle.wxyz = position, turned
+        for handle, ghost in zip(self._ghosts, ghosts, strict=True):
+            handle.position, handle.wxyz = ghost.position, ghost.quaternion
 
     def close(self) -> None:
         """Stops the server."""

@@ -10,7 +10,7 @@ import torch
 from bidex_meta.agents import Agent
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.world import World
-from bidex_meta.world.rendering import Ghost, ghosts, pose, simulation
+from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 
 
 class Stage:
@@ -81,8 +81,8 @@ class Stage:
         pose(scene.dressed, data, engine.placement()[row])
         return data
 
-    def ghosts(self) -> list[Ghost]:
-        """Its goals."""
+    def ghosts(self) -> list[DrawnGhost]:
+        """Its goals; none in a world that hides them."""
         return ghosts(self._world, self.row)
 
     def camera(self) -> tuple[tuple[float, float, float], float, tuple[float, float]]:

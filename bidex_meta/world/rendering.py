@@ -1,7 +1,7 @@
-"""Pictures of a row: its scene from a fixed camera, with its goal as a ghost."""
+"""Pictures of a row: its scene from a fixed camera, with its goal as a ghost if observations show it."""
 
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ from bidex_meta.utils.maths import wxyz
 if TYPE_CHECKING:
     from bidex_meta.engine.protocol import Engine
     from bidex_meta.tasks.scene import Scene
+    from bidex_meta.world.part import Part
     from bidex_meta.world.world import World
 
 CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
@@ -24,11 +25,20 @@ MOST_PIXELS = 1080
 """Edge of the largest square picture."""
 _SMALL = 320
 """Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
-GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
-"""Colour of goals."""
+GHOST_ALPHA = 0.35
+"""Opacity of goals."""
 
-Ghost = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""A goal: position (3,), quaternion (w, x, y, z), semi-axes (3,), world, metres."""
+
+class DrawnGhost(NamedTuple):
+    """A goal of one environment: an ellipsoid in the world, metres."""
+
+    position: np.ndarray
+    quaternion: np.ndarray
+    """MuJoCo's (w, x, y, z)."""
+    size: np.ndarray
+    """Semi-axes."""
+    colour: tuple[float, float, float]
+    """Red, green and blue in [0, 1]."""
 
 
 class Painter(threading.local):
@@ -111,10 +121,15 @@ def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
 
 def simulation(world: "World", row: int) -> "tuple[Engine, int, Scene]":
     """The engine that carries a row, its row there, and its scene."""
-    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
-    at = int((part.group.rows == row).nonzero()[0])
+    part, at = _part(world, row)
     scene = next(m.scene for m in part.group.members if m.engine_rows.start <= at < m.engine_rows.stop)
     return part.group.engine, at, scene
+
+
+def _part(world: "World", row: int) -> "tuple[Part, int]":
+    """Return the part that has a row, and its row in the part's engine."""
+    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
+    return part, int((part.group.rows == row).nonzero()[0])
 
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) -> None:
@@ -127,20 +142,29 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
         part(model, data)
 
 
-def ghosts(world: "World", row: int) -> list[Ghost]:
-    """The goals of a row's task."""
-    slot = int(world.task_id[row])
-    task = world.slots[slot].task_class
-    variation = torch.as_tensor(world.slots[slot].tasks[int(world.task_index[row])])[None]
-    found = task.ghosts(task.freeze(variation))
-    return [(pose[0, :3].numpy(), wxyz(pose[0, 3:]).numpy(), np.array(size)) for pose, size in found]
+def ghosts(world: "World", row: int) -> list[DrawnGhost]:
+    """Return the goals of a row's task in its present state; none in a world that hides them.
+
+    Every picture, film and view asks here, so that none tells what observations hide.
+    """
+    if world.hides_goals:
+        return []
+    part, at = _part(world, row)
+    rows = torch.tensor([at], device=part.group.engine.device)
+    ((member, _, state),) = part.states(part.group.take(world.task_index), rows)
+    found = []
+    for goal, size, colour in member.scene.task.ghosts(state):
+        numbers = goal[0].double().cpu()
+        found.append(DrawnGhost(numbers[:3].numpy(), wxyz(numbers[3:]).numpy(), np.array(size), colour))
+    return found
 
 
-def add_ghosts(goals: list[Ghost], scene: mujoco.MjvScene) -> None:
+def add_ghosts(goals: list[DrawnGhost], scene: mujoco.MjvScene) -> None:
     """Puts goals into a scene that is about to be drawn, translucent."""
     rotation = np.zeros(9)
-    for position, quaternion, size in goals:
+    for position, quaternion, size, colour in goals:
         mujoco.mju_quat2Mat(rotation, quaternion)
         geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, GHOST)
+        rgba = np.array((*colour, GHOST_ALPHA), dtype=np.float32)
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, rgba)
         scene.ngeom += 1

@@ -324,7 +324,7 @@ class World(BatchedWorld):
         return {name: value.clone() for name, value in self._randomiser.drawn.items()} if self._randomiser else {}
 
     def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
-        """A picture of an environment with its goal, shape (height, width, 3), uint8."""
+        """Draw an environment, with its goal if observations show it: (height, width, 3), uint8."""
         row = whole_number("row", row, 0, self.num_envs - 1)
         width, height = (whole_number(name, n, 1) for name, n in (("width", width), ("height", height)))
         return self._painter.picture(self, row, width, height, camera)

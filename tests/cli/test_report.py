@@ -59,6 +59,7 @@ def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, report, t
     (runs[0] / "videos" / "training_500.mp4").write_bytes(b"old")
     (runs[0] / "videos" / "training_1000.mp4").write_bytes(b"new film")
     (runs[0] / "videos" / "tiled.mp4").write_bytes(b"tiles")
+    (runs[0] / "videos" / "task.webp").write_bytes(b"animation")
     text = report(runs)
     tags = Tags(text)
     names = {tag for tag, _ in tags.elements}
@@ -69,7 +70,7 @@ def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, report, t
     films = [a["src"] for tag, a in tags.elements if tag == "video"]
     assert {base64.b64decode(film.partition(",")[2]) for film in films} == {b"new film", b"tiles"}
     pictures = [base64.b64decode(a["src"].partition(",")[2]) for tag, a in tags.elements if tag == "img"]
-    assert len(pictures) == 3 and all(b"<svg" in picture for picture in pictures)
+    assert len(pictures) == 4 and pictures.pop() == b"animation" and all(b"<svg" in picture for picture in pictures)
     assert "&lt;b&gt;&amp;" in text
 
 

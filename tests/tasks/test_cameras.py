@@ -8,6 +8,7 @@ import torch
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.tasks.state import TaskState
 
 _OF_HANDS = tuple(f"{side}/" for side in SIDES)
 
@@ -34,7 +35,8 @@ def test_the_camera_sees_hands_objects_and_goal(name):
         assert in_view(data.site(f"{side}/hand_point").xpos), side
     space = task.variation_space
     middle = torch.tensor(0.5 * (np.array(space.low) + np.array(space.high)))[None]
-    goals = [pose[0, :3].numpy() for pose, _ in task.ghosts(task.freeze(middle))]
+    state = TaskState(torch.from_numpy(data.sensordata.copy())[None], scene.sensors, task.freeze(middle))
+    goals = [ghost.pose[0, :3].numpy() for ghost in task.ghosts(state)]
     objects = [data.body(i).xpos for i in range(model.nbody) if model.body(i).name.endswith("/object")]
     hit = np.zeros(1, np.int32)
     for point in (*goals, *objects):

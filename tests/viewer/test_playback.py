@@ -144,9 +144,14 @@ def test_the_page_shows_the_row_and_obeys(stage):
         assert np.allclose(page._shapes[moved].position, stage.data().geom_xpos[moved])
         assert len(page._ghosts) == len(stage.ghosts()) > 0
         page._class.value, page._pace.value, page._pause.value = stage.names[3], 0.5, True
+        page._tour.value = True
         page._asked.append("Another episode")
         page.obey(stage)
         assert (stage.row, page.paused, page.speed) == (3, True, 0.5)
+        assert not stage.tour and not page._tour.value, "a chosen class stays"
+        page._tour.value = True
+        page.obey(stage)
+        assert stage.tour, "a tour goes on from there"
         assert len(page._ghosts) == len(stage.ghosts())
         assert f"| class | {stage.names[3]} |" in page._text.content
         stage.row = 0  # as on a tour
