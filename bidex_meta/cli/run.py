@@ -195,6 +195,8 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
     rows = mend(folder.metrics_path, resume_step or 0)
     last = rows[-1] if rows and rows[-1]["step"] == resume_step else None
     with contextlib.ExitStack() as stack:
+        size = runner.checkpoint_bytes(learner, world, config.learner, config.steps)
+        stack.enter_context(folder.checkpoints.room(size))
         record, watch = stack.enter_context(Recorder(folder, config.steps, seconds, resume_step, config.logger)), None
         if config.evaluate_every is not None or config.video_every is not None:
             watch = watching.Watch(plan, folder, learner, record, len(rows))
