@@ -22,7 +22,7 @@ from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
-from bidex_meta.utils.files import read_text
+from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
 
 POINTS = 60
@@ -32,8 +32,6 @@ _TAG = re.compile(
     r"|Perf/steps_per_second"
 )
 _TRAINED = "Train/return/"
-_PATHS = {"suite": 1, "object": 1, "start_from": 1, "dataset": 2, "demonstrations": 2, "teacher": 1}
-"""Entries of a config that are paths, and how many of their last parts are kept."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """What is kept of a class after each shot; the evaluation after the last one has counts and lengths too."""
 
@@ -112,20 +110,6 @@ def arm_of(path: Path, config: dict[str, Any]) -> str:
     if name.casefold().startswith(subject.casefold()):
         name = name[len(subject) :].strip("-_ ")
     return short_name(config["algo"]) if not name or re.match(r"\d{4}-\d\d-\d\d", name) else name
-
-
-def portable(config: dict[str, Any]) -> dict[str, Any]:
-    """The config without folders of this machine: of absolute paths the last parts alone."""
-
-    def short(path: str, parts: int) -> str:
-        return "/".join(Path(path).parts[-parts:]) if Path(path).is_absolute() else path
-
-    kept = dict(config)
-    for name, parts in _PATHS.items():
-        value = config.get(name)
-        if value:
-            kept[name] = short(value, parts) if isinstance(value, str) else [short(each, parts) for each in value]
-    return kept
 
 
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:

@@ -19,6 +19,7 @@ _ClassResult = TypedDict(
         "score": Finite | None,
         "success_interval": NotRequired[_Interval],
         "return_interval": NotRequired[_Interval],
+        "episodes": NotRequired[Whole],
     },
 )
 
@@ -42,11 +43,17 @@ class _Evaluation(TypedDict):
 
 class _Git(TypedDict):
     commit: NotRequired[Text | None]
+    dirty: NotRequired[bool]
 
 
 class _Versions(TypedDict):
+    packages: NotRequired[dict[str, Text | None]]
+    cpus: NotRequired[Whole | None]
     gpus: NotRequired[list[Text] | None]
     git: NotRequired[_Git | None]
+    physics: NotRequired[Text | None]
+    suite_version: NotRequired[Whole | None]
+    suite_digest: NotRequired[Text | None]
 
 
 def read_versions(folder: Path) -> Json:
