@@ -20,6 +20,7 @@ from bidex_meta.evaluation.play import RandomAgent, Watched
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.versions import package_versions
+from bidex_meta.utils.files import portable
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str]) -> None:
     play = _meta_test if learner_kind(config.algo).make.adapts else _evaluate
     result = play(flags, folder, config, worlds)
     if flags.json:
-        run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}
+        run = {"run": portable(str(folder.path)), **result, "conditions": conditions(worlds, flags.num_envs)}
         run |= {"randomisation": asdict(worlds.randomisation)} if worlds.randomisation else {}
         print(json.dumps(run, indent=2))
 

@@ -27,6 +27,7 @@ from bidex_meta.runs.folder import check_new, new_folder_name
 from bidex_meta.train import distributed, runner
 from bidex_meta.train.distributed import together
 from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.utils.files import portable
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
@@ -250,7 +251,7 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
         algo, step = plan.config.algo, learner.env_steps
         found["other_tasks"], table = judged_on_others(source, algo, learner, step, "train", options, True, brief=True)
         tables.append(table)
-    write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
+    write_json(folder.evaluation_path, {"run": portable(str(folder.path)), **found, "conditions": conditions(source)})
     for table in tables:
         print_table(table)
     say(f"More columns: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")

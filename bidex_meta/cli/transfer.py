@@ -29,6 +29,7 @@ from bidex_meta.evaluation.transfer_measures import TAG, add_over_nothing, at_th
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Whole
 from bidex_meta.worlds import Worlds
 
@@ -118,7 +119,8 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
             shots.append(row | {"demonstrations": count} | at_the_end(folders))
     add_over_nothing(steps, "area")
     add_over_nothing(shots, "success")
-    made = {"run": str(flags.run), "suite": suite, "steps": flags.steps, "versions": collect_versions()}
+    made = {"run": portable(str(flags.run)), "suite": portable(suite), "steps": flags.steps}
+    made |= {"versions": collect_versions()}
     write_json(flags.out / "transfer.json", made | {"reinforcement": steps, "demonstrations": shots})
     if steps:
         print_table(plain_table(*_steps_table(steps, flags.steps)))

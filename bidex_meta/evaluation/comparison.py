@@ -16,6 +16,7 @@ from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
 from bidex_meta.runs.stored import Run, StoredRun
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
@@ -88,7 +89,7 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
     for key, kind in unique.items():
         others = [other for other in unique.values() if other["algo"] == kind["algo"]]
         names = {name for a in others for b in others for name in a.keys() | b.keys() if a.get(name) != b.get(name)}
-        differing = [f"{name.removeprefix('learner.')} {kind.get(name)}" for name in sorted(names)]
+        differing = [f"{name.removeprefix('learner.')} {portable(kind.get(name))}" for name in sorted(names)]
         groups.append((", ".join([kind["algo"], *differing]), members[key]))
     arms = [{run.arm if isinstance(run, StoredRun) else None for run in mine} for _, mine in groups]
     names = [arm.pop() if len(arm) == 1 and arms.count(arm) == 1 else None for arm in map(set, arms)]
