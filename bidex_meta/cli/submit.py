@@ -8,16 +8,17 @@ from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import others_of
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.policies import checkpoint, fitting, load_policy
 from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import class_rows, estimate, iqm, read_entry
+from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, estimate, iqm, read_entry
 from bidex_meta.evaluation.play import EVALUATION_SEED, Watched
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
+from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few
@@ -49,21 +50,31 @@ def main(arguments: Sequence[str]) -> None:
     folders = [RunFolder.open(path) for path in flags.runs]
     configs = [folder.config() for folder in folders]
     _check(folders, configs)
+    weights = _weights(folders)
     first = configs[0]
     name = flags.name or short_name(first.algo)
-    suite = Worlds.open(first.to_json()).name
-    path = flags.out / f"{Path(suite).stem}-{name.replace(' ', '-').replace('/', '-')}.json"
+    worlds = Worlds.open(first.to_json())
+    suite = worlds.name if worlds.suite is None else worlds.suite.file.stem
+    path = flags.out / entry_name(suite, name)
     if exists(path):
         raise BidexError(f"There is {path} already. Give another --name, or delete it.")
+    for known in sorted(flags.out.glob("*.json")):
+        if twice := {*weights} & {*read_entry(known).weights}:
+            run = folders[weights.index(twice.pop())].path
+            raise BidexError(f"{run} stands in {known}: their weights are equal. Leave it out, or delete that entry.")
     check_writable(path)
     facts = [_facts(folder) for folder in folders]
     played = [_play(folder, config, flags) for folder, config in zip(folders, configs, strict=True)]
+    verified = played[0][3]
+    stated = {
+        "seeds": [config.seed for config in configs], "hours": [row[0] for row in facts], "device": facts[0][1],
+        "commit": [row[2] for row in facts],
+    }  # fmt: skip
     entry = {
-        "format": 1, "name": name, "suite": suite, "version": played[0][3]["suite_version"], "algorithm": first.algo,
-        "seeds": [config.seed for config in configs], "steps": [row[2] for row in played],
-        "hours": [row[0] for row in facts], "device": facts[0][1], "commit": [row[2] for row in facts],
-        "episodes": flags.episodes, "own": class_rows([row[0] for row in played]),
-        "others": class_rows([row[1] for row in played]), "verified": played[0][3],
+        "format": FORMAT, "name": name, "suite": suite, "version": verified["suite_version"], "algorithm": first.algo,
+        "weights": weights, "steps": [row[2] for row in played], "episodes": flags.episodes,
+        "own": class_rows([row[0] for row in played]), "others": class_rows([row[1] for row in played]),
+        "verified": verified, "stated": stated,
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, entry)
@@ -83,6 +94,19 @@ def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
             raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
     if len({config.seed for config in configs}) < len(configs):
         raise BidexError("Two of the runs have one seed. Name each seed once.")
+
+
+def _weights(folders: Sequence[RunFolder]) -> list[str]:
+    """Return the digests of the runs' policies; raises BidexError where two are equal, whatever their configs say."""
+    digests: dict[str, Path] = {}
+    for folder in folders:
+        state, _ = checkpoint(folder)
+        with fitting(folder.path):
+            digest = weights_digest(state["learner"]["policy"])
+        if digest in digests:
+            raise BidexError(f"{folder.path} and {digests[digest]} have equal weights: they are one run. Name it once.")
+        digests[digest] = folder.path
+    return list(digests)
 
 
 def _facts(folder: RunFolder) -> tuple[float, str, str | None]:

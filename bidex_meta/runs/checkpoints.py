@@ -190,6 +190,21 @@ def _check_archive(file: IO[bytes]) -> None:
     file.seek(0)
 
 
+def weights_digest(policy: State) -> str:
+    """Return 32 hexadecimal digits of a policy's tensors, with which two copies of one run are found.
+
+    Numbers enter in half precision, in which published policies are stored.
+    """
+    return _digest({"weights": _halved(policy.get("weights", policy))})[:32]
+
+
+def _halved(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _halved(part) for name, part in sorted(value.items())}
+    is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
+    return value.to(_torch().float16) if is_number else value
+
+
 def _digest(content: State) -> str:
     found = hashlib.blake2b(digest_size=32)
     _feed(content, found, 0)
