@@ -20,6 +20,7 @@ from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
+from bidex_meta.runs.provenance import differences
 from bidex_meta.runs.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.utils.files import portable, read_text
@@ -152,6 +153,12 @@ def _check(
         raise BidexError(f"{folder.path / 'versions.json'} names no commit: nobody could make this run again.")
     if evaluation.get("split", "train") != "train":
         raise BidexError(f"{folder.evaluation_path} is of {evaluation['split']} tasks. Write it anew: {folder.again}")
+    other = [str(each) for each in differences(versions, evaluation.get("conditions", {})) if each.is_of_worlds]
+    if other:
+        raise BidexError(
+            f"{folder.path} was trained with other worlds than its evaluation's: {', '.join(other)}. Evaluate it "
+            "with the versions in versions.json."
+        )
     trained = {tag.removeprefix(_TRAINED) for row in rows for tag in row if tag.startswith(_TRAINED)}
     parts = evaluation.get("splits", {"train": {"after": evaluation.get("policy", evaluation)}})
     missing = trained - {name for part in parts.values() for name in part["after"]["classes"]}

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, run_teachers, watching
-from bidex_meta.cli.evaluate import conditions, judged, judged_on_others
+from bidex_meta.cli.conditions import conditions
+from bidex_meta.cli.evaluate import judged, judged_on_others
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.cli.tables import Json, print_table, say

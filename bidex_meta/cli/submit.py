@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.conditions import check_worlds_of, conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import others_of
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.policies import checkpoint, fitting, load_policy
+from bidex_meta.cli.policies import checkpoint, fitting, policy_of
 from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
@@ -19,6 +19,7 @@ from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
+from bidex_meta.runs.provenance import check_alike
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few
@@ -50,10 +51,13 @@ def main(arguments: Sequence[str]) -> None:
     folders = [RunFolder.open(path) for path in flags.runs]
     configs = [folder.config() for folder in folders]
     _check(folders, configs)
-    weights = _weights(folders)
     first = configs[0]
-    name = flags.name or short_name(first.algo)
     worlds = Worlds.open(first.to_json())
+    check_alike(folders)
+    for folder in folders:
+        check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
+    weights = _weights(folders)
+    name = flags.name or short_name(first.algo)
     suite = worlds.name if worlds.suite is None else worlds.suite.file.stem
     path = flags.out / entry_name(suite, name)
     if exists(path):
@@ -100,7 +104,7 @@ def _weights(folders: Sequence[RunFolder]) -> list[str]:
     """Return the digests of the runs' policies; raises BidexError where two are equal, whatever their configs say."""
     digests: dict[str, Path] = {}
     for folder in folders:
-        state, _ = checkpoint(folder)
+        state, _ = checkpoint(folder, noted=True)
         with fitting(folder.path):
             digest = weights_digest(state["learner"]["policy"])
         if digest in digests:
@@ -126,7 +130,8 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     worlds = Worlds.open(config)
     others = others_of(worlds)
     set_up_torch(stored.threads)
-    policy, steps = load_policy(folder, config["device"])
+    state, steps = checkpoint(folder, noted=True)
+    policy = policy_of(folder, state, config["device"])
     found = []
     for where, what in ((worlds, "its own tasks"), (others, "others")):
         say(f"{folder.path}: playing {what}.")

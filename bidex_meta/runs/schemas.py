@@ -34,7 +34,15 @@ class _Split(TypedDict):
     by_shot: NotRequired[list[_Classes]]
 
 
+class _Made(TypedDict):
+    packages: NotRequired[dict[str, Text | None]]
+    physics: NotRequired[Text | None]
+    suite_version: NotRequired[Whole | None]
+    suite_digest: NotRequired[Text | None]
+
+
 class _Evaluation(TypedDict):
+    conditions: NotRequired[_Made]
     steps: NotRequired[Whole]
     split: NotRequired[Text]
     splits: NotRequired[dict[str, _Split]]
@@ -46,14 +54,10 @@ class _Git(TypedDict):
     dirty: NotRequired[bool]
 
 
-class _Versions(TypedDict):
-    packages: NotRequired[dict[str, Text | None]]
+class _Versions(_Made):
     cpus: NotRequired[Whole | None]
     gpus: NotRequired[list[Text] | None]
     git: NotRequired[_Git | None]
-    physics: NotRequired[Text | None]
-    suite_version: NotRequired[Whole | None]
-    suite_digest: NotRequired[Text | None]
 
 
 def read_versions(folder: Path) -> Json:
