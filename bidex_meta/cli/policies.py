@@ -28,8 +28,13 @@ def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> t
     ``which`` is ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path
     or by its name in the run's folder of checkpoints.
     """
+    loaded = _loaded(folder, which)
     if not noted:
         note(folder)
+    return loaded
+
+
+def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
     if which == "best":
         if not folder.checkpoints.best.is_file():
             raise BidexError(
