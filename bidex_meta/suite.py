@@ -3,17 +3,19 @@
 Names of task classes and of their variations are checked where the classes are known, in `bidex_meta.benchmark`.
 """
 
+import hashlib
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
-from bidex_meta.utils.files import absolute, expanded, read_toml
+from bidex_meta.utils.files import absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.utils.validation import check_fields, check_rising, parse
@@ -174,6 +176,15 @@ class Suite:
     """Of training worlds."""
 
     @property
+    def digest(self) -> str:
+        """Twelve hexadecimal digits of all that decides tasks, rewards and observations, whatever the file's version.
+
+        Entries with their default value do not enter, so that a new kind of entry leaves old digests as they are.
+        """
+        content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
     def splits(self) -> tuple[Split, ...]:
         """The splits that hold at least one class."""
         return tuple(split for split in SPLITS if self.split_classes(split))
@@ -181,6 +192,21 @@ class Suite:
     def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
         """The classes of one split, in file order."""
         return tuple(entry for entry in self.classes if split in entry.splits)
+
+
+_OF_THE_FILE = ("name", "version", "description", "file")
+
+
+def _chosen(value: Any) -> Any:
+    """A value ready for JSON: of dataclasses the fields that are no default, of paths the name."""
+    if is_dataclass(value):
+        given = ((entry, getattr(value, entry.name)) for entry in fields(value))
+        return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
+    if isinstance(value, Mapping):
+        return {name: _chosen(each) for name, each in value.items()}
+    if isinstance(value, tuple):
+        return [_chosen(each) for each in value]
+    return portable(str(value)) if isinstance(value, Path | str) else value
 
 
 def suite_names() -> list[str]:

@@ -20,9 +20,10 @@ from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
+from bidex_meta.runs.provenance import differences
 from bidex_meta.runs.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
-from bidex_meta.utils.files import read_text
+from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
 
 POINTS = 60
@@ -32,8 +33,6 @@ _TAG = re.compile(
     r"|Perf/steps_per_second"
 )
 _TRAINED = "Train/return/"
-_PATHS = {"suite": 1, "object": 1, "start_from": 1, "dataset": 2, "demonstrations": 2, "teacher": 1}
-"""Entries of a config that are paths, and how many of their last parts are kept."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """What is kept of a class after each shot; the evaluation after the last one has counts and lengths too."""
 
@@ -114,20 +113,6 @@ def arm_of(path: Path, config: dict[str, Any]) -> str:
     return short_name(config["algo"]) if not name or re.match(r"\d{4}-\d\d-\d\d", name) else name
 
 
-def portable(config: dict[str, Any]) -> dict[str, Any]:
-    """The config without folders of this machine: of absolute paths the last parts alone."""
-
-    def short(path: str, parts: int) -> str:
-        return "/".join(Path(path).parts[-parts:]) if Path(path).is_absolute() else path
-
-    kept = dict(config)
-    for name, parts in _PATHS.items():
-        value = config.get(name)
-        if value:
-            kept[name] = short(value, parts) if isinstance(value, str) else [short(each, parts) for each in value]
-    return kept
-
-
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
     """Run folders; of a sweep those of its ended runs, with the names of their arms."""
     if path.suffix != ".toml":
@@ -168,6 +153,12 @@ def _check(
         raise BidexError(f"{folder.path / 'versions.json'} names no commit: nobody could make this run again.")
     if evaluation.get("split", "train") != "train":
         raise BidexError(f"{folder.evaluation_path} is of {evaluation['split']} tasks. Write it anew: {folder.again}")
+    other = [str(each) for each in differences(versions, evaluation.get("conditions", {})) if each.is_of_worlds]
+    if other:
+        raise BidexError(
+            f"{folder.path} was trained with other worlds than its evaluation's: {', '.join(other)}. Evaluate it "
+            "with the versions in versions.json."
+        )
     trained = {tag.removeprefix(_TRAINED) for row in rows for tag in row if tag.startswith(_TRAINED)}
     parts = evaluation.get("splits", {"train": {"after": evaluation.get("policy", evaluation)}})
     missing = trained - {name for part in parts.values() for name in part["after"]["classes"]}

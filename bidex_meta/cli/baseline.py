@@ -16,6 +16,7 @@ from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Few, Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of
@@ -69,7 +70,8 @@ def main(arguments: Sequence[str]) -> None:
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     if flags.out is not None:
         stored = ("return", "return_interval", "success", "episodes", "unstable")
-        made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+        made = {"policy": _POLICIES[what], "suite": portable(flags.suite), "seed": flags.seed}
+        made |= {"versions": collect_versions()}
         classes = {name: {key: row[key] for key in stored} for name, row in numbers.items()}
         references.store(flags.out, classes, made)
     if flags.json:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
 from bidex_meta.cli.plot import named_runs
-from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
+from bidex_meta.cli.tables import NONE, Json, plain_table, print_table, say
 from bidex_meta.evaluation.comparison import Group, estimates, iqm, read_groups, score_over, success_over
 from bidex_meta.runs import plots
+from bidex_meta.runs.provenance import release_of
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,12 @@ class CompareFlags:
 def main(arguments: Sequence[str]) -> None:
     """Read, compare, print."""
     flags = parse(CompareFlags, arguments, "compare")
-    groups = read_groups(named_runs(flags.runs, "compare"))
+    runs = named_runs(flags.runs, "compare")
+    groups = read_groups(runs)
+    for group in groups:
+        releases = {release_of(run) for run in runs if run.path in group.paths} - {None}
+        if len(releases) > 1:
+            say(f"{group.label}: its runs were made with bidex-meta {', '.join(sorted(map(str, releases)))}.")
     if flags.out is not None:
         plots.save(plots.draw_comparison(estimates(groups)), flags.out)
     if flags.json:

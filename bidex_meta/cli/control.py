@@ -15,6 +15,7 @@ from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.control_arms import Control, arms, control
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.provenance import check_alike
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
@@ -88,6 +89,7 @@ def _plain(arm: Json) -> Json:
 
 def _check(folders: Sequence[RunFolder]) -> None:
     """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
+    check_alike(folders)
     first = run_kind(folders[0].config())
     seeds: dict[int, Path] = {}
     for folder in folders:

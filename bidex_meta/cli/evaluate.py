@@ -9,6 +9,7 @@ from typing import Literal
 from rich.table import Table
 
 from bidex_meta.agents import Agent
+from bidex_meta.cli.conditions import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
@@ -19,12 +20,10 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent, Watched
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
-from bidex_meta.runs.versions import package_versions
 from bidex_meta.suite import OTHERS
+from bidex_meta.utils.files import portable
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
-
-_PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     play = _meta_test if learner_kind(config.algo).make.adapts else _evaluate
     result = play(flags, folder, config, worlds)
     if flags.json:
-        run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}
+        run = {"run": portable(str(folder.path)), **result, "conditions": conditions(worlds, flags.num_envs)}
         run |= {"randomisation": asdict(worlds.randomisation)} if worlds.randomisation else {}
         print(json.dumps(run, indent=2))
 
@@ -154,19 +153,3 @@ def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, world
         print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
     tests = {split: result.to_json() for split, result in found.items()}
     return {"steps": step, "seed": flags.seed, "splits": tests}
-
-
-def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:
-    """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
-
-    Of the worlds that were played, and the environments that were asked for (None: the default).
-    """
-    wanted, identity = [*_PACKAGES], worlds.identity()
-    if worlds.device.startswith("cuda") or worlds.engine == "warp":
-        wanted.append("mujoco-warp")
-    if identity["physics"] is None:
-        wanted.append("metaworld")
-    installed = package_versions()
-    packages = {name: installed[name] for name in wanted}
-    where = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
-    return {**where, "packages": packages, **identity}

@@ -17,6 +17,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_atomic
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.worlds import Worlds
 
@@ -113,6 +114,8 @@ def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
     if program is None:
         raise TypeError("torch.onnx.export returned no program")
     program.model.metadata_props.update(metadata)
+    for node in program.model.graph.all_nodes():
+        node.metadata_props.clear()  # the lines of code that made it, with paths of this machine
     return program.model_proto.SerializeToString()
 
 
@@ -130,7 +133,7 @@ def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> 
     """What the file says of itself: texts by name, lists and tables as JSON."""
     worlds, versions = Worlds.open(config.to_json()), folder.versions()
     facts = {
-        "suite": worlds.name, "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
+        "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
         "classes": list(worlds.tasks("train")), "seed": config.seed, "steps": steps,
         "commit": (versions.get("git") or {}).get("commit"), "versions": versions.get("packages"),
         "observation_groups": shape.get("groups"),

@@ -1,11 +1,19 @@
-"""What ``bidex-meta push`` and ``pull`` share: names, the files of a folder, and the hub's library."""
+"""What ``bidex-meta push`` and ``pull`` share: names, the files of a folder, their checks, and the hub's library."""
 
+import contextlib
+import json
+import logging
+import os
 import shutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.data import Dataset, open_dataset, part_files, seals
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.utils.files import exists
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, refuse_links
+from bidex_meta.utils.files import absolute, exists, is_file, portable, read_json
 
 FOLDER = "folder:"
 """Begins a name that is no repository of the Hugging Face Hub but a folder of this machine."""
@@ -13,22 +21,110 @@ DATASETS = "datasets/"
 """Begins the name of a data set's repository, as in the hub's addresses."""
 OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "metrics.jsonl", "policy.onnx", "checkpoints/*.pt")
 OF_DATA = ("data/metadata.json", "data/*.hdf5")
+SUITES = "*.toml"
+"""Files of suites of one's own, beside the run that was trained on one."""
 CARD = "README.md"
+_METADATA = f"data/{part_files.METADATA}"
+Files = Mapping[str, Path | bytes]
+"""What is published, by the path within the folder: a file, or its content."""
 
 
-def files_of(folder: Path, patterns: tuple[str, ...]) -> dict[str, Path]:
-    """The files of a folder that are published, by their path within it."""
-    found = [path for pattern in patterns for path in sorted(folder.glob(pattern)) if path.is_file()]
-    return {path.relative_to(folder).as_posix(): path for path in found}
+def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) -> dict[str, Path]:
+    """Return the files of a folder that are published, by their path within it.
+
+    Raises BidexError for a link that leads out of ``root``, by default the folder itself: it would publish, or fetch,
+    a file that nobody named.
+    """
+    root = absolute(root or folder)
+    files = {}
+    for pattern in patterns:
+        for path in sorted(folder.glob(pattern)):
+            if not absolute(path).is_relative_to(root):
+                raise BidexError(f"Expected a file in {folder}, got {path}, which leads out of it. Put the file there.")
+            if path.is_file():
+                files[path.relative_to(folder).as_posix()] = path
+    return files
 
 
-def copied(files: dict[str, Path], folder: Path) -> None:
-    """Copies files into a folder; BidexError where it holds something."""
-    if exists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
-        raise BidexError(f"{folder} exists and is not empty. Name another, or delete it.")
-    for name, path in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, folder / name)
+def checked(folder: Path) -> RunFolder | Dataset:
+    """Return the run or the data set in a folder, after all that is published of it was read.
+
+    Raises BidexError where ``bidex-meta evaluate`` or ``bidex-meta data info`` would.
+    """
+    if is_file(folder / _METADATA):
+        from bidex_meta.data.checking import coverage, summary
+
+        dataset = open_dataset(folder)
+        dataset.check_digests()
+        summary(dataset)
+        coverage(dataset)
+        return dataset
+    run = RunFolder.open(folder)
+    run.config()
+    run.versions()
+    if exists(run.evaluation_path):
+        run.evaluation()
+    for path in files_of(folder, ("checkpoints/*.pt",)).values():
+        run.checkpoints.load_one(path)
+    return run
+
+
+def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes]:
+    """Return the files of a checked folder as they are published: without paths of this machine, with an own suite."""
+    content: dict[str, Path | bytes] = dict(files)
+    for name in files.keys() & {"config.json", "versions.json", "evaluation.json"}:
+        found = read_json(files[name], "a file of a run")
+        if name == "config.json" and is_file(suite := Path(found["suite"] or "")):
+            content[suite.name] = suite
+        if portable(found) != found:
+            content[name] = (json.dumps(portable(found), indent=2) + "\n").encode()
+    if _METADATA in files:
+        found = read_json(files[_METADATA], "a data set's metadata")
+        if "bidex" in found and portable(found) != found:
+            content[_METADATA] = seals.sealed_text(portable(found), portable(found["bidex"]))
+    return content
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder beside ``path``, which is renamed to it once all within has succeeded.
+
+    What a killed process left is deleted. Raises BidexError where ``path`` holds something.
+    """
+    if exists(path) and not (path.is_dir() and not any(path.iterdir())):
+        raise BidexError(f"{path} exists and is not empty. Name another, or delete it.")
+    missing = [above for above in path.parents if not exists(above)]
+    temporary = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
+    refuse_links(temporary)
+    temporary.mkdir(parents=True, exist_ok=True)
+    try:
+        with RunFolder(temporary).locked(f"Another process writes {path}. Wait for its end, or name another."):
+            shutil.rmtree(temporary)
+            temporary.mkdir()
+            yield temporary
+            if exists(path):
+                path.rmdir()
+            temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty
+            for above in missing:
+                above.rmdir()
+
+
+def copied(files: Files, folder: Path) -> None:
+    """Write files into a folder, and force them to the disk."""
+    for name, source in files.items():
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("xb") as file:
+            if isinstance(source, bytes):
+                file.write(source)
+            else:
+                with source.open("rb") as content:
+                    shutil.copyfileobj(content, file)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def library() -> Any:
@@ -39,6 +135,8 @@ def library() -> Any:
         raise BidexError(
             f"The hub needs huggingface_hub: pip install 'bidex-meta[hub]'. {FOLDER}PATH does not."
         ) from None
+    # It reports each of its tries.
+    logging.getLogger("huggingface_hub").setLevel(logging.CRITICAL)
     return huggingface_hub
 
 
@@ -47,7 +145,9 @@ def called(function: str, name: str, **options: Any) -> Any:
     kind = "dataset" if name.startswith(DATASETS) else "model"
     try:
         return getattr(library(), function)(name.removeprefix(DATASETS), repo_type=kind, **options)
-    except (OSError, ValueError, RuntimeError) as error:  # the library's own are all of these
+    except BidexError:
+        raise
+    except Exception as error:  # the library's own, and of what it sends by: none of them has a base of its own
         raise BidexError(
             f"{name}: {type(error).__name__}, {one_line(error)[:200]} Mend the name or the network, log in by "
             f"`hf auth login`, or use {FOLDER}PATH."

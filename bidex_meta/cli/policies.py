@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bidex_meta.agents import Agent
+from bidex_meta.cli.conditions import note
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.cli.tables import Json
@@ -19,12 +20,21 @@ from bidex_meta.world.contract import TaskWorld
 from bidex_meta.worlds import WorldConfig, Worlds
 
 
-def checkpoint(folder: RunFolder, which: str = "last") -> tuple[Json, int]:
+def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
     """State and environment steps of a run's checkpoint; BidexError where there is none such.
+
+    Says how the run's record differs from this installation and the run's suite, unless that was ``noted`` before.
 
     ``which`` is ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path
     or by its name in the run's folder of checkpoints.
     """
+    loaded = _loaded(folder, which)
+    if not noted:
+        note(folder)
+    return loaded
+
+
+def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
     if which == "best":
         if not folder.checkpoints.best.is_file():
             raise BidexError(

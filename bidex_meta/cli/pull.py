@@ -1,15 +1,16 @@
 """``bidex-meta pull``: a policy or a data set from a hub or a folder."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from bidex_meta.cli.hub import CARD, FOLDER, OF_A_RUN, OF_DATA, called, copied, files_of
+from bidex_meta.cli.hub import CARD, FOLDER, OF_A_RUN, OF_DATA, SUITES, called, checked, copied, files_of, new_folder
 from bidex_meta.cli.parsing import parse
 from bidex_meta.errors import BidexError
+from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 
 
@@ -28,14 +29,29 @@ class PullFlags:
 def main(arguments: Sequence[str]) -> None:
     """Download and print the folder."""
     flags = parse(PullFlags, arguments, "pull")
-    wanted = (*OF_A_RUN, *OF_DATA, CARD)
+    wanted = (*OF_A_RUN, *OF_DATA, SUITES, CARD)
     if flags.name.startswith(FOLDER):
-        source = absolute(flags.name.removeprefix(FOLDER))
+        source = root = absolute(flags.name.removeprefix(FOLDER))
     else:
         source = Path(called("snapshot_download", flags.name, allow_patterns=list(wanted)))
-    files = files_of(source, wanted)
+        root = source.parents[1]  # a snapshot in the cache links to the files beside all snapshots
+    files = files_of(source, wanted, root)
     if not {"config.json", "data/metadata.json"} & files.keys():
         raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")
     out = flags.out or Path("pulled") / Path(flags.name.removeprefix(FOLDER)).name
-    copied(files, out)
+    with new_folder(absolute(out)) as folder:
+        copied(files, folder)
+        try:
+            found = checked(folder)
+        except BidexError as error:
+            raise BidexError(f"{flags.name} is damaged, and was not kept: {error}") from None
+        if isinstance(found, RunFolder):
+            _name_suite(found, absolute(out))
     print(out)
+
+
+def _name_suite(run: RunFolder, out: Path) -> None:
+    """Let a config name the suite's file that was published with the run, by its whole path."""
+    config = run.config()
+    if config.suite is not None and config.suite in [path.name for path in run.path.glob(SUITES)]:
+        run.change_config(replace(config, suite=str(out / config.suite)))

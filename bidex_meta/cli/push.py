@@ -8,7 +8,20 @@ import tyro
 
 from bidex_meta import __version__
 from bidex_meta.cli.cards import data_card, run_card
-from bidex_meta.cli.hub import CARD, DATASETS, FOLDER, OF_A_RUN, OF_DATA, called, copied, files_of, library
+from bidex_meta.cli.hub import (
+    CARD,
+    DATASETS,
+    FOLDER,
+    OF_A_RUN,
+    OF_DATA,
+    called,
+    checked,
+    copied,
+    files_of,
+    library,
+    new_folder,
+    published,
+)
 from bidex_meta.cli.parsing import RunPath, Switch, parse
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
@@ -31,24 +44,21 @@ class PushFlags:
 def main(arguments: Sequence[str]) -> None:
     """Write the card, publish, print the command that pulls."""
     flags = parse(PushFlags, arguments, "push")
-    files = files_of(flags.run, OF_DATA)
-    if files:
-        card = data_card(flags.run, flags.name)
-    else:
-        folder = RunFolder.open(flags.run)
-        files = files_of(flags.run, OF_A_RUN)
-        if not any(name.endswith(".pt") for name in files):
-            raise BidexError(f"{flags.run} has no checkpoint, so that there is no policy to publish. Train it on.")
-        card = run_card(folder, flags.name)
+    of_data = bool(files_of(flags.run, OF_DATA))
+    if not flags.name.startswith(FOLDER) and of_data != flags.name.startswith(DATASETS):
+        raise BidexError(f"Expected {DATASETS}OWNER/NAME for a data set alone, got {flags.name} for {flags.run}.")
+    files = files_of(flags.run, OF_DATA if of_data else OF_A_RUN)
+    found = checked(flags.run)
+    if not of_data and not any(name.endswith(".pt") for name in files):
+        raise BidexError(f"{flags.run} has no checkpoint, so that there is no policy to publish. Train it on.")
+    card = run_card(found, flags.name) if isinstance(found, RunFolder) else data_card(found, flags.name)
+    content = published(flags.run, files) | {CARD: card.encode()}
     if flags.name.startswith(FOLDER):
-        target = absolute(flags.name.removeprefix(FOLDER))
-        copied(files, target)
-        (target / CARD).write_text(card, encoding="utf-8")
+        with new_folder(absolute(flags.name.removeprefix(FOLDER))) as target:
+            copied(content, target)
     else:
-        if bool(files_of(flags.run, OF_DATA)) != flags.name.startswith(DATASETS):
-            raise BidexError(f"Expected {DATASETS}OWNER/NAME for a data set alone, got {flags.name} for {flags.run}.")
         add = library().CommitOperationAdd
-        content = [add(name, str(path)) for name, path in files.items()] + [add(CARD, card.encode())]
+        operations = [add(name, each if isinstance(each, bytes) else str(each)) for name, each in content.items()]
         called("create_repo", flags.name, private=flags.private, exist_ok=True)
-        called("create_commit", flags.name, operations=content, commit_message=f"bidex-meta {__version__}")
+        called("create_commit", flags.name, operations=operations, commit_message=f"bidex-meta {__version__}")
     print(f"bidex-meta pull {flags.name}")

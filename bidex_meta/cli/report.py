@@ -16,14 +16,14 @@ from bidex_meta.cli.compare import class_table, group_table
 from bidex_meta.cli.parsing import RunPaths, parse
 from bidex_meta.cli.plot import named_runs, output
 from bidex_meta.cli.tables import NONE, Json
-from bidex_meta.config import flat, printed
+from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import History, estimates, read_groups, read_histories
 from bidex_meta.runs import plots, training_seconds
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.runs.stored import Run
 from bidex_meta.runs.video import FILMS
-from bidex_meta.utils.files import is_file
+from bidex_meta.utils.files import is_file, portable
 
 FILM_BYTES = 40_000_000  # films of a page together at most; what is above is named alone
 _SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
@@ -76,9 +76,13 @@ def render(runs: Sequence[Run]) -> str:
         speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
         adaptation=list(_adaptation(runs, names)),
         differences=_differences(runs, names),
-        configs=[(names[run.path], printed(config)) for run, config in zip(runs, configs, strict=True)],
+        configs=[(names[run.path], _json(config)) for run, config in zip(runs, configs, strict=True)],
         films=list(_films(runs, names)),
     )
+
+
+def _json(config: RunConfig) -> str:
+    return json.dumps(portable(config.to_json()), indent=2)
 
 
 def _letter(place: int) -> str:
@@ -104,7 +108,7 @@ def _run(run: Run, name: str) -> Json:
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
     return {
-        "name": name, "path": str(run.path), "on": config.suite or config.task,
+        "name": name, "path": portable(str(run.path)), "on": portable(config.suite or config.task),
         "steps": f"{max((row['step'] for row in rows), default=0):,}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
         "speed": f"{median(speeds):,.0f}" if speeds else NONE,
@@ -121,7 +125,10 @@ def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
     try:
         groups = [replace(group, label=short[group.paths[0]]) for group in read_groups(evaluated)]
     except BidexError as error:
-        return {**found, "reason": str(error)}
+        reason = str(error)
+        for run in runs:
+            reason = reason.replace(str(run.path), portable(str(run.path)))
+        return {**found, "reason": reason}
     if not groups:
         return found
     picture = _picture(lambda: plots.draw_comparison(estimates(groups))) if len(groups) > 1 else None
@@ -141,7 +148,7 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
 
 def _differences(runs: Sequence[Run], names: dict[Path, str]) -> Json:
     """What of config and versions is not the same in all runs."""
-    columns = [run.config().flat() | flat({"versions": run.versions()}) for run in runs]
+    columns = [flat(portable(run.config().to_json())) | flat({"versions": run.versions()}) for run in runs]
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
     cells = [[key, *map(_cell, (column.get(key) for column in columns))] for key in differing]

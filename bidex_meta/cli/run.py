@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, run_teachers, watching
-from bidex_meta.cli.evaluate import conditions, judged, judged_on_others
+from bidex_meta.cli.conditions import conditions
+from bidex_meta.cli.evaluate import judged, judged_on_others
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.cli.tables import Json, print_table, say
@@ -27,6 +28,7 @@ from bidex_meta.runs.folder import check_new, new_folder_name
 from bidex_meta.train import distributed, runner
 from bidex_meta.train.distributed import together
 from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.utils.files import portable
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
@@ -195,6 +197,8 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
     rows = mend(folder.metrics_path, resume_step or 0)
     last = rows[-1] if rows and rows[-1]["step"] == resume_step else None
     with contextlib.ExitStack() as stack:
+        size = runner.checkpoint_bytes(learner, world, config.learner, config.steps)
+        stack.enter_context(folder.checkpoints.room(size))
         record, watch = stack.enter_context(Recorder(folder, config.steps, seconds, resume_step, config.logger)), None
         if config.evaluate_every is not None or config.video_every is not None:
             watch = watching.Watch(plan, folder, learner, record, len(rows))
@@ -248,7 +252,7 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
         algo, step = plan.config.algo, learner.env_steps
         found["other_tasks"], table = judged_on_others(source, algo, learner, step, "train", options, True, brief=True)
         tables.append(table)
-    write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
+    write_json(folder.evaluation_path, {"run": portable(str(folder.path)), **found, "conditions": conditions(source)})
     for table in tables:
         print_table(table)
     say(f"More columns: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")

@@ -10,6 +10,7 @@ from typing import Annotated, Generic, Literal
 import tyro
 
 from bidex_meta.cli import run_data, run_teachers
+from bidex_meta.cli.conditions import check_worlds_of
 from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.cli.tables import Json
@@ -119,6 +120,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     run_teachers.check_teachers(kind, config, worlds)
     if folder and stored:
         _refuse_changes(default, config, folder)
+        mend = "Resume with the versions in versions.json, or start a new run from it: --start-from RUN."
+        check_worlds_of(folder, worlds, mend)
     return RunPlan(flags, kind, config, folder, reason)
 
 

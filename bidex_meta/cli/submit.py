@@ -4,19 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.conditions import check_worlds_of, conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.policies import checkpoint, fitting, policy_of
 from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import class_rows, estimate, iqm, read_entry
+from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, estimate, iqm, read_entry
 from bidex_meta.evaluation.play import Watched
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
+from bidex_meta.runs.checkpoints import weights_digest
+from bidex_meta.runs.provenance import check_alike
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few
@@ -49,20 +51,33 @@ def main(arguments: Sequence[str]) -> None:
     configs = [folder.config() for folder in folders]
     _check(folders, configs)
     first = configs[0]
+    worlds = Worlds.open(first.to_json())
+    check_alike(folders)
+    for folder in folders:
+        check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
+    weights = _weights(folders)
     name = flags.name or short_name(first.algo)
-    suite = Worlds.open(first.to_json()).name
-    path = flags.out / f"{Path(suite).stem}-{name.replace(' ', '-').replace('/', '-')}.json"
+    suite = worlds.name if worlds.suite is None else worlds.suite.file.stem
+    path = flags.out / entry_name(suite, name)
     if exists(path):
         raise BidexError(f"There is {path} already. Give another --name, or delete it.")
+    for known in sorted(flags.out.glob("*.json")):
+        if twice := {*weights} & {*read_entry(known).weights}:
+            run = folders[weights.index(twice.pop())].path
+            raise BidexError(f"{run} stands in {known}: their weights are equal. Leave it out, or delete that entry.")
     check_writable(path)
     facts = [_facts(folder) for folder in folders]
     played = [_play(folder, config, flags) for folder, config in zip(folders, configs, strict=True)]
+    verified = played[0][3]
+    stated = {
+        "seeds": [config.seed for config in configs], "hours": [row[0] for row in facts], "device": facts[0][1],
+        "commit": [row[2] for row in facts],
+    }  # fmt: skip
     entry = {
-        "format": 1, "name": name, "suite": suite, "version": played[0][3]["suite_version"], "algorithm": first.algo,
-        "seeds": [config.seed for config in configs], "steps": [row[2] for row in played],
-        "hours": [row[0] for row in facts], "device": facts[0][1], "commit": [row[2] for row in facts],
-        "episodes": flags.episodes, "own": class_rows([row[0] for row in played]),
-        "others": class_rows([row[1] for row in played]), "verified": played[0][3],
+        "format": FORMAT, "name": name, "suite": suite, "version": verified["suite_version"], "algorithm": first.algo,
+        "weights": weights, "steps": [row[2] for row in played], "episodes": flags.episodes,
+        "own": class_rows([row[0] for row in played]), "others": class_rows([row[1] for row in played]),
+        "verified": verified, "stated": stated,
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, entry)
@@ -84,6 +99,19 @@ def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
         raise BidexError("Two of the runs have one seed. Name each seed once.")
 
 
+def _weights(folders: Sequence[RunFolder]) -> list[str]:
+    """Return the digests of the runs' policies; raises BidexError where two are equal, whatever their configs say."""
+    digests: dict[str, Path] = {}
+    for folder in folders:
+        state, _ = checkpoint(folder, noted=True)
+        with fitting(folder.path):
+            digest = weights_digest(state["learner"]["policy"])
+        if digest in digests:
+            raise BidexError(f"{folder.path} and {digests[digest]} have equal weights: they are one run. Name it once.")
+        digests[digest] = folder.path
+    return list(digests)
+
+
 def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
     """Hours of training, the device and the commit that trained."""
     versions, config = folder.versions(), folder.config()
@@ -101,7 +129,8 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     worlds = Worlds.open(config)
     others = worlds.others
     set_up_torch(stored.threads)
-    policy, steps = load_policy(folder, config["device"])
+    state, steps = checkpoint(folder, noted=True)
+    policy = policy_of(folder, state, config["device"])
     found = []
     for where, what in ((worlds, "its own tasks"), (others, "others")):
         say(f"{folder.path}: playing {what}.")

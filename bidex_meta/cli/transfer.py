@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bidex_meta.cli.conditions import note
 from bidex_meta.cli.parsing import RunPath, parse
 from bidex_meta.cli.run_config import plan_run
 from bidex_meta.cli.sweep import choose_cores, state_of, work
@@ -28,7 +29,9 @@ from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.evaluation.transfer_measures import TAG, add_over_nothing, at_the_end, by_reinforcement
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json
+from bidex_meta.runs.provenance import check_alike
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Whole
 from bidex_meta.worlds import Worlds
 
@@ -63,6 +66,8 @@ def main(arguments: Sequence[str]) -> None:
     at = arguments.index("--") if "--" in arguments else len(arguments)
     flags = parse(TransferFlags, arguments[:at], "transfer")
     arms = arms_of([flags.run, *flags.start_from])
+    for run in (flags.run, *flags.start_from):
+        note(RunFolder.open(run))
     config = RunFolder.open(flags.run).config()
     worlds = Worlds.open(config.to_json())
     classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
@@ -110,6 +115,7 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
         done = [cell.run for cell in members if state_of(cell.run).state == "done"]
         row: Json = {"class": task, "from": arm, "seeds": [run.seed for run in done]}
         folders = [run.folder for run in done]
+        check_alike(folders)
         if not done:
             continue
         if count is None:
@@ -118,7 +124,8 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
             shots.append(row | {"demonstrations": count} | at_the_end(folders))
     add_over_nothing(steps, "area")
     add_over_nothing(shots, "success")
-    made = {"run": str(flags.run), "suite": suite, "steps": flags.steps, "versions": collect_versions()}
+    made = {"run": portable(str(flags.run)), "suite": portable(suite), "steps": flags.steps}
+    made |= {"versions": collect_versions()}
     write_json(flags.out / "transfer.json", made | {"reinforcement": steps, "demonstrations": shots})
     if steps:
         print_table(plain_table(*_steps_table(steps, flags.steps)))

@@ -21,6 +21,7 @@ from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.tasks.registry import plain_name
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
         check_writable(flags.out)
     worlds = Worlds.open(WorldConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
     rows = {name: row for split in worlds.splits for name, row in _of_split(worlds, split, flags).items()}
-    made = {"suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+    made = {"suite": portable(flags.suite), "seed": flags.seed, "versions": collect_versions()}
     if flags.out is not None:
         write_json(flags.out, made | {"classes": rows})
     if flags.json:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
-from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.conditions import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import TASKS, Options, meta_test
 from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
@@ -17,6 +17,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
 from bidex_meta.runs import RunFolder, schemas
+from bidex_meta.runs.provenance import differences
 from bidex_meta.suite import OTHERS
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
@@ -52,6 +53,7 @@ class _Conditions(TypedDict):
     packages: NotRequired[Json]
     physics: NotRequired[Text | None]
     suite_version: NotRequired[Whole | None]
+    suite_digest: NotRequired[Text | None]
 
 
 class _Recorded(TypedDict):
@@ -158,7 +160,7 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
     """The checkpoint that was evaluated."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
-        found = checkpoint(folder, which) if there else None
+        found = checkpoint(folder, which, noted=True) if there else None
         if found is not None and found[1] == steps:
             return found
     raise BidexError(
@@ -203,7 +205,7 @@ def recorded_conditions(evaluation: Json, versions: Json, config: RunConfig) -> 
     Of the contents of ``evaluation.json`` and ``versions.json`` (empty where there is none), and the run's config.
     """
     found = {"device": config.device, "engine": config.engine, "num_envs": None}
-    found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
+    found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version", "suite_digest")}
     found |= evaluation.get("conditions", {})
     packages = found["packages"]
     return found | {"packages": packages if isinstance(packages, dict) else {}}
@@ -211,10 +213,11 @@ def recorded_conditions(evaluation: Json, versions: Json, config: RunConfig) -> 
 
 def others(then: Json, now: Json) -> list[str]:
     """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
+    texts = list(map(str, differences(then, now)))
+    where = ("device", "engine", "threads")
+    texts += [f"{name} {then[name]} then, {now[name]} now" for name in where if then.get(name) not in (None, now[name])]
     packages = then["packages"]
-    pairs = [(name, packages.get(name), version) for name, version in now["packages"].items()]
-    pairs += [(name, then.get(name), now[name]) for name in ("device", "engine", "threads")]
-    pairs += [(name.replace("_", " "), then.get(name), now[name]) for name in ("physics", "suite_version")]
-    texts = [f"{name} {old} then, {new} now" for name, old, new in pairs if None not in (old, new) and old != new]
-    unknown = [name for name, old, new in pairs if old is None and new is not None and name != "threads"]
+    unknown = [name for name in now["packages"] if packages.get(name) is None]
+    names = ("device", "engine", "physics", "suite_version")
+    unknown += [name.replace("_", " ") for name in names if then.get(name) is None and now[name] is not None]
     return texts + ([f"not recorded: {', '.join(unknown)}"] if unknown else [])

@@ -15,11 +15,14 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
+from bidex_meta.runs.provenance import split_by_worlds
 from bidex_meta.runs.stored import Run, StoredRun
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
 _SETTINGS += ("base", "points", "object")
+_MADE = "made with"  # the entry of a kind with what tells its worlds from others
 _POINTS = 200  # of a curve over several runs
 
 
@@ -76,11 +79,13 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
     """Runs of the same kind together, in the order they are named, with a label each.
 
     That is the name of a study's arm where all runs of the group come from it and no other group's do, else the
-    settings that differ.
+    settings that differ. Runs that were made with different worlds are apart, and the label names these.
     """
+    _check_copies(runs)
     members: dict[str, list[Run]] = {}
     unique: dict[str, Json] = {}
-    for kind, run in zip(kinds, runs, strict=True):
+    for kind, made, run in zip(kinds, split_by_worlds(runs), runs, strict=True):
+        kind = {**kind, _MADE: [f"{name} {value}" for name, value in made.items()]}
         key = json.dumps(kind, sort_keys=True)
         unique[key] = kind
         members.setdefault(key, []).append(run)
@@ -88,11 +93,24 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
     for key, kind in unique.items():
         others = [other for other in unique.values() if other["algo"] == kind["algo"]]
         names = {name for a in others for b in others for name in a.keys() | b.keys() if a.get(name) != b.get(name)}
-        differing = [f"{name.removeprefix('learner.')} {kind.get(name)}" for name in sorted(names)]
+        names -= {_MADE}
+        differing = [f"{name.removeprefix('learner.')} {portable(kind.get(name))}" for name in sorted(names)]
         groups.append((", ".join([kind["algo"], *differing]), members[key]))
     arms = [{run.arm if isinstance(run, StoredRun) else None for run in mine} for _, mine in groups]
     names = [arm.pop() if len(arm) == 1 and arms.count(arm) == 1 else None for arm in map(set, arms)]
-    return [(name or label, mine) for name, (label, mine) in zip(names, groups, strict=True)]
+    labels = []
+    for name, (label, _), kind in zip(names, groups, unique.values(), strict=True):
+        labels.append(", ".join([name or label, *kind[_MADE]]))
+    return [(label, mine) for label, (_, mine) in zip(labels, groups, strict=True)]
+
+
+def _check_copies(runs: Sequence[Run]) -> None:
+    """Raises BidexError for a run and its copy, whatever seed the copy's config says: both were trained at one time."""
+    known: dict[tuple[float, ...], Path] = {}
+    for run in runs:
+        times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
+        if len({*times}) > 1 and known.setdefault(times, run.path) != run.path:
+            raise BidexError(f"{run.path} is a copy of {known[times]}: one run is not two seeds. Name it once.")
 
 
 def iqm(values: np.ndarray) -> Estimate:

@@ -4,10 +4,10 @@ Interquartile mean, performance profile and probability of improvement are those
 2108.13264). Intervals resample seeds, and within each class the tasks, so that a single seed has one too: of its tasks.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -16,12 +16,22 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.evaluation.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate, interquartile_mean
 from bidex_meta.runs.atomic import Json
-from bidex_meta.utils.files import read_json
-from bidex_meta.utils.validation import Fraction, NonNegative, Seed, Text, Whole, parse
+from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
+from bidex_meta.utils.files import portable, read_json
+from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
 
 PROFILE = (0.1, 0.5, 0.9)
 """Success rates at which a performance profile is read."""
+FORMAT = 2
+_TASKS_OF_METAWORLD = 50
+_ROUNDING = 1e-4  # of stored rates
+_USUAL_WIDTH = 1.96  # standard deviations of half an interval of 95 %
 _Interval = tuple[Fraction, Fraction]
+_Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
+_Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
+_Commit = Annotated[str, Meta(pattern=r"^[0-9a-f]{7,40}\+?$")]
+_Physics = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$")]
+_Version = Annotated[str, Meta(max_length=100, pattern=r"^[0-9][\w.+]*$")]
 
 
 @dataclass(frozen=True)
@@ -38,36 +48,149 @@ Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 
 
 @dataclass(frozen=True)
-class Entry:
-    """Runs that differ in nothing but the seed, as they were played to verify them; lists have an item a seed."""
+class Conditions:
+    """Where an entry's episodes were played; the whole of it is written by ``submit`` itself."""
 
-    format: Annotated[int, Meta(ge=1, le=1)]
-    name: Text
-    suite: Text
-    version: Whole | None  # of the suite's file
-    algorithm: Text
+    device: _Name
+    engine: Literal["auto", "c", "warp"]
+    threads: Count | None
+    num_envs: Count | None
+    packages: dict[str, _Version | None]
+    physics: _Physics | None
+    suite_version: Whole | None
+    suite_digest: _Physics | None = None
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the run folders say and nobody can verify; lists have an item for each run."""
+
     seeds: list[Seed]
-    steps: list[Whole]
     hours: list[NonNegative]  # of training, without evaluation
-    device: Text  # that trained
-    commit: list[Text | None]  # that trained; with + where files differed from it
-    episodes: Whole  # of each task
+    device: _Name  # that trained
+    commit: list[_Commit | None]  # that trained; with + where files differed from it
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Runs that differ in nothing but the seed, as they were played to verify them; lists have an item for each run."""
+
+    format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
+    name: _Name
+    suite: _Name
+    version: Whole | None  # of the suite's file
+    algorithm: _Name
+    weights: Annotated[list[_Digest | None], Meta(min_length=1)]
+    """Digests of the policies, see ``weights_digest``; None of a run whose checkpoint was not kept."""
+    steps: list[Count]  # that the checkpoints are of
+    episodes: Few  # of each task
     own: Classes  # results on the suite's own tasks
     others: Classes  # on as many tasks of each class that no run trained on
-    verified: Json  # conditions of the evaluation: packages, device, physics
+    verified: Conditions
+    stated: Stated
 
     def success(self, classes: Classes) -> list[np.ndarray]:
         """Success of each class's tasks, (seeds, tasks)."""
         return [np.array(row.tasks) for row in classes.values()]
 
 
+def entry_name(suite: str, name: str) -> str:
+    """Return the name of an entry's file."""
+    return f"{suite}-{name}.json".replace(" ", "-").replace("/", "-")
+
+
 def read_entry(path: Path) -> Entry:
-    """An entry's file; raises BidexError where it cannot be read or does not fit the schema."""
-    entry = parse(read_json(path, "an entry of the leaderboard"), Entry, str(path), exact=True)
-    shapes = {(name, len(row.tasks)) for part in (entry.own, entry.others) for name, row in part.items()}
-    if entry.own.keys() != entry.others.keys() or {count for _, count in shapes} != {len(entry.seeds)}:
-        raise BidexError(f"{path}: expected the same classes twice, of {len(entry.seeds)} seeds. Submit it anew.")
+    """An entry's file; raises BidexError where it cannot be read, does not fit the schema, or contradicts itself."""
+    content = read_json(path, "an entry of the leaderboard")
+    entry = parse(content, Entry, str(path), exact=True)
+    if portable(content) != content:
+        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+    for fault in _faults(entry, path):
+        raise BidexError(f"{path}: {fault}. Submit it anew.")
     return entry
+
+
+def check_apart(entries: Mapping[Path, Entry]) -> None:
+    """Raises BidexError where one policy stands in two entries."""
+    known: dict[str, Path] = {}
+    for path, entry in entries.items():
+        for digest in filter(None, entry.weights):
+            if digest in known:
+                raise BidexError(f"{path} has a run of {known[digest]}: their weights are equal. Keep one of them.")
+            known[digest] = path
+
+
+def _faults(entry: Entry, path: Path) -> Iterator[str]:
+    """Yield what an entry says that cannot be."""
+    runs, stated = len(entry.weights), entry.stated
+    if path.name != entry_name(entry.suite, entry.name):
+        yield f"expected a file named {entry_name(entry.suite, entry.name)}"
+    for name, values in (("steps", entry.steps), *vars(stated).items()):
+        if isinstance(values, list) and len(values) != runs:
+            yield f"{name}: expected {runs} values, as many as weights, got {len(values)}"
+    digests = [digest for digest in entry.weights if digest is not None]
+    if len({*digests}) < len(digests):
+        yield "weights: expected another policy of each run, got one twice"
+    if len({*stated.seeds}) < len(stated.seeds):
+        yield "stated.seeds: expected each seed once"
+    if entry.version != entry.verified.suite_version:
+        yield f"version: expected {entry.verified.suite_version} as in verified, got {entry.version}"
+    if missing := {"bidex-meta", "mujoco"} - entry.verified.packages.keys():
+        yield f"verified.packages: expected {min(missing)} to be there"
+    tasks = tasks_of_suite(entry.suite, entry.version)
+    for part, classes in (("own", entry.own), ("others", entry.others)):
+        names = list(tasks if tasks is not None else entry.own)
+        if list(classes) != names:
+            yield f"{part}: expected the classes {', '.join(names)}, got {', '.join(classes)}"
+        for name, row in classes.items():
+            where = f"{part}.{name}"
+            wanted = len(entry.own[name].tasks[0]) if tasks is None else tasks[name]
+            yield from (f"{where}.{fault}" for fault in _faults_of(row, runs, wanted, entry.episodes))
+
+
+def _faults_of(row: ClassRow, runs: int, tasks: int, episodes: int) -> Iterator[str]:
+    """Yield what is wrong with a class of ``runs`` runs and ``tasks`` tasks."""
+    counts = [len(of_run) for of_run in row.tasks]
+    if counts != [tasks] * runs:
+        yield f"tasks: expected {tasks} values of each of {runs} runs, got {counts}"
+        return
+    rates = np.array(row.tasks)
+    successes = rates * episodes
+    if np.abs(successes - successes.round()).max() > _ROUNDING * episodes:
+        yield f"tasks: expected shares of {episodes} episodes"
+    mean = rates.mean()
+    if abs(mean - row.success) > _ROUNDING:
+        yield f"success: expected the mean of its tasks, {mean:.4f}, got {row.success:.4f}"
+    if (row.interval is None) != (rates.size < 2):
+        yield f"interval: expected {'none' if rates.size < 2 else 'one'} of {rates.size} values"
+    elif row.interval is not None:
+        low, high = row.interval
+        usual = _USUAL_WIDTH * _deviation(rates)
+        if not low - _ROUNDING <= mean <= high + _ROUNDING:
+            yield f"interval: expected one that holds {mean:.4f}, got {low:.4f} to {high:.4f}"
+        elif abs((high - low) / 2 - usual) > 0.1 * usual + 1.0 / rates.size:
+            yield f"interval: expected about {mean:.3f} ± {usual:.3f}, got {low:.4f} to {high:.4f}"
+
+
+def _deviation(rates: np.ndarray) -> float:
+    """Return the standard deviation of the mean of rates (seeds, tasks), seeds and tasks both drawn anew."""
+    seeds = rates.mean(axis=1, keepdims=True)
+    tasks = rates.mean(axis=0, keepdims=True)
+    rest = rates - seeds - tasks + rates.mean()
+    return float(np.sqrt(seeds.var() / len(rates) + tasks.var() / rates.shape[1] + rest.var() / rates.size))
+
+
+def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
+    """Return the number of train tasks of each class; None for a suite of one's own or of another version."""
+    if name in METAWORLD_SUITES:
+        return dict.fromkeys(METAWORLD_SUITES[name], _TASKS_OF_METAWORLD)
+    suite = load_suite(name) if name in suite_names() else None
+    if suite is None or suite.version != version:
+        return None
+    return {
+        each.name: sum(task.split == "train" for task in each.tasks) or suite.tasks_per_class or 0
+        for each in suite.split_classes("train")
+    }
 
 
 def class_rows(evaluations: Sequence[Evaluation]) -> Json:

@@ -1,9 +1,12 @@
 """Write a file so that a crash leaves either the old content or the new one, never a torn one."""
 
+import contextlib
+import errno
 import json
 import os
-import tempfile
-from collections.abc import Callable
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -11,27 +14,68 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.utils.files import exists
 
 TEMPORARY_SUFFIX = ".tmp"
+_CHUNK = 2**20  # bytes
 Json = dict[str, Any]  # an object of JSON
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Call ``write`` on a temporary file beside ``path``, force it to the disk and rename it over ``path``."""
-    # Same folder, since a rename is atomic only within one file system.
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX, dir=path.parent)
+    temporary = temporary_name(path)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)  # mkstemp's 0600 would lock colleagues out of a shared run folder
-        os.replace(name, path)
+        os.replace(temporary, path)
     except BaseException as error:
-        Path(name).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         # torch.save tells of what the system refuses, such as a full disk, as of an error of its own.
         if isinstance(error, RuntimeError) and isinstance(why := error.__context__, OSError):
             raise OSError(why.errno, why.strerror, str(path)) from None
         raise
     sync_folder(path.parent)
+
+
+def temporary_name(path: Path) -> Path:
+    """Return an unused name in the folder of ``path``: a rename is atomic only within one file system.
+
+    ``tempfile`` would create the file with mode 0600, or 0600 made 0644 whatever the umask; ``open`` asks the umask.
+    """
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{TEMPORARY_SUFFIX}")
+
+
+@contextlib.contextmanager
+def room_for(folder: Path, size: int, count: int) -> Iterator[None]:
+    """Hold the room of ``count`` files of ``size`` bytes in a folder until its leftovers are removed.
+
+    Raises BidexError if the disk, a quota or a limit of the process does not grant this room.
+    """
+    remove_leftovers(folder)
+    free = shutil.disk_usage(folder).free
+    try:
+        if count * size > free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        for number in range(count):
+            _fill(folder / f".room-{number}{TEMPORARY_SUFFIX}", size)
+    except OSError as error:
+        remove_leftovers(folder)
+        raise BidexError(
+            f"Expected room for {count} files of {size / 1e6:,.1f} MB in {folder}, got {error.strerror} "
+            f"({free / 1e6:,.1f} MB are free on its disk). Make room there, or name another folder."
+        ) from None
+    try:
+        yield
+    finally:
+        remove_leftovers(folder)
+
+
+def _fill(path: Path, size: int) -> None:
+    with path.open("xb") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, max(size, 1))
+            return
+        for _ in range(size // _CHUNK + 1):
+            file.write(bytes(_CHUNK))
 
 
 def write_json(path: Path, content: object) -> None:
@@ -64,12 +108,12 @@ def check_writable(path: Path) -> None:
             folder.mkdir()
             created.append(folder)
         # As long a name as the file's own will have while it is written.
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX, dir=path.parent)
+        temporary = temporary_name(path)
         try:
-            os.write(handle, bytes(4096))
+            with temporary.open("xb") as file:
+                file.write(bytes(4096))
         finally:
-            os.close(handle)
-            os.unlink(name)
+            temporary.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or one_line(error)
         raise BidexError(f"{path} cannot be written: {reason}. Name another place, or make room.") from None

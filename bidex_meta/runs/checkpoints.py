@@ -4,17 +4,19 @@ Each has a format number and a digest of every number and tensor in it: ``torch.
 bit would be loaded as another weight. Files of format 1, without a digest, have the checksums of a zip archive.
 """
 
+import contextlib
 import hashlib
 import re
 import shutil
 import sys
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from bidex_meta.errors import BidexError, one_line, shortened
-from bidex_meta.runs.atomic import refuse_links, remove_leftovers, write_atomic
+from bidex_meta.runs.atomic import refuse_links, remove_leftovers, room_for, write_atomic
 from bidex_meta.utils.files import exists, is_file, open_regular
 
 State = dict[str, Any]  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
@@ -45,6 +47,17 @@ class Checkpoints:
         path = self.folder / f"step_{step}.pt"
         self._write(path, {"step": step, "state": state})
         self._follow(path)
+
+    @contextlib.contextmanager
+    def room(self, size: int) -> Iterator[None]:
+        """Hold the room of the first checkpoint, of ``size`` bytes at most, until it is saved, so that it cannot fail.
+
+        Raises BidexError if there is no such room.
+        """
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        with room_for(self.folder, size, count=2):  # ``step_<N>.pt`` and ``last.pt``
+            yield
 
     def finish(self, step: int) -> None:
         """Does what a :meth:`save` that was killed left undone.
@@ -175,6 +188,21 @@ def _check_archive(file: IO[bytes]) -> None:
     if damaged is not None:
         raise ValueError(f"its part {shortened(damaged)} does not have its checksum")
     file.seek(0)
+
+
+def weights_digest(policy: State) -> str:
+    """Return 32 hexadecimal digits of a policy's tensors, with which two copies of one run are found.
+
+    Numbers enter in half precision, in which published policies are stored.
+    """
+    return _digest({"weights": _halved(policy.get("weights", policy))})[:32]
+
+
+def _halved(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _halved(part) for name, part in sorted(value.items())}
+    is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
+    return value.to(_torch().float16) if is_number else value
 
 
 def _digest(content: State) -> str:

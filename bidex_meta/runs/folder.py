@@ -199,7 +199,8 @@ def _torn_start(path: Path) -> bool:
         # Where only a temporary file is there, it is of the config: the check whether it can be written was killed.
         known = known and (bool(found) or all(entry.name.startswith(".config.json.") for entry in entries))
         known = known and not any(entry.is_symlink() for entry in found or entries)
-        empty = not any(any(entry.iterdir()) for entry in found if entry.name in _ENTRIES[:2])
+        inner = [each for entry in found if entry.name in _ENTRIES[:2] for each in entry.iterdir()]
+        empty = all(each.name.endswith(TEMPORARY_SUFFIX) for each in inner)  # such as the room of a checkpoint
         return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
     except OSError:
         return False

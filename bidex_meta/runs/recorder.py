@@ -12,6 +12,7 @@ from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import MetricsWriter
 from bidex_meta.runs.progress import Progress
 from bidex_meta.runs.video import write_video
+from bidex_meta.utils.files import portable
 
 
 class Recorder:
@@ -27,7 +28,7 @@ class Recorder:
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:
-            self._metrics.writer.config(folder.config().to_json())
+            self._metrics.writer.config(portable(folder.config().to_json()))
         self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:

@@ -19,6 +19,7 @@ _ClassResult = TypedDict(
         "score": Finite | None,
         "success_interval": NotRequired[_Interval],
         "return_interval": NotRequired[_Interval],
+        "episodes": NotRequired[Whole],
     },
 )
 
@@ -33,7 +34,15 @@ class _Split(TypedDict):
     by_shot: NotRequired[list[_Classes]]
 
 
+class _Made(TypedDict):
+    packages: NotRequired[dict[str, Text | None]]
+    physics: NotRequired[Text | None]
+    suite_version: NotRequired[Whole | None]
+    suite_digest: NotRequired[Text | None]
+
+
 class _Evaluation(TypedDict):
+    conditions: NotRequired[_Made]
     steps: NotRequired[Whole]
     split: NotRequired[Text]
     splits: NotRequired[dict[str, _Split]]
@@ -42,9 +51,11 @@ class _Evaluation(TypedDict):
 
 class _Git(TypedDict):
     commit: NotRequired[Text | None]
+    dirty: NotRequired[bool]
 
 
-class _Versions(TypedDict):
+class _Versions(_Made):
+    cpus: NotRequired[Whole | None]
     gpus: NotRequired[list[Text] | None]
     git: NotRequired[_Git | None]
 

@@ -34,6 +34,10 @@ class LearnerConfig(Checked):
         """Approximate memory of a learner, where a step of an environment stores ``width`` numbers."""
         return 0
 
+    def bytes_stored(self, num_envs: int, width: int) -> int:
+        """Return the most bytes of experience that a checkpoint holds, such as a replay; arguments as above."""
+        return 0
+
 
 class Learner(ABC):
     """Base of all learners, of a world in the mode that :meth:`autoreset_mode` returns.
@@ -79,6 +83,11 @@ class Learner(ABC):
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
         """Approximate memory; see :meth:`LearnerConfig.bytes_held`."""
         return config.bytes_held(num_envs, width) if isinstance(config, LearnerConfig) else 0
+
+    @classmethod
+    def bytes_stored(cls, config: Any, num_envs: int, width: int) -> int:
+        """Return the most bytes of experience in a checkpoint; see :meth:`LearnerConfig.bytes_stored`."""
+        return config.bytes_stored(num_envs, width) if isinstance(config, LearnerConfig) else 0
 
     @abstractmethod
     def iterate(self) -> dict[str, float]:

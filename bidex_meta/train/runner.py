@@ -11,6 +11,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
+
+import gymnasium
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.recorder import Recorder
@@ -21,6 +24,9 @@ from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
+_WITH_MOMENTS = 3
+_OF_AN_ENTRY = 1024  # bytes of an archive's entry: name, place and alignment
+_OF_A_STEP = 8  # numbers that a replay stores of a step beside observation and action
 
 
 def train(
@@ -118,6 +124,29 @@ def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
     own = {"learner": {name: state["learner"][name] for name in learner.per_process}, "env": state["env"]}
     parts = gather(own)
     return None if parts is None else {**state, "others": parts[1:]}
+
+
+def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps: int) -> int:
+    """Return the bytes that a checkpoint of a training takes at most, for ``steps`` environment steps in all.
+
+    ``config`` is the learner's. Optimisers begin empty, and Adam's have two moments for each weight later.
+    """
+    width = _numbers(world.single_observation_space) + _numbers(world.single_action_space) + _OF_A_STEP
+    own = _WITH_MOMENTS * _tensor_bytes(learner.state_dict()) + _tensor_bytes(world.state_dict())
+    stored = min(learner.bytes_stored(config, world.num_envs, width), 4 * width * steps)
+    return world_size() * (own + stored)
+
+
+def _numbers(space: gymnasium.Space[Any]) -> int:
+    return math.prod(space.shape or (0,))
+
+
+def _tensor_bytes(state: Any) -> int:
+    if isinstance(state, dict):
+        return sum(_tensor_bytes(part) for part in state.values())
+    if isinstance(state, list | tuple):
+        return sum(_tensor_bytes(part) for part in state)
+    return getattr(state, "nbytes", 0) + _OF_AN_ENTRY
 
 
 def resume(learner: Learner, world: VectorWorld, state: State) -> None:

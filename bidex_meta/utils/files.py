@@ -9,7 +9,7 @@ import stat
 import tomllib
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, Any
 
 from bidex_meta.errors import BidexError, one_line, shortened
@@ -19,6 +19,8 @@ JsonObject = dict[str, Any]
 """What a file of JSON or TOML holds."""
 MOST_TEXT = 64_000_000
 """Bytes of a file of JSON or TOML: far above the largest evaluation."""
+_DATA_SETS = ("dataset", "demonstrations", "drawn_from")
+"""Entries that name data sets."""
 _DEEPEST = 64
 _LARGEST = 2**63 - 1
 """Whole numbers beyond are no count, step or seed of ours; and Python takes long for some thousand digits."""
@@ -38,6 +40,24 @@ def absolute(path: str | Path) -> Path:
         return expanded(path).resolve()
     except (RuntimeError, OSError) as error:
         raise BidexError(f"{shortened(str(path))}: {one_line(error)}. Mend the link, or name another path.") from None
+
+
+def portable(content: Json) -> Json:
+    """Return content without the folders of this machine, to be published: of an absolute path its last part alone.
+
+    Data sets keep two parts (``CatchUnderarm/random-v0``), since these are their names.
+    """
+    return _portable(content, 1)
+
+
+def _portable(content: Json, parts: int) -> Json:
+    if isinstance(content, dict):
+        return {name: _portable(value, 2 if name in _DATA_SETS else parts) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_portable(value, parts) for value in content]
+    if isinstance(content, str) and (content.startswith("~") or PurePath(content).is_absolute()):
+        return "/".join(PurePath(content).parts[1:][-parts:])
+    return content
 
 
 def is_file(path: Path) -> bool:

@@ -132,9 +132,9 @@ class Worlds(ABC):
         """What distinguishes its worlds from others of the same name, ready for JSON.
 
         ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are not
-        ours; ``suite_version``: of the suite's file, None without one.
+        ours; ``suite_version`` and ``suite_digest``: of the suite's file, None without one.
         """
-        return {"physics": physics_of(self.task_classes()), "suite_version": None}
+        return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
         """References of the normalised score and of broken episodes; none where bases, tasks or reward are others."""

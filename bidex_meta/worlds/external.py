@@ -47,7 +47,7 @@ class Foreign(Worlds):
 
     def identity(self) -> Identity:
         """As in ``Worlds``: the physics is the library's, known by its package's version."""
-        return {"physics": None, "suite_version": None}
+        return {"physics": None, "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
         """As in ``Worlds``: none."""

@@ -61,7 +61,8 @@ class OwnSuite(Worlds):
     def identity(self) -> Identity:
         """As in ``Worlds``; of the classes of both splits."""
         classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
-        return {"physics": physics_of(classes), "suite_version": self.suite.version}
+        physics = physics_of(classes)
+        return {"physics": physics, "suite_version": self.suite.version, "suite_digest": self.suite.digest}
 
 
 class SingleClass(Worlds):

@@ -47,6 +47,7 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: 
     made = policy(algo, **{"hidden": (8, 8), **options})
     content, gap = exported(made, SHAPE.state_dict(), {"suite": "mine"})
     assert gap < 1e-5
+    assert str(ROOT).encode() not in content and b".py" not in content
     obs = torch.randn(5, 16)
     obs[:, 13:] = torch.eye(3)[[0, 2, 1, 1, 0]]
     (actions,) = onnxruntime.InferenceSession(content).run(None, {"observations": obs.numpy()})

@@ -1,6 +1,9 @@
 """``bidex-meta push`` and ``pull``: over a folder, over the hub's cache without a network, and what is uploaded."""
 
 import json
+import os
+import resource
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +11,7 @@ import gymnasium
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.runs import RunFolder
 from tests.pages import ROOT
 
 HAND_OVER = ROOT / "results" / "teachers" / "HandOver"
@@ -72,9 +76,7 @@ def test_an_upload_holds_the_run_and_its_card(shown, refused, monkeypatch) -> No
 
 def test_a_data_set_goes_through_a_folder_and_minari_makes_its_environment(shown, tmp_path: Path, monkeypatch) -> None:
     minari = pytest.importorskip("minari", reason="needs the extra data")
-    data = tmp_path / "HandOver" / "random-v0"
-    words = ["--task", "HandOver", "--size", "80", "--num-envs", "2", "--threads", "1", "--device", "cpu"]
-    assert main(["record", "random", *words, "--out", str(data)]) == 0
+    data = recorded(tmp_path / "HandOver" / "random-v0")
     shown("push", data, f"folder:{tmp_path / 'hub'}")
     pulled = tmp_path / "pulled" / "HandOver" / "random-v0"
     shown("pull", f"folder:{tmp_path / 'hub'}", "--out", pulled)
@@ -86,6 +88,164 @@ def test_a_data_set_goes_through_a_folder_and_minari_makes_its_environment(shown
     assert env.spec is not None and env.spec.id == "bidex-meta/HandOver-v1"
     assert isinstance(env, gymnasium.Env) and env.observation_space.shape == dataset.observation_space.shape
     env.close()
+
+
+METADATA = [None, [], "text", 3, 2.5, True, {"a": [1]}]
+FIELDS = {
+    "config.json": ["algo", "seed", "steps", "learner", "num_envs"],
+    "versions.json": ["packages", "git", "gpus"],
+    "evaluation.json": ["policy", "steps"],
+}
+
+
+def _damages() -> list[tuple[str, str, object]]:
+    """A file, an entry and a value of another type; ``cut`` and ``whole`` are of the whole file."""
+    cases: list[tuple[str, str, object]] = []
+    for name, fields in FIELDS.items():
+        cases += [(name, "cut", share) for share in (0.0, 0.3, 0.9)]
+        cases += [(name, "whole", value) for value in METADATA[:-1]]
+        cases += [(name, field, value) for field in fields for value in METADATA]
+    return cases
+
+
+def _damage(path: Path, field: str, value: object) -> None:
+    text = path.read_text()
+    if field == "cut":
+        path.write_text(text[: int(float(str(value)) * len(text))])
+    elif field == "whole":
+        path.write_text(json.dumps(value))
+    else:
+        path.write_text(json.dumps(json.loads(text) | {field: value}))
+
+
+def test_damaged_metadata_of_a_run_are_one_line_or_pushed(tmp_path: Path, capsys) -> None:
+    """A value that fits after all (a seed of 3) may pass; nothing ends in another error than ours."""
+    cases, told = _damages(), 0
+    for number, (name, field, value) in enumerate(cases):
+        run = tmp_path / f"run-{number}"
+        run.mkdir()
+        for each in FIELDS:
+            shutil.copyfile(HAND_OVER / each, run / each)
+        (run / "checkpoints").mkdir()
+        checkpoint = next((HAND_OVER / "checkpoints").glob("*.pt"))
+        os.link(checkpoint, run / "checkpoints" / checkpoint.name)
+        _damage(run / name, field, value)
+        hub = tmp_path / f"hub-{number}"
+        code = main(["push", str(run), f"folder:{hub}"])
+        errors = capsys.readouterr().err
+        assert code in (0, 2) and "Traceback" not in errors and errors.count("\n") <= 1, (name, field, value, errors)
+        assert (code == 0) == hub.is_dir()
+        told += code == 2
+    assert told >= 58
+
+
+def test_damaged_metadata_of_a_data_set_are_one_line(refused, tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs the extra data")
+    data = recorded(tmp_path / "HandOver" / "random-v0")
+    metadata = data / "data" / "metadata.json"
+    good = metadata.read_text()
+    content = json.loads(good)
+    content.pop("digest")
+    content["bidex"].pop("sealed")
+    fits = [("dataset_id", "text"), ("bidex", None)]  # a name, and a data set from elsewhere
+    for field in ("total_steps", "total_episodes", "dataset_id", "bidex"):
+        for value in METADATA:
+            metadata.write_text(json.dumps(content | {field: value}))
+            if (field, value) not in fits:
+                assert refused("push", data, f"folder:{tmp_path / 'hub'}").count("\n") == 1
+    for field in ("tasks", "kind", "versions"):
+        for value in (3, ["x", 3], {"packages": []}, {"packages": {"a": 3}}):
+            metadata.write_text(json.dumps(content | {"bidex": content["bidex"] | {field: value}}))
+            assert refused("push", data, f"folder:{tmp_path / 'hub'}").count("\n") == 1
+    metadata.write_text(good[: len(good) // 2])
+    assert refused("push", data, f"folder:{tmp_path / 'hub'}").count("\n") == 1
+    metadata.write_text(good)
+    part = next((data / "data").glob("part*.hdf5"), None) or max((data / "data").glob("*.hdf5"))
+    part.write_bytes(part.read_bytes()[:-100])
+    assert "is damaged" in refused("push", data, f"folder:{tmp_path / 'hub'}")
+    assert not (tmp_path / "hub").exists()
+
+
+def test_links_are_not_followed_out_of_the_folder(refused, shown, tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("precious")
+    run = Path(shutil.copytree(HAND_OVER, tmp_path / "run"))
+    (run / "metrics.jsonl").unlink()
+    (run / "metrics.jsonl").symlink_to(secret)
+    assert "leads out of it" in refused("push", run, f"folder:{tmp_path / 'hub'}")
+    assert "leads out of it" in refused("pull", f"folder:{run}", "--out", tmp_path / "mine")
+    (run / "metrics.jsonl").unlink()
+    (run / "checkpoints").rename(tmp_path / "elsewhere")
+    (run / "checkpoints").symlink_to(tmp_path / "elsewhere")
+    assert "leads out of it" in refused("push", run, f"folder:{tmp_path / 'hub'}")
+    (run / "checkpoints").unlink()
+    (tmp_path / "elsewhere").rename(run / "checkpoints")
+    (newest,) = (run / "checkpoints").iterdir()
+    (run / "checkpoints" / "last.pt").symlink_to(newest.name)
+    shown("push", run, f"folder:{tmp_path / 'hub'}")  # a link within is a copy
+    assert not (tmp_path / "hub" / "checkpoints" / "last.pt").is_symlink()
+    assert {path.name for path in tmp_path.iterdir()} == {"secret", "run", "hub"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
+def test_a_pull_that_finds_no_room_or_is_killed_leaves_nothing_in_the_way(refused, shown, tmp_path: Path) -> None:
+    out, limits = tmp_path / "mine", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        assert refused("pull", f"folder:{HAND_OVER}", "--out", out).count("\n") == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / ".mine.tmp" / "checkpoints").mkdir(parents=True)  # as a killed one leaves
+    (tmp_path / ".mine.tmp" / "config.json").write_text("{")
+    shown("pull", f"folder:{HAND_OVER}", "--out", out)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    hub = Path(shutil.copytree(HAND_OVER, tmp_path / "hub"))
+    (checkpoint,) = (hub / "checkpoints").iterdir()
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    assert "damaged, and was not kept" in refused("pull", f"folder:{hub}", "--out", tmp_path / "other")
+    assert not (tmp_path / "other").exists() and not list(tmp_path.glob(".*"))
+
+
+def test_a_hub_that_cannot_be_reached_is_one_line(refused, monkeypatch) -> None:
+    hub = pytest.importorskip("huggingface_hub", reason="needs the extra hub")
+
+    class ConnectError(Exception):
+        """As of the library's transport, which knows no OSError."""
+
+    def offline(*_: object, **__: object) -> None:
+        raise ConnectError("[Errno -2] Name or service not known")
+
+    for name in ("create_repo", "snapshot_download"):
+        monkeypatch.setattr(hub, name, offline)
+    for words in (("push", HAND_OVER, "me/hand-over"), ("pull", "me/hand-over")):
+        said = refused(*words)
+        assert said.count("\n") == 1 and "ConnectError, [Errno -2] Name or service" in said and "the network" in said
+
+
+def test_an_own_suite_goes_along_and_no_path_of_this_machine(shown, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = Path(shutil.copytree(MT20, tmp_path / "run"))
+    suite = Path(shutil.copyfile(ROOT / "suites" / "MT20.toml", tmp_path / "mine.toml"))
+    config = json.loads((run / "config.json").read_text())
+    config |= {"suite": str(suite), "teacher": ["scripts", str(tmp_path / "teacher")]}
+    (run / "config.json").write_text(json.dumps(config))
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    (run / "evaluation.json").write_text(json.dumps(evaluation | {"run": str(run)}))
+    shown("push", run, "folder:hub")
+    texts = [path.read_text() for path in (tmp_path / "hub").iterdir() if path.is_file()]
+    assert len(texts) >= 5 and not any(str(tmp_path) in text for text in texts)
+    out = tmp_path / "there" / "policy"
+    shown("pull", "folder:hub", "--out", out)
+    found = RunFolder.open(out).config()
+    assert (found.suite, found.teacher) == (str(out / "mine.toml"), ("scripts", "teacher"))
+    assert (out / "mine.toml").read_text() == suite.read_text()
+
+
+def recorded(data: Path) -> Path:
+    words = ["--task", "HandOver", "--size", "80", "--num-envs", "2", "--threads", "1", "--device", "cpu"]
+    assert main(["record", "random", *words, "--out", str(data)]) == 0
+    return data
 
 
 def test_what_is_no_run_is_refused(refused, tmp_path: Path) -> None:

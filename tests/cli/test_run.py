@@ -1,10 +1,12 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -196,6 +198,29 @@ def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, c
     assert "adapts" in refused("run", *SMALL[:6], "--algo", "maml", "--other-tasks")
     shown("plot", path)
     assert (path / "curves.png").stat().st_size > 0
+
+
+def test_what_a_run_publishes_holds_no_path_of_this_machine(toy_worlds, tmp_path, shown):
+    suite = Path(shutil.copyfile(ROOT / "suites" / "MT4.toml", tmp_path / "mine.toml"))
+    for gamma in (0.9, 0.8):
+        words = [
+            *SMALL[2:],
+            "--suite",
+            suite,
+            "--learner.gamma",
+            gamma,
+            "--steps",
+            24,
+            "--run-dir",
+            tmp_path / f"r{gamma}",
+        ]
+        assert main(["run", *map(str, words)]) == 0
+    runs = [tmp_path / "r0.9", tmp_path / "r0.8"]
+    shown("report", *runs, "--out", tmp_path / "page.html")
+    shown("baseline", "zero", "--suite", suite, "--out", tmp_path / "zero.json", "--episodes", 1)
+    written = [tmp_path / "page.html", tmp_path / "zero.json", runs[0] / "evaluation.json", *runs[0].glob("events*")]
+    texts = [path.read_bytes() for path in written] + [shown("evaluate", runs[0], "--json").encode()]
+    assert len(texts) == 5 and not any(str(tmp_path).encode() in text for text in texts)
 
 
 def test_a_resumed_run_equals_an_unbroken_one(toy_worlds, tmp_path):

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import time
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -151,6 +153,45 @@ def test_a_full_disk_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], 
     monkeypatch.setattr("bidex_meta.runs.checkpoints.write_atomic", full)
     told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
     assert told.startswith("bidex-meta: checkpoints/step_96.pt: No space left on device.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
+@pytest.mark.parametrize("refuses", ["disk", "quota"])
+def test_a_disk_without_room_for_a_checkpoint_is_told_before_training(
+    refuses: str, toy: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    line = ["run", *SMALL, "--logger", "none", "--steps", "48", "--run-dir", tmp_path / "r"]
+    with monkeypatch.context() as patch:
+        patch.setattr(MTPPO, "_iterate", lambda learner: pytest.fail("it trained"))
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        if refuses == "disk":
+            patch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=5000))
+        else:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (8000, limits[1]))
+        try:
+            told = refused(capsys, *line).splitlines()[-1]
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert told.startswith("bidex-meta: Expected room for 2 files of ") and str(tmp_path / "r" / "checkpoints") in told
+    assert not list((tmp_path / "r" / "checkpoints").iterdir())
+    assert main([str(word) for word in line]) == 0, "the same command begins again"
+
+
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac"])
+def test_the_room_that_is_held_takes_the_first_checkpoint(algo: str, toy: None, tmp_path: Path, monkeypatch) -> None:
+    room, sizes, save = [], [], Recorder.save
+
+    def watched(record: Recorder, state: dict[str, object], step: int) -> None:
+        room.extend(path.stat().st_size for path in sorted((tmp_path / "r" / "checkpoints").glob(".room-*")))
+        save(record, state, step)
+        sizes.append((tmp_path / "r" / "checkpoints" / f"step_{step}.pt").stat().st_size)
+
+    monkeypatch.setattr(Recorder, "save", watched)
+    small = [word for word in SMALL if word not in ("--learner.rollout-steps", "4")]
+    words = ["--algo", algo, "--steps", "48", "--run-dir", str(tmp_path / "r")]
+    assert main(["run", *small, *words]) == 0
+    assert len(room) == 2 and min(room) > sizes[0], "for step_<N>.pt and for last.pt"
+    assert not list((tmp_path / "r" / "checkpoints").glob(".*"))
 
 
 def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:

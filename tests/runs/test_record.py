@@ -3,15 +3,18 @@ import json
 import math
 import os
 import resource
+from dataclasses import replace
 
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bidex_meta.config import RunConfig
+from bidex_meta.data.part_files import SealedFile
 from bidex_meta.errors import BidexError
-from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics
+from bidex_meta.runs import MetricsWriter, Progress, Recorder, RunFolder, mend, read_metrics
 from bidex_meta.runs import progress as progress_module
 from bidex_meta.runs.metrics import last_rows
 from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
@@ -165,6 +168,31 @@ def test_picture_and_film_read_back(tmp_path):
     film = imageio.imread(tmp_path / "a.mp4")
     assert film.shape == (5, 50, 70, 3)
     assert abs(film[2].astype(int) - frame).mean() < 10
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a umask")
+@pytest.mark.parametrize("umask", [0o077, 0o027, 0o022, 0o002])
+def test_the_umask_decides_who_may_read_what_is_written(umask: int, tmp_path):
+    before = os.umask(umask)
+    try:
+        folder = RunFolder.create(CONFIG, tmp_path / "r")
+        folder.checkpoints.save({"weights": torch.zeros(3)}, 1)
+        folder.change_config(replace(CONFIG, steps=200))
+        with Recorder(folder, 10) as record:
+            record.log({"Train/return/HandOver": 1.0}, 1)
+        write_image(folder.videos_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+        write_animation(folder.videos_path / "a.webp", [np.zeros((4, 4, 3), np.uint8)] * 2, 10)
+        save(draw_learning([("a", {"Train/return/HandOver": curve(1.0, 2.0)})]), folder.path / "a.svg")
+        sealed = SealedFile(folder.path / "part.hdf5")
+        sealed.commit()
+        mend(folder.metrics_path, 0)
+    finally:
+        os.umask(before)
+    paths = [tmp_path / "r", *(tmp_path / "r").rglob("*")]
+    assert len(paths) > 12
+    modes = {path.name: path.stat().st_mode & 0o777 for path in paths}
+    expected = {path.name: (0o777 if path.is_dir() else 0o666) & ~umask for path in paths}
+    assert modes == expected
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")

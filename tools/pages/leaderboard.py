@@ -3,18 +3,34 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from bidex_meta.evaluation.leaderboard import PROFILE, Entry, estimate, improvement, iqm, profile, read_entry
+from bidex_meta.evaluation.leaderboard import (
+    PROFILE,
+    Entry,
+    check_apart,
+    estimate,
+    improvement,
+    iqm,
+    profile,
+    read_entry,
+)
+from bidex_meta.suite import load_suite, suite_names
 from tools.pages.tables import table
 
 
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
-    """A row for each entry of a suite, best first; each has the probability that it is above the row below it."""
-    entries = [read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))]
-    ranked = sorted((entry for entry in entries if entry.suite == suite), key=_rank, reverse=True)
+    """Yield a row for each entry of a suite in its present version, best first.
+
+    Each has the probability that it is above the row below it.
+    """
+    entries = {path: read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))}
+    check_apart(entries)
+    version = load_suite(suite).version if suite in suite_names() else None
+    comparable = [entry for entry in entries.values() if (entry.suite, entry.version) == (suite, version)]
+    ranked = sorted(comparable, key=_rank, reverse=True)
     rows = [_row(place, entry, ranked[place:]) for place, entry in enumerate(ranked, 1)]
     above = [f"> {100 * rate:.0f} %" for rate in PROFILE]
-    head = ["", "entry", "success, IQM", "other tasks, IQM", *above, "above the next", "seeds", "steps", "hours"]
-    yield from table([*head, "trained on", "commit"], rows) if rows else ()
+    head = ["", "entry", "success, IQM", "other tasks, IQM", *above, "above the next", "runs", "steps"]
+    yield from table([*head, "stated: hours", "stated: trained on", "stated: commit"], rows) if rows else ()
 
 
 def _rank(entry: Entry) -> float:
@@ -22,13 +38,13 @@ def _rank(entry: Entry) -> float:
 
 
 def _row(place: int, entry: Entry, below: list[Entry]) -> list[str]:
-    own, others = entry.success(entry.own), entry.success(entry.others)
+    own, others, stated = entry.success(entry.own), entry.success(entry.others), entry.stated
     better = estimate(improvement, own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
     return [
         str(place), f"{entry.name} ({entry.algorithm})" if entry.name != entry.algorithm else entry.name,
         *(estimate(iqm, part).text(100.0, " %") for part in (own, others)),
         *(f"{100 * profile(own, rate):.0f} %" for rate in PROFILE), better,
-        str(len(entry.seeds)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
-        f"{sum(entry.hours) / len(entry.hours):.2f}", entry.device,
-        ", ".join(sorted({commit or "unknown" for commit in entry.commit})),
+        str(len(entry.weights)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
+        f"{sum(stated.hours) / len(stated.hours):.2f}", stated.device,
+        ", ".join(sorted({commit or "unknown" for commit in stated.commit})),
     ]  # fmt: skip

@@ -45,7 +45,11 @@ class DAggerConfig(NetworkConfig):
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base."""
-        return self.samples * width + network_bytes(self.hidden, width, 1)
+        return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 1)
+
+    def bytes_stored(self, num_envs: int, width: int) -> int:
+        """As in the base: the labelled observations."""
+        return self.samples * width
 
 
 PRESETS: dict[str, DAggerConfig] = {"laptop": DAggerConfig()}

@@ -62,8 +62,11 @@ class OffPolicyConfig(NetworkConfig):
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base."""
-        replay = min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps)
-        return int(replay) + network_bytes(self.hidden, width, 3)
+        return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 3)
+
+    def bytes_stored(self, num_envs: int, width: int) -> int:
+        """As in the base: the replay."""
+        return int(min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps))
 
 
 class ReturnScale:

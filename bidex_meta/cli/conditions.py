@@ -1,0 +1,57 @@
+"""What an evaluation's numbers depend on, and whether a run was made with what is here: said, or refused."""
+
+from collections.abc import Sequence
+
+from bidex_meta.cli.tables import Json, say
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.provenance import Difference, differences
+from bidex_meta.runs.versions import package_versions
+from bidex_meta.worlds import Worlds
+
+_PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
+
+
+def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:
+    """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
+
+    Of the worlds that were played, and the environments that were asked for (None: the default).
+    """
+    wanted, identity = [*_PACKAGES], worlds.identity()
+    if worlds.device.startswith("cuda") or worlds.engine == "warp":
+        wanted.append("mujoco-warp")
+    if identity["physics"] is None:
+        wanted.append("metaworld")
+    installed = package_versions()
+    packages = {name: installed[name] for name in wanted}
+    where = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
+    return {**where, "packages": packages, **identity}
+
+
+def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
+    """Return how a run's record differs from this installation and the run's own worlds, here ``worlds`` if known."""
+    return differences(folder.versions(), conditions(worlds or Worlds.open(folder.config().to_json())))
+
+
+def note(folder: RunFolder) -> None:
+    """Say in one line how a run's record differs from this installation and its suite, if it does."""
+    try:
+        found = differences_of(folder)
+    except BidexError:
+        return  # its suite is not here: the weights alone may be enough, and who needs the suite says so
+    if found:
+        say(f"{folder.path} was made with {_texts(found)}.")
+
+
+def check_worlds_of(folder: RunFolder, worlds: Worlds, mend: str) -> None:
+    """Say how a run's record differs, and raise BidexError, with ``mend``, if its worlds are no longer the same."""
+    found = differences_of(folder, worlds)
+    of_worlds = [difference for difference in found if difference.is_of_worlds]
+    if of_worlds:
+        raise BidexError(f"The worlds of {folder.path} have changed: {_texts(of_worlds)}. {mend}")
+    if found:
+        say(f"{folder.path} was made with {_texts(found)}.")
+
+
+def _texts(found: Sequence[Difference]) -> str:
+    return one_line(", ".join(map(str, found)))

@@ -1,0 +1,111 @@
+"""What a run or an evaluation was made with, and how two such records differ: every reader of runs asks here.
+
+A record is ``versions.json`` of a run, ``conditions`` of an evaluation, or the present installation and suite:
+``packages`` (versions by name), ``physics``, ``suite_version`` and ``suite_digest``. What one of two records does not
+say is no difference.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.stored import Run
+
+_WORLD = ("physics", "suite_version", "suite_digest")
+_ENGINES = ("mujoco", "mujoco-warp", "metaworld")
+Value = str | int
+Subject = tuple[str | None, ...]
+"""What runs are trained on: two runs of one subject have the same worlds, if nobody has changed these."""
+
+
+class Difference(NamedTuple):
+    """One entry of two records."""
+
+    name: str
+    then: Value
+    now: Value
+
+    @property
+    def is_of_worlds(self) -> bool:
+        """Whether the worlds differ: rewards and successes of both are no samples of one distribution."""
+        return self.name in _ENGINES or self.name.replace(" ", "_") in _WORLD
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.then} then, {self.now} now"
+
+
+def differences(then: Json, now: Json) -> list[Difference]:
+    """Return the entries that both records have, with other values; ``now`` says which packages count."""
+    before = _values(then)
+    return [
+        Difference(name, before[name], value)
+        for name, value in _values(now).items()
+        if name in before and before[name] != value
+    ]
+
+
+def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
+    """Return of each run what tells its worlds from other worlds of the same subject among the runs; mostly nothing.
+
+    Runs with different entries must not be pooled. Both the training and the evaluation count.
+    """
+    records = [dict(_of_worlds(run)) for run in runs]
+    seen: dict[tuple[Subject, str], set[Value]] = defaultdict(set)
+    for run, record in zip(runs, records, strict=True):
+        for name, value in record.items():
+            seen[_subject(run), name].add(value)
+    found = []
+    for run, record in zip(runs, records, strict=True):
+        own = _subject(run)
+        found.append({name: record.get(name) for (of, name), values in seen.items() if of == own and len(values) > 1})
+    return found
+
+
+def check_alike(runs: Sequence[Run]) -> None:
+    """Raises BidexError where runs that shall be seeds of one experiment were made with different worlds."""
+    records = split_by_worlds(runs)
+    for run, record in zip(runs, records, strict=True):
+        for name, value in record.items():
+            if value != records[0].get(name):
+                raise BidexError(
+                    f"Expected runs of equal worlds, but {runs[0].path} and {run.path} differ in {name}: "
+                    f"{records[0].get(name)} and {value}. Name them in separate calls."
+                )
+
+
+def release_of(run: Run) -> Value | None:
+    """Return the version of this package that a run was made with; None where it is not recorded."""
+    return _values(run.versions()).get("bidex-meta")
+
+
+def _values(record: Mapping[str, object]) -> dict[str, Value]:
+    """The known values of a record by name."""
+    packages = record.get("packages")
+    values: dict[str, object] = dict(packages) if isinstance(packages, dict) else {}
+    values |= {name.replace("_", " "): record.get(name) for name in _WORLD}
+    return {name: value for name, value in values.items() if isinstance(value, str | int)}
+
+
+def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
+    """What decides the worlds of a run, of its training and of its evaluation."""
+    config = run.config()
+    trained = _values(run.versions())
+    engines = ["mujoco"]
+    if config.engine == "warp" or (config.engine == "auto" and config.device.startswith("cuda")):
+        engines.append("mujoco-warp")
+    if (config.suite or "").startswith("metaworld/"):
+        engines.append("metaworld")
+    names = [*engines, *(name.replace("_", " ") for name in _WORLD)]
+    yield from ((name, trained[name]) for name in names if name in trained)
+    if run.evaluated:
+        with suppress(BidexError):  # of an evaluation that cannot be read; who needs it says so
+            evaluated = _values(run.evaluation().get("conditions", {}))
+            yield from ((f"evaluated with {name}", evaluated[name]) for name in names if name in evaluated)
+
+
+def _subject(run: Run) -> Subject:
+    config = run.config()
+    return config.suite, config.task, config.object, config.base

@@ -1,0 +1,156 @@
+"""Runs that were made with other physics, suites or versions: every reader of runs says so, or refuses."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.cli.policies import load_policy
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.provenance import differences
+from tests.fakes import evaluated_run
+from tests.pages import ROOT
+from tools.collect import collect
+
+SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
+OTHERS = {
+    "mujoco": {"packages": {"mujoco": "3.9.9"}},
+    "physics": {"physics": "0123456789ab"},
+    "suite version": {"suite_version": 7},
+    "suite digest": {"suite_digest": "0123456789ab"},
+}
+VALUES = {"mujoco": "3.9.9", "physics": "0123456789ab", "suite version": "7", "suite digest": "0123456789ab"}
+TEXTS = {name: f"{name} {value} then, " for name, value in VALUES.items()}
+
+
+def edited(run: Path, name: str) -> Path:
+    """The run as if it had been made with something else."""
+    versions = json.loads((run / "versions.json").read_text())
+    other = OTHERS[name]
+    packages = versions["packages"] | other.get("packages", {})
+    (run / "versions.json").write_text(json.dumps(versions | other | {"packages": packages}))
+    return run
+
+
+@pytest.fixture
+def run(toy_worlds, tmp_path: Path) -> Path:
+    assert main(["run", *SMALL, "--steps", "96", "--run-dir", str(tmp_path / "r"), "--episodes", "4"]) == 0
+    return tmp_path / "r"
+
+
+def test_what_is_not_recorded_is_no_difference() -> None:
+    now = {"packages": {"mujoco": "4.0.0", "torch": None}, "physics": "a", "suite_version": 2, "suite_digest": None}
+    assert differences({}, now) == []
+    then = {"packages": {"mujoco": "3.9", "scipy": "1"}, "physics": "a", "suite_version": 1, "suite_digest": "b"}
+    found = differences(then, now)
+    assert [(str(each), each.is_of_worlds) for each in found] == [
+        ("mujoco 3.9 then, 4.0.0 now", True),
+        ("suite version 1 then, 2 now", True),
+    ]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_readers_of_one_run_say_it_in_a_line(name: str, run: Path, capsys, tmp_path: Path) -> None:
+    def said(*words: object) -> list[str]:
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == 0, capsys.readouterr().err
+        return [
+            line for line in capsys.readouterr().err.splitlines() if "was made with" in line or "Conditions" in line
+        ]
+
+    start = ["run", *SMALL, "--steps", "24", "--no-evaluate", "--start-from", run]
+    assert said("evaluate", run) == said(*start, "--run-dir", tmp_path / "s1") == []
+    edited(run, name)
+    text = f"{run} was made with {TEXTS[name]}"
+    for words in (["evaluate", run], [*start, "--run-dir", tmp_path / "s2"]):
+        (line,) = said(*words)
+        assert line.startswith(text), words
+    load_policy(RunFolder.open(run), "cpu")  # what play, render, record, export, teachers, validity and control call
+    assert capsys.readouterr().err.startswith(text)
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    evaluation["conditions"] = {"device": "cpu", "engine": "auto"}  # of an older one: verify asks the run's record
+    (run / "evaluation.json").write_text(json.dumps(evaluation))
+    (line,) = said("verify", run)
+    assert line.startswith(f"Conditions: {TEXTS[name]}")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_run_whose_worlds_have_changed_is_neither_resumed_nor_submitted_nor_collected(
+    name: str, run: Path, refused, shown, tmp_path: Path
+) -> None:
+    edited(run, name)
+    before = (run / "config.json").read_text()
+    for words in (["run", "--resume", run, "--steps", "192"], ["submit", run, "--out", tmp_path / "board"]):
+        assert f"The worlds of {run} have changed: {TEXTS[name]}" in refused(*words)
+    assert (run / "config.json").read_text() == before
+    with pytest.raises(ValueError, match="other worlds than its evaluation's"):
+        collect((run,), tmp_path / "data")
+
+
+def test_another_release_alone_is_said_and_resumed(run: Path, capsys) -> None:
+    versions = json.loads((run / "versions.json").read_text())
+    versions["packages"]["bidex-meta"] = "0.0.1"
+    (run / "versions.json").write_text(json.dumps(versions))
+    capsys.readouterr()
+    assert main(["run", "--resume", str(run), "--steps", "120", "--no-evaluate"]) == 0
+    assert f"{run} was made with bidex-meta 0.0.1 then, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("where", ["training", "evaluation"])
+def test_runs_of_other_worlds_are_not_pooled(name: str, where: str, shown, refused, tmp_path: Path) -> None:
+    runs = [evaluated_run(tmp_path, seed, {"A": 0.5}) for seed in range(4)]
+    (group,) = json.loads(shown("compare", *runs, "--json"))
+    assert len(group["seeds"]) == 4
+    for number, run in enumerate(runs):
+        versions = json.loads((run / "versions.json").read_text())
+        versions |= {"physics": "da96102fd588", "suite_version": 1, "suite_digest": "da96102fd588"}
+        if where == "training":
+            (run / "versions.json").write_text(json.dumps(versions))
+            if number == 3:
+                edited(run, name)
+        else:
+            made = {each: versions[each] for each in ("packages", "physics", "suite_version", "suite_digest")}
+            made |= OTHERS[name] if number == 3 else {}
+            evaluation = json.loads((run / "evaluation.json").read_text())
+            (run / "evaluation.json").write_text(json.dumps(evaluation | {"conditions": made}))
+    groups = json.loads(shown("compare", *runs, "--json"))
+    assert [len(group["seeds"]) for group in groups] == [3, 1]
+    assert all(f"{name} " in group["group"] for group in groups)
+    assert VALUES[name] in groups[1]["group"]
+    page = Path(shown("report", *runs, "--out", tmp_path / "page.html").strip()).read_text()
+    assert groups[1]["group"] in page
+
+
+def test_classes_with_physics_of_their_own_stay_one_group(shown, tmp_path: Path) -> None:
+    runs = [evaluated_run(tmp_path, seed, {task: 0.5}, task=task) for seed in (0, 1) for task in ("HandOver", "Pen")]
+    for run in runs:
+        versions = json.loads((run / "versions.json").read_text())
+        physics = {"physics": "a" * 12 if "HandOver" in run.name else "b" * 12}
+        (run / "versions.json").write_text(json.dumps(versions | physics))
+    (group,) = json.loads(shown("compare", *runs, "--json"))
+    assert group["seeds"] == [0, 1]
+
+
+def test_a_copy_with_another_seed_is_no_second_run(run: Path, refused, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps(config | {"seed": 1}))
+    for command in ("compare", "plot", "report"):
+        words = ["--out", tmp_path / "page.html"] if command == "report" else ["--out", tmp_path / "a.png"]
+        assert "is a copy of" in refused(command, run, copy, *words)
+
+
+def test_a_suite_file_that_was_changed_is_found(shown, toy_worlds, tmp_path: Path, capsys) -> None:
+    suite = Path(shutil.copyfile(ROOT / "suites" / "MT4.toml", tmp_path / "mine.toml"))
+    words = [*SMALL[2:], "--steps", "24", "--no-evaluate", "--suite", suite, "--run-dir", tmp_path / "r"]
+    shown("run", *words)
+    text = suite.read_text()
+    suite.write_text(text.replace("description = ", "description = 'another' # "))
+    shown("evaluate", tmp_path / "r")
+    assert "was made with" not in capsys.readouterr().err
+    suite.write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 49"))
+    assert main(["evaluate", str(tmp_path / "r")]) == 0
+    assert "was made with suite digest " in capsys.readouterr().err
