@@ -20,14 +20,16 @@ from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.suite import HELD_STEPS
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import check_precision
-from bidex_meta.utils.validation import whole_number
+from bidex_meta.utils.validation import Seed, whole_number
 from bidex_meta.world.contract import TaskWorld
 
 _SECONDS = 15.0  # from one sign of life of ``Watched`` to the next
 EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains with it, so they are new to the policy
 
 
+@checked_arguments
 def evaluate(
     agent: Agent, world: TaskWorld, episodes_per_task: int = 4, *, seed: int | None = None,
     references: Mapping[str, Reference] | None = None
@@ -132,6 +134,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
 class ZeroAgent:
     """Does nothing: action 0 everywhere. Spaces are the world's batched one, ``(num_envs, action)``."""
 
+    @checked_arguments
     def __init__(self, action_space: Box):
         self._shape = action_space.shape
 
@@ -146,7 +149,8 @@ class ZeroAgent:
 class RandomAgent:
     """Uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
 
-    def __init__(self, action_space: Box, seed: int = 0):
+    @checked_arguments
+    def __init__(self, action_space: Box, seed: Seed = 0):
         self._low = torch.as_tensor(action_space.low)
         self._range = torch.as_tensor(action_space.high) - self._low
         self._generator = torch.Generator().manual_seed(seed)
