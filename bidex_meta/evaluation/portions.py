@@ -32,7 +32,7 @@ class Portions:
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
         for name, number in (("rollouts", rollouts), ("tasks", tasks), ("trials", trials)):
             if number is not None:
-                whole_number(name, number, 1)
+                whole_number(name, number, 1, 1_000_000)
         self._pool_sizes = list(world.num_slot_tasks)
         # The task of each adaptation, for each slot.
         self._adaptations = [np.tile(np.arange(min(tasks or size, size)), trials) for size in self._pool_sizes]
