@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.arguments import check_argument
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.episodes import set_stagger
 
@@ -22,6 +23,7 @@ def extra(name: str) -> Iterator[None]:
 
 def check_training(world: VectorWorld, stagger: bool) -> None:
     """Raises BidexError for a world in another autoreset mode than SAME_STEP; sets whether it staggers."""
+    check_argument("world", world, VectorWorld)
     if (mode := world.metadata["autoreset_mode"]) != AutoresetMode.SAME_STEP:
         what = f"Expected a world in autoreset mode SAME_STEP, got {mode.name}"
         raise BidexError(f"{what}; make it without autoreset_mode.")
