@@ -4,6 +4,7 @@ The four properties and `Task` are Meta-World's, so that code written against it
 """
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, cast
 
@@ -27,8 +28,9 @@ from bidex_meta.suite import (
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import whole_number
+from bidex_meta.utils.validation import Text, real_numbers, whole_number
 from bidex_meta.world import PointsRule, Slot, World
 from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
@@ -47,9 +49,11 @@ class Task(NamedTuple):
     """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
 
     @classmethod
-    def from_variation(cls, env_name: str, variation: np.ndarray) -> "Task":
+    @checked_arguments
+    def from_variation(cls, env_name: Text, variation: np.ndarray | Sequence[float]) -> "Task":
         """The task of a class with this variation, shape (size,)."""
-        return cls(env_name, np.asarray(variation, dtype=_NUMBERS).tobytes())
+        numbers = real_numbers("variation", variation, 1)
+        return cls(env_name, numbers.astype(_NUMBERS).tobytes())
 
     @property
     def variation(self) -> np.ndarray:
@@ -116,9 +120,10 @@ class Benchmark:
         """Environment classes of the test split by name; empty in a multi-task suite."""
         return self._env_classes("test")
 
-    def task_classes(self, split: str = "train") -> dict[str, TaskClass]:
+    @checked_arguments
+    def task_classes(self, split: Split = "train") -> dict[str, TaskClass]:
         """What the classes of a split are (scene, observation, reward), by name."""
-        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(cast(Split, split))}
+        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
 
     @property
     def train_tasks(self) -> list[Task]:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
@@ -41,6 +42,7 @@ HELD_STEPS = 15
 """Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Rules:
     """Four choices, each alone; the defaults are version 1, ``V2`` has all of version 2."""
@@ -119,6 +121,7 @@ FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_dam
 """Of a randomisation, those that are factors of the model's numbers."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class ListedTask:
     """One task that a suite file writes out, in place of drawing it."""
@@ -130,6 +133,7 @@ class ListedTask:
     """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class SuiteClass:
     """One task class of a suite."""
@@ -147,6 +151,7 @@ class SuiteClass:
     """What else the class lets one choose, by the names of its constructor's arguments."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Suite:
     """A suite file, checked."""
@@ -214,6 +219,7 @@ def suite_names() -> list[str]:
     return sorted(path.stem for path in suites_dir().glob("*.toml"))
 
 
+@checked_arguments
 def metaworld_classes(suite: str) -> tuple[str, ...]:
     """The classes of one of Meta-World's suites; BidexError where there is none, with the nearest name."""
     if suite not in METAWORLD_SUITES:
@@ -221,6 +227,7 @@ def metaworld_classes(suite: str) -> tuple[str, ...]:
     return METAWORLD_SUITES[suite]
 
 
+@checked_arguments
 def load_suite(name_or_path: str | Path) -> Suite:
     """Reads a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
 
@@ -232,6 +239,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
     return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
 
 
+@checked_arguments
 def load_randomisation(path: str | Path) -> Randomisation:
     """The table ``[randomisation]`` of a TOML file: a suite's, or one that holds nothing else.
 

@@ -116,6 +116,85 @@ def test_a_mistake_in_a_method_names_class_method_expected_and_received(right: s
     assert told in str(raised.value) and ("sensor" in told or str(raised.value).startswith("SlideBlock."))
 
 
+def _wrong(folder: Path, name: str, *changes: tuple[str, str]) -> str:
+    """A class of the working folder with these changes to its source; its name."""
+    source = (folder / "my_tasks.py").read_text()
+    for right, wrong in changes:
+        assert right in source
+        source = source.replace(right, wrong)
+    (folder / f"{name}.py").write_text(source)
+    return f"{name}:SlideBlock"
+
+
+_HALF_NAN = "torch.where(torch.arange(len(distance)) % 2 == 1, torch.nan, distance)"
+
+
+@pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
+def test_a_reward_term_that_is_not_finite_names_class_and_term(mode: str, working_folder: Path) -> None:
+    name = _wrong(working_folder, f"nan_reward_{mode}", ('"target": -5.0 * distance', f'"target": {_HALF_NAN}'))
+    world = make_task_world(name, 4, device="cpu", threads=1, autoreset_mode=mode)
+    world.reset(seed=0)
+    with pytest.raises(
+        BidexError, match=r"SlideBlock\.reward_terms: 'target': .* got nan .*\(2 of 4 environments\)"
+    ) as raised:
+        world.step(torch.zeros(4, 52))
+    assert "\n" not in str(raised.value)
+    with pytest.raises(BidexError, match="'target'"):  # what a learner on a GPU asks when its loss is not finite
+        world.check_formulas()
+
+
+def test_an_observation_or_a_start_that_is_not_finite_names_class_and_block(working_folder: Path) -> None:
+    observe = 'return observe_goal(state, "block/quaternion")'
+    change = (observe, 'return {"goal_pose": state.frozen["goal"] / 0.0}')
+    name = _wrong(working_folder, "nan_observation", change)
+    with pytest.raises(BidexError, match=r"SlideBlock\.observe: 'goal_pose': expected finite numbers"):
+        make_task_world(name, 2, device="cpu", threads=1).reset(seed=0)
+    change = ('place(qpos["block"], frozen["block"], draws)', 'qpos["block"][:, 0] = (draws[:, 0] - 2.0).sqrt()')
+    name = _wrong(working_folder, "nan_start", change)
+    with pytest.raises(BidexError, match=r"SlideBlock\.start: 'block': expected finite numbers"):
+        make_task_world(name, 2, device="cpu", threads=1).reset(seed=0)
+
+
+def test_broken_physics_of_a_class_of_ones_own_is_no_fault_of_its_formulas(working_folder: Path) -> None:
+    world = make_task_world(NAME, 2, device="cpu", threads=1)
+    world.reset(seed=0)
+    world.parts[0].group.engine.qpos[0] = torch.nan
+    info = world.step(torch.zeros(2, 52))[4]
+    assert info["unstable"].tolist() == [True, False] and info["reward_unscaled"].isfinite().all()
+
+
+def test_a_loss_that_own_rewards_broke_does_not_blame_the_learning_rate(
+    working_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = _wrong(working_folder, "nan_in_a_run", ('"target": -5.0 * distance', f'"target": {_HALF_NAN}'))
+    run = ["run", "--task", name, "--algo", "ppo", "--num-envs", "4", "--steps", "64", "--threads", "1"]
+    assert main([*run, "--no-evaluate"]) == 2
+    shown = capsys.readouterr().err
+    assert "SlideBlock.reward_terms: 'target'" in shown and "learning_rate" not in shown
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("episode_steps = 125", "episode_steps = 0", "episode_steps: expected a whole number from 1 on, got 0"),
+        ("start_draws = DRAWS", 'start_draws = "3"', "start_draws: expected a whole number from 0 on, got '3'"),
+        ("transition_scale = 0.5", 'transition_scale = float("nan")', "transition_scale: expected a number from 0"),
+        (
+            "right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)",
+            "right = (0.55, 0.2, 0.8)",
+            "right: expected a HandPose",
+        ),
+        ("solver = FAST", "solver = 100", "solver: expected a Solver, got 100"),
+        ('"goal_shift", 0.1, 0.25', '"goal_shift", 0.25, 0.1', "goal_shift: expected its lower end before its upper"),
+    ],
+)
+def test_an_attribute_of_another_kind_is_refused(right: str, wrong: str, told: str, working_folder: Path) -> None:
+    name = _wrong(working_folder, f"attribute_{abs(hash(wrong))}", (right, wrong))
+    with pytest.raises(BidexError) as raised:
+        make_task_world(name, 2, device="cpu", threads=1)
+    assert told in str(raised.value) and name in str(raised.value) and "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     ("line", "told"),
     [

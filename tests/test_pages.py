@@ -5,6 +5,7 @@ import importlib
 import io
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -130,6 +131,16 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert target.exists(), f"{page.name}: {found[0]} leads nowhere"
         if found["anchor"] and target.suffix == ".md":
             assert found["anchor"] in _anchors(target), f"{page.name}: {target.name} has no {found['anchor']}"
+
+
+def test_extras_that_pages_and_messages_name_exist() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for path in (*PAGES, *(ROOT / "bidex_meta").rglob("*.py"), *(ROOT / "examples").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        named = [name.strip() for each in re.findall(r"bidex-meta\[([\w, -]+)\]", text) for name in each.split(",")]
+        for rest in re.findall(r"needs the extra (`[^.]*)", text):
+            named += [name for name in re.findall(r"`+([\w-]+)`+", rest) if name not in COMMANDS]
+        assert set(named) <= extras.keys(), f"{path}: {named}"
 
 
 def test_the_readme_is_short() -> None:

@@ -109,6 +109,9 @@ class Learner(Contract):
         metrics = self._iterate()
         if not math.isfinite(sum(value for name, value in metrics.items() if name.startswith(("Loss/", "Policy/")))):
             steps = self.env_steps
+            world: Any = getattr(self.world, "unwrapped", self.world)
+            if hasattr(world, "check_formulas"):
+                world.check_formulas()  # of a class of the user's own, whose numbers may be the cause
             raise FloatingPointError(f"{self.name}: the loss is not finite after {steps} steps; {self.remedy}.")
         whole = time.perf_counter() - started
         metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected

@@ -5,15 +5,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from bidex_meta.agents import Agent
 from bidex_meta.cli.conditions import note
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.cli.tables import Json
+from bidex_meta.engine.choice import checked_device
 from bidex_meta.errors import BidexError, known_name, one_line
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
 from bidex_meta.train.distributed import LostProcess
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import is_file
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.world.contract import TaskWorld
@@ -69,9 +73,10 @@ def fitting(path: Path) -> Iterator[None]:
         ) from error
 
 
-def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
+@checked_arguments
+def load_policy(folder: RunFolder, device: str | torch.device, which: str = "last") -> tuple[Agent, int]:
     """The policy of a run's checkpoint and the environment steps it was trained for; errors as of ``checkpoint``."""
-    load, step = policy_loader(folder, device, which)
+    load, step = policy_loader(folder, str(checked_device(device)), which)
     return load(), step
 
 

@@ -7,7 +7,9 @@ import torch
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.clients.gymnasium_ids import both_seeds, check_render_mode
 from bidex_meta.errors import BidexError
+from bidex_meta.world.checked import one_row
 from bidex_meta.world.contract import Info, Options
+from bidex_meta.world.episodes import check_single_reset
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -42,9 +44,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode, the same for the same seed: observation (d,), float32, and an empty info. No options."""
+        check_single_reset(seed, options)
         super().reset(seed=seed, options=options)
-        if options:
-            raise BidexError(f"Expected no reset options, got {', '.join(map(str, options))}.")
         obs, _ = self.world.reset(seed=seed)
         self._over = False
         return obs[0].cpu().numpy(), {}
@@ -58,7 +59,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._over:
             raise BidexError("Expected reset() before step(): no episode runs.")
-        obs, reward, terminated, truncated, batch = self.world.step(torch.as_tensor(action)[None])
+        obs, reward, terminated, truncated, batch = self.world.step(one_row(action))
         info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
         self._over = bool(terminated[0] or truncated[0])

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.arguments import check_argument
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.episodes import set_stagger
 
@@ -22,6 +23,7 @@ def extra(name: str) -> Iterator[None]:
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
     """Set whether a world staggers; raise BidexError for one in another autoreset mode than the library needs."""
+    check_argument("world", world, VectorWorld)
     given = world.metadata["autoreset_mode"]
     if given != mode:
         usual = mode == AutoresetMode.SAME_STEP

@@ -1,13 +1,18 @@
 """A task class as PettingZoo's parallel environment: fingers, hands or any of them as agents. Extra: `marl`."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
 
 from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.clients.needs import extra
-from bidex_meta.errors import BidexError
+from bidex_meta.engine.health import dense
+from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.units import Agents
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world.agent_views import agent_views
 
 with extra("marl"):
@@ -45,19 +50,21 @@ class HandsEnv(ParallelEnv):
 
     def observation_space(self, agent: str) -> Space:
         """Returns the same object each time."""
-        return self.observation_spaces[agent]
+        return self.observation_spaces[known_name("agent", agent, self.possible_agents)]
 
     def action_space(self, agent: str) -> Space:
         """Returns the same object each time."""
-        return self.action_spaces[agent]
+        return self.action_spaces[known_name("agent", agent, self.possible_agents)]
 
+    @checked_arguments
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
         """Starts an episode, the same for the same seed: observations by agent, and empty infos. Options do nothing."""
         self._state, _ = self._env.reset(seed=seed)
         self.agents = list(self.possible_agents)
         return self._observations(), {name: {} for name in self.agents}
 
-    def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
+    @checked_arguments
+    def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """Advances 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
 
         Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; empty once the
@@ -67,9 +74,11 @@ class HandsEnv(ParallelEnv):
             return {}, {}, {}, {}, {}
         joint = np.zeros(sum(map(len, self._actions.values())), np.float32)
         for name in self.agents:
-            given, expected = actions.get(name), self.action_spaces[name].shape
-            if given is None or np.shape(given) != expected:
-                got = "nothing" if given is None else f"shape {np.shape(given)}"
+            expected = self.action_spaces[name].shape
+            given = dense(actions.get(name), torch.device("cpu"))
+            if given is None or given.shape != expected:
+                shown = shortened(actions[name]) if name in actions else "nothing"
+                got = shown if given is None else f"shape {tuple(given.shape)}"
                 raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
             joint[self._actions[name]] = given
         self._state, reward, terminated, truncated, info = self._env.step(joint)

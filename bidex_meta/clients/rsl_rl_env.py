@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world.contract import Info, TaskWorld, VectorWorld
 
 with extra("rsl-rl"):
@@ -25,6 +27,7 @@ class RslRlVecEnv(VecEnv):
     to no whole numbers from 0 on.
     """
 
+    @checked_arguments
     def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: object = None, stagger: bool = False) -> None:
         check_training(world, stagger)
         self.world: Any = world
@@ -47,10 +50,11 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
-        given = torch.as_tensor(value, device=self.world.device)
-        steps = given.to(torch.int64)
-        if steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
-            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {shortened(given.tolist())}"
+        given = dense(value, self.world.device)
+        steps = torch.zeros(0) if given is None else given.to(torch.int64)
+        if given is None or steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
+            got = shortened(value if given is None else given.tolist())
+            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
             raise BidexError(f"episode_length_buf: expected {what}. Give steps, one number for each environment.")
         self.get_observations()
         episodes = self.world.episodes

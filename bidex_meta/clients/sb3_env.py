@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import torch
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, VectorWorld
 
 _Rows = None | int | Iterable[int]
@@ -26,6 +27,7 @@ class SB3VecEnv(vec_env.VecEnv):
     Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
+    @checked_arguments
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         check_training(world, stagger)
         self.world: Any = world
@@ -42,7 +44,7 @@ class SB3VecEnv(vec_env.VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Stores the actions (num_envs, a)."""
-        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.world.device)
+        self._actions = checked.action(actions, self.world.action_space.shape, self.world.device)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:
         """Takes them: observations (num_envs, d), rewards and dones (num_envs,), infos."""

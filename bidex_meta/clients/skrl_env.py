@@ -9,6 +9,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Seed
 from bidex_meta.world.contract import Info, Step, VectorWorld
 
 with extra("skrl"):
@@ -27,7 +29,8 @@ class SkrlEnv(Wrapper):
     reward" counts. Raises BidexError for a world in another autoreset mode.
     """
 
-    def __init__(self, world: VectorWorld, seed: int | None = None, stagger: bool = False) -> None:
+    @checked_arguments
+    def __init__(self, world: VectorWorld, seed: Seed | None = None, stagger: bool = False) -> None:
         check_training(world, stagger, AutoresetMode.NEXT_STEP)
         super().__init__(world)
         self.world, self._seed = world, seed

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world.contract import VectorWorld
 
 with extra("torchrl"):
@@ -22,6 +23,7 @@ class TorchRLEnv(envs.EnvBase):
     transforms count. Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
+    @checked_arguments
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         check_training(world, stagger)
         rows, device = world.num_envs, world.device

@@ -16,6 +16,7 @@ from bidex_meta.data import other_formats, part_files, seals
 from bidex_meta.data.part_files import H5, Episode, Json
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.suite import V1, Rules
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.utils.validation import Finite, Positive, Seed, Text, Whole, parse
@@ -84,6 +85,7 @@ def data_folder() -> Path:
     return expanded(os.environ.get("BIDEX_DATA") or "data")
 
 
+@checked_arguments
 def dataset_names(folder: Path | None = None) -> list[str]:
     """Names of the complete data sets in a folder (``data_folder()``), such as ``CatchUnderarm/random-v0``."""
     folder = data_folder() if folder is None else folder
@@ -91,6 +93,7 @@ def dataset_names(folder: Path | None = None) -> list[str]:
     return sorted(path.parent.parent.relative_to(folder).as_posix() for path in complete)
 
 
+@checked_arguments
 def open_dataset(name_or_path: str | Path) -> "Dataset":
     """A data set by name in ``data_folder()``, or by folder; BidexError where it is missing, incomplete or damaged."""
     named = expanded(name_or_path)

@@ -4,14 +4,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Whole
 
+
+@checked_arguments
 @dataclass(frozen=True)
 class Capacity:
     """Room per world, or the most of it in use."""
 
-    contacts: int  # candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each
-    convex: int  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
-    rows: int  # constraint rows, a hard limit for each world
+    contacts: Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each
+    convex: Whole  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
+    rows: Whole  # constraint rows, a hard limit for each world
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:

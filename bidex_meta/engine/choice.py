@@ -20,7 +20,7 @@ def choose_engine(
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)
-    place, engine = _device(device), known_name("engine", engine, ENGINES)
+    place, engine = checked_device(device), known_name("engine", engine, ENGINES)
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
@@ -30,7 +30,8 @@ def choose_engine(
     return place, lambda models, rows, room: CpuEngine(models, rows, threads)
 
 
-def _device(device: str | torch.device) -> torch.device:
+def checked_device(device: str | torch.device) -> torch.device:
+    """The device of a name, ``auto`` resolved; BidexError where this machine has none such."""
     if isinstance(device, str) and device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:

@@ -8,14 +8,14 @@ end; Meta-World's ``metalearning_evaluation`` takes the first episodes that fini
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.gains import Gains, paired_gains
 from bidex_meta.evaluation.play import DEFAULT, check_world, play_tasks, quota
@@ -23,6 +23,7 @@ from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world.contract import TaskWorld
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
@@ -68,6 +69,7 @@ class MetaEvaluation:
         }  # fmt: skip
 
 
+@checked_arguments
 def meta_evaluate(
     agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
     episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
@@ -177,7 +179,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
     limit = world.max_episode_steps.clamp(max=max_steps)
     running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
     for step in range(1, int(limit[playing].max()) + 1):
-        action, outputs = agent.adapt_action(obs)
+        action, outputs = checked_outputs(agent, agent.adapt_action(obs))
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)
         valid = running & ~info["unstable"]
@@ -190,6 +192,16 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         if not bool(running.any()):
             break
     return int(steps)
+
+
+def checked_outputs(agent: object, given: object) -> tuple[Any, dict[str, Any]]:
+    """Actions and the policy's other outputs, as ``adapt_action`` returned them; BidexError without the dict."""
+    if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], dict):
+        raise BidexError(
+            f"{type(agent).__name__}.adapt_action: expected actions and a dict of the policy's other outputs, got "
+            f"{shortened(given)}. Return (actions, {{}})."
+        )
+    return given
 
 
 def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int) -> None:

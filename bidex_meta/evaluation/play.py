@@ -21,13 +21,16 @@ from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.suite import HELD_STEPS
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import check_precision
+from bidex_meta.utils.validation import Seed
 from bidex_meta.world.contract import TaskWorld
 
 DEFAULT = Protocol()
 _SECONDS = 15.0  # from one sign of life of ``Watched`` to the next
 
 
+@checked_arguments
 def evaluate(
     agent: Agent, world: TaskWorld, episodes_per_task: int | None = None, *, seed: int | None = None,
     protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None
@@ -138,6 +141,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
 class ZeroAgent:
     """Does nothing: action 0 everywhere. Spaces are the world's batched one, ``(num_envs, action)``."""
 
+    @checked_arguments
     def __init__(self, action_space: Box):
         self._shape = action_space.shape
 
@@ -152,7 +156,8 @@ class ZeroAgent:
 class RandomAgent:
     """Uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
 
-    def __init__(self, action_space: Box, seed: int = 0):
+    @checked_arguments
+    def __init__(self, action_space: Box, seed: Seed = 0):
         self._low = torch.as_tensor(action_space.low)
         self._range = torch.as_tensor(action_space.high) - self._low
         self._generator = torch.Generator().manual_seed(seed)

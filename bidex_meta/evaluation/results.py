@@ -8,6 +8,7 @@ import numpy as np
 from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
 from bidex_meta.runs.atomic import Json
+from bidex_meta.utils.arguments import checked_arguments
 
 MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
 
@@ -116,6 +117,7 @@ def results_by_class(
     return classes
 
 
+@checked_arguments
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
     """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval."""
     differences = {}

@@ -3,7 +3,9 @@
 import math
 from dataclasses import dataclass
 
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import quaternion_from_rpy, quaternion_product
+from bidex_meta.utils.validation import Finite
 
 MOUNT_QUATERNION = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 """Orientation (w, x, y, z) of the mount for an unrotated actor: fingers to world -y, palm up, thumb to -x."""
@@ -25,6 +27,7 @@ PALM_DOWN_BACK = (math.pi, 0.0, 0.0)
 """Pose G: fingers to +y, palm down; faces a hand in pose F."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class HandPose:
     """Start pose of one hand: the mount's origin in the world, metres, and roll, pitch, yaw of the actor, radians.
@@ -32,8 +35,8 @@ class HandPose:
     R = Rz(yaw) Ry(pitch) Rx(roll), before the mount's own turn.
     """
 
-    position: tuple[float, float, float]
-    rpy: tuple[float, float, float]
+    position: tuple[Finite, Finite, Finite]
+    rpy: tuple[Finite, Finite, Finite]
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:

@@ -14,7 +14,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
-from bidex_meta.errors import BidexError
+from bidex_meta.engine.choice import checked_device
+from bidex_meta.engine.health import dense
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.evaluation.meta_test import checked_outputs
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import real_numbers, true_or_false
 from bidex_meta.world.contract import Info, Options, PooledWorld
 
 MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
@@ -28,12 +33,15 @@ class ForMetaWorld:
     numbers the task of each environment from 0 on, None: each has its own.
     """
 
+    @checked_arguments
     def __init__(
         self, agent: Agent, device: str | torch.device = "cpu", task_of_row: Sequence[int] | np.ndarray | None = None
     ):
         self._agent = cast(MetaLearningAgent, agent)
-        self._device = torch.device(device)
-        self._task_of_row = None if task_of_row is None else self._tensor(np.asarray(task_of_row, np.int64))
+        self._device = checked_device(device)
+        self._task_of_row = (
+            None if task_of_row is None else self._tensor(real_numbers("task_of_row", task_of_row, 1).astype(np.int64))
+        )
         self._begins = True
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
@@ -42,8 +50,11 @@ class ForMetaWorld:
 
     def reset(self, env_mask: np.ndarray) -> None:
         """New episodes in the environments of a bool mask (num_envs,), which may be empty."""
-        if np.any(env_mask):
-            self._agent.reset(self._tensor(env_mask))
+        mask = self._tensor(env_mask)
+        if mask.dtype != torch.bool or mask.dim() != 1:
+            raise BidexError(f"env_mask: expected bool of shape (num_envs,), got {shortened(env_mask)}.")
+        if bool(mask.any()):
+            self._agent.reset(mask)
 
     def init(self) -> None:
         """Resets to what was meta-learned."""
@@ -58,7 +69,7 @@ class ForMetaWorld:
         if self._begins:  # Meta-World resets the environments here, and does not say so
             self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
             self._begins = False
-        action, outputs = self._agent.adapt_action(obs)
+        action, outputs = checked_outputs(self._agent, self._agent.adapt_action(obs))
         return _array(action), {k: _array(v) if isinstance(v, Tensor) else v for k, v in outputs.items()}
 
     def step(self, timestep: tuple) -> None:
@@ -75,8 +86,11 @@ class ForMetaWorld:
         self._begins = True
 
     def _tensor(self, value: np.ndarray) -> Tensor:
-        tensor = torch.from_numpy(value.copy())  # an environment may write into its array again
-        return tensor.to(self._device, torch.float32 if tensor.is_floating_point() else tensor.dtype)
+        tensor = dense(value, self._device)
+        if tensor is None:
+            raise BidexError(f"ForMetaWorld: expected an array of numbers, got {shortened(value)}.")
+        # A copy: an environment may write into its array again.
+        return tensor.to(torch.float32 if tensor.is_floating_point() else tensor.dtype, copy=True)
 
 
 class FromMetaWorld:
@@ -86,8 +100,9 @@ class FromMetaWorld:
     go on without reward and without an end.
     """
 
-    def __init__(self, agent: Any):
-        self._agent = agent
+    @checked_arguments
+    def __init__(self, agent: Agent):
+        self._agent: Any = agent
         self._begun: Tensor | None = None
         self._over: Tensor | None = None
 
@@ -109,7 +124,7 @@ class FromMetaWorld:
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
         """Exploring actions (num_envs, a), and the agent's other outputs unchanged."""
         self._begun = None
-        action, outputs = self._agent.adapt_action(_array(obs))
+        action, outputs = checked_outputs(self._agent, self._agent.adapt_action(_array(obs)))
         return torch.as_tensor(action, device=obs.device), outputs
 
     def step(self, timestep: Timestep) -> None:
@@ -134,6 +149,7 @@ class MetaWorldEnvs(VectorEnv):
     Raises BidexError unless its autoreset mode is DISABLED: episodes are started here, since success may end them.
     """
 
+    @checked_arguments
     def __init__(self, world: PooledWorld):
         if world.metadata["autoreset_mode"] != AutoresetMode.DISABLED:
             raise BidexError("Expected a world that does not reset by itself. Make it with autoreset_mode='DISABLED'.")
@@ -148,6 +164,7 @@ class MetaWorldEnvs(VectorEnv):
         self._returns = torch.zeros(self.num_envs, dtype=torch.float64, device=world.task_id.device)
         self._lengths = torch.zeros_like(world.task_id)
 
+    @checked_arguments
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode in every environment: observations (num_envs, d)."""
         obs, _ = self.world.reset(seed=seed)
@@ -162,7 +179,7 @@ class MetaWorldEnvs(VectorEnv):
         info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). Where success
         counts at the end of an episode there is none before its last step, and ``terminate_on_success`` shortens none.
         """
-        obs, reward, terminated, truncated, info = self.world.step(torch.as_tensor(np.asarray(actions)))
+        obs, reward, terminated, truncated, info = self.world.step(actions)  # type: ignore[arg-type]
         success = info["success"]
         if self.world.success_at_end:
             success = success & (terminated | truncated)
@@ -185,7 +202,7 @@ class MetaWorldEnvs(VectorEnv):
 
     def toggle_terminate_on_success(self, on: bool) -> None:
         """Whether an episode ends at its first success."""
-        self.terminate_on_success = bool(on)
+        self.terminate_on_success = true_or_false("on", on)
 
     def toggle_sample_tasks_on_reset(self, on: bool) -> None:
         """Environments keep their tasks until ``sample_tasks``: raises BidexError when switched on."""

@@ -13,6 +13,7 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
+from bidex_meta.utils.arguments import checked_arguments
 
 
 class MT1(Benchmark):
@@ -20,6 +21,7 @@ class MT1(Benchmark):
 
     ENV_NAMES: ClassVar[list[str]] = registry.names()
 
+    @checked_arguments
     def __init__(self, env_name: str, seed: int | None = None) -> None:
         super().__init__(_suite("MT1", "plain", {"train": [env_name]}), seed or 0)
 
@@ -29,6 +31,7 @@ class ML1(Benchmark):
 
     ENV_NAMES: ClassVar[list[str]] = registry.names()
 
+    @checked_arguments
     def __init__(self, env_name: str, seed: int | None = None) -> None:
         super().__init__(_suite("ML1", "masked", {"train": [env_name], "test": [env_name]}), seed or 0)
 
@@ -36,6 +39,7 @@ class ML1(Benchmark):
 class CustomMT(Benchmark):
     """Some classes with their goals visible, 50 tasks each."""
 
+    @checked_arguments
     def __init__(self, envs: Sequence[str], seed: int | None = None) -> None:
         super().__init__(_suite("CustomMT", "one-hot", {"train": envs}), seed or 0)
 
@@ -43,6 +47,7 @@ class CustomMT(Benchmark):
 class CustomML(Benchmark):
     """Other classes to train on than to be tested on (else BidexError), goals hidden, 50 tasks each."""
 
+    @checked_arguments
     def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:
         both = sorted(set(_named(train_envs)) & set(_named(test_envs)))
         if both:
@@ -51,6 +56,7 @@ class CustomML(Benchmark):
 
 
 class _Shipped(Benchmark):
+    @checked_arguments
     def __init__(self, seed: int | None = None) -> None:
         super().__init__(type(self).__name__, seed or 0)
 

@@ -18,14 +18,18 @@ from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
 from bidex_meta.suite import suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Count, Few, true_or_false
+from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import AnyTask, EnvRecipe
 
 Option = Any  # a keyword of Meta-World's functions; ``make_env`` and ``SuiteEnv`` have their types
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 
+@checked_arguments
 def make_mt_envs(
-    name: str, seed: int | None = None, num_tasks: int | None = None, **options: Option
+    name: str, seed: int | None = None, num_tasks: Few | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
     """Environments that show their goals and draw a task at each reset: one of a class, or one of each of a suite's.
 
@@ -36,16 +40,20 @@ def make_mt_envs(
     if _is_class(name):
         benchmark = MT1(name, seed)
         [(env_name, env_class)] = benchmark.train_classes.items()
-        one = {"num_tasks": num_tasks or 1, "env_id": 0 if options.get("use_one_hot") else None}
+        one = {
+            "num_tasks": num_tasks or 1,
+            "env_id": 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None,
+        }
         return make_env(env_class.recipe, _tasks(benchmark, "train", env_name), seed, **(one | options))
     return _multi_task(Benchmark(name, seed or 0), seed, num_tasks, **options)
 
 
+@checked_arguments
 def make_ml_envs(
     name: str,
     seed: int | None = None,
     meta_batch_size: int | None = None,
-    total_tasks_per_cls: int | None = None,
+    total_tasks_per_cls: Few | None = None,
     split: str = "train",
     **options: Option,
 ) -> VectorEnv:
@@ -63,6 +71,7 @@ make_ml_envs_train = partial(make_ml_envs, terminate_on_success=False, task_sele
 make_ml_envs_test = partial(make_ml_envs, terminate_on_success=True, task_select="pseudorandom", split="test")
 
 
+@checked_arguments
 def make_split(
     suite: str, split: str, task_seed: int, seed: int, env_name: str | None = None, **options: Option
 ) -> VectorEnv:
@@ -81,6 +90,7 @@ def make_split(
     return _meta(benchmark, seed, split=split, **(select | options))
 
 
+@checked_arguments
 def make_custom(
     seed: int | None = None,
     envs_list: Sequence[str] | None = None,
@@ -136,15 +146,16 @@ def _meta(
     return _make_vector(places, seed, **options)
 
 
+@checked_arguments
 def make_env(
     recipe: EnvRecipe,
     tasks: Sequence[AnyTask],
     seed: int | None = None,
-    max_episode_steps: int | None = None,
+    max_episode_steps: Count | None = None,
     terminate_on_success: bool = False,
     use_one_hot: bool = False,
     env_id: int | None = None,
-    num_tasks: int | None = None,
+    num_tasks: Few | None = None,
     recurrent_info_in_obs: bool = False,
     normalize_reward_in_recurrent_info: bool = True,
     task_select: Literal["random", "pseudorandom"] = "random",
@@ -186,6 +197,7 @@ def make_env(
     return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.name}_{env_id}")
 
 
+@checked_arguments
 def _make_vector(
     places: Sequence[tuple[EnvRecipe, list[Task]]],
     seed: int | None = None,
@@ -198,7 +210,7 @@ def _make_vector(
         partial(make_env, recipe, tasks, seed=None if seed is None else seed + i, **{"env_id": i, **options})
         for i, (recipe, tasks) in enumerate(places)
     ]
-    return make(makers, autoreset_mode=autoreset_mode)
+    return make(makers, autoreset_mode=checked_mode(autoreset_mode))
 
 
 def _split_tasks(tasks: Sequence[Task], envs: int) -> list[list[Task]]:

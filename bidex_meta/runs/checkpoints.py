@@ -17,7 +17,9 @@ from typing import IO, Any
 
 from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.runs.atomic import refuse_links, remove_leftovers, room_for, write_atomic
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, open_regular
+from bidex_meta.utils.validation import Whole
 
 State = dict[str, Any]  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
@@ -25,12 +27,13 @@ FORMAT = 2  # goes up when older code could not read a checkpoint; 1 had no dige
 _DEEPEST = 100
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Checkpoints:
     """The checkpoints of one run."""
 
     folder: Path  # created by the first ``save``
-    keep: int = 3  # how many ``step_<N>.pt`` stay: several, so that one damaged file does not end the run
+    keep: Whole = 3  # how many ``step_<N>.pt`` stay: several, so that one damaged file does not end the run
 
     @property
     def last(self) -> Path:
@@ -42,7 +45,8 @@ class Checkpoints:
         """The policy that did best in an evaluation while training; exists if there was one."""
         return self.folder / "best.pt"
 
-    def save(self, state: State, step: int) -> None:
+    @checked_arguments
+    def save(self, state: State, step: Whole) -> None:
         """Write ``step_<step>.pt`` and ``last.pt`` after ``step`` environment steps, then delete the oldest."""
         path = self.folder / f"step_{step}.pt"
         self._write(path, {"step": step, "state": state})
@@ -89,6 +93,7 @@ class Checkpoints:
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)
 
+    @checked_arguments
     def save_best(self, policy: State, step: int, found: dict[str, float]) -> None:
         """Write ``best.pt``: a policy alone (entry ``learner.policy`` of a checkpoint), and its results."""
         self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": found})
@@ -98,6 +103,7 @@ class Checkpoints:
         content = _read(self.best, "none is known") if exists(self.best) else None
         return None if content is None else content.get("found")
 
+    @checked_arguments
     def load_one(self, path: Path) -> tuple[State, int]:
         """A certain checkpoint as ``load`` gives it; raises BidexError where it is missing or cannot be read."""
         if not is_file(path):

@@ -28,8 +28,10 @@ from bidex_meta.runs.checkpoints import Checkpoints
 from bidex_meta.runs.metrics import last_rows, read_metrics
 from bidex_meta.runs.schemas import read_evaluation, read_versions
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
+from bidex_meta.utils.validation import Whole
 
 AnyConfig = RunConfig[Any]  # A run's config, its learner's settings in whichever form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
@@ -48,6 +50,7 @@ class _Part:
         return folder.path / self._name
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk, from ``create`` or ``open``."""
@@ -55,6 +58,7 @@ class RunFolder:
     path: Path
 
     @classmethod
+    @checked_arguments
     def create(
         cls, config: AnyConfig, path: Path | None = None, root: Path = Path("runs"), identity: Json | None = None
     ) -> "RunFolder":
@@ -77,7 +81,8 @@ class RunFolder:
         return folder
 
     @classmethod
-    def open(cls, path: Path) -> "RunFolder":
+    @checked_arguments
+    def open(cls, path: str | Path) -> "RunFolder":
         """An existing run; raises BidexError where there is no ``config.json``."""
         folder = cls(Path(path))
         if not is_file(folder.config_path):
@@ -133,12 +138,14 @@ class RunFolder:
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
         return read_evaluation(self.evaluation_path, self.again)
 
+    @checked_arguments
     def change_config(self, config: AnyConfig) -> None:
         """Replace ``config.json``, atomically, where it says something else."""
         if read_json(self.config_path, "a run's config") != config.to_json():
             write_json(self.config_path, config.to_json())
 
-    def finish(self, step: int | None) -> None:
+    @checked_arguments
+    def finish(self, step: Whole | None) -> None:
         """Clears away what a killed process left half done in a locked folder; ``step`` is the loaded checkpoint's."""
         remove_leftovers(self.path)
         if step is not None:

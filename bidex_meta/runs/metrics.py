@@ -7,11 +7,14 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json, write_atomic
 from bidex_meta.runs.writers import Writer, make_writer
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
+from bidex_meta.utils.validation import Whole
 
 _MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; a line an iteration is some kilobytes
 _TAIL = 65_536
@@ -23,14 +26,16 @@ class MetricsWriter:
     Of a resumed run, both lose what was logged after ``resume_step``, its checkpoint's: it is logged again.
     """
 
-    def __init__(self, folder: Path, resume_step: int | None = None, logger: str = "tensorboard"):
+    @checked_arguments
+    def __init__(self, folder: Path, resume_step: Whole | None = None, logger: str = "tensorboard"):
         path = folder / "metrics.jsonl"
         if resume_step is not None:
             _keep(path, [line for line, row in _lines(path) if row is not None and row["step"] <= resume_step])
         self._file = path.open("a")
         self.writer: Writer = make_writer(logger, folder, resume_step)
 
-    def log(self, metrics: Mapping[str, float], step: int) -> None:
+    @checked_arguments
+    def log(self, metrics: Mapping[str, Any], step: Whole) -> None:
         """Write one line, where a value that is not finite stands as null, and one point of the logger per value."""
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
@@ -48,6 +53,7 @@ class MetricsWriter:
         self.writer.close()
 
 
+@checked_arguments
 def read_metrics(path: Path) -> list[Json]:
     """The lines of a ``metrics.jsonl``, without those that cannot be read, such as a last one torn by a crash.
 
@@ -56,6 +62,7 @@ def read_metrics(path: Path) -> list[Json]:
     return [row for _, row in _lines(path, missing=False) if row is not None]
 
 
+@checked_arguments
 def last_rows(path: Path) -> list[Json]:
     """The last lines of a ``metrics.jsonl`` that can be read, without reading all of a long file; errors as there."""
     with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
@@ -64,6 +71,7 @@ def last_rows(path: Path) -> list[Json]:
     return [row for row in rows if row is not None]  # a first one that was cut in two cannot be read
 
 
+@checked_arguments
 def training_seconds(rows: Sequence[Json]) -> float:
     """Wall time of the training, over all resumes, by the lines of a ``metrics.jsonl``.
 
@@ -75,7 +83,8 @@ def training_seconds(rows: Sequence[Json]) -> float:
     return max(logged, default=sum(unlogged))
 
 
-def mend(path: Path, step: int) -> list[Json]:
+@checked_arguments
+def mend(path: Path, step: Whole) -> list[Json]:
     """The lines up to ``step`` of the run that goes on from there, whatever has become of its metrics.
 
     Where they are no file, or lines before the last cannot be read, all stay as ``metrics.jsonl.damaged``, which is

@@ -12,7 +12,9 @@ from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import MetricsWriter
 from bidex_meta.runs.progress import Progress
 from bidex_meta.runs.video import write_video
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
+from bidex_meta.utils.validation import Seconds, Whole
 
 
 class Recorder:
@@ -21,9 +23,10 @@ class Recorder:
     Steps and seconds in all are for the progress display; ``resume_step`` is of the checkpoint the run continues from.
     """
 
+    @checked_arguments
     def __init__(
-        self, folder: RunFolder, total_steps: int, total_seconds: float = math.inf, resume_step: int | None = None,
-        logger: str = "tensorboard"
+        self, folder: RunFolder, total_steps: Whole, total_seconds: Seconds = math.inf,
+        resume_step: Whole | None = None, logger: str = "tensorboard"
     ):  # fmt: skip
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)

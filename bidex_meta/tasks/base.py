@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import mujoco
 import torch
@@ -20,10 +20,15 @@ from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant
-from bidex_meta.utils.validation import true_or_false
+from bidex_meta.utils.validation import Count, Finite, NonNegative, Positive, Text, Whole, true_or_false
+
+CONTROL_RATE = 60
+"""Control steps per second of every class (docs/figures.md, control)."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Solver:
     """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md).
@@ -36,14 +41,25 @@ class Solver:
         most_condim: Dimensions of a contact at most: 4 with torsional friction (eggs and fingertips), 3 without.
     """
 
-    iterations: int = 10
-    line_search: int = 20
+    iterations: Count = 10
+    line_search: Count = 20
     integrator: mujoco.mjtIntegrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     cone: mujoco.mjtCone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    impratio: float = 10.0
-    time_step: float = 1.0 / 120.0
-    most_condim: int = 4
+    impratio: Positive = 10.0
+    time_step: Positive = 1.0 / 120.0
+    most_condim: Literal[1, 3, 4, 6] = 4
 
+    def __post_init__(self) -> None:
+        steps = 1.0 / (CONTROL_RATE * self.time_step)
+        if abs(steps - max(round(steps), 1)) > 1e-6:
+            raise BidexError(
+                f"Solver: time_step: expected a whole number of them to a control step of 1/{CONTROL_RATE} s, got "
+                f"{self.time_step}. Write 1 / 120, 1 / 180 or 1 / 240."
+            )
+
+
+Point = tuple[Finite, Finite, Finite]
+"""A place in the world, metres."""
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
 """For eggs, held for a second: what creeps by a millimetre a second does no harm."""
@@ -57,8 +73,6 @@ THIN = Solver(100, 50, time_step=1.0 / 240.0)
 """For fast bases that press things as thin as a finger on a table."""
 JITTER, JOINT_NOISE = 0.005, 0.1
 """Of jittered starts: half width of a fixture's shift, metres, and joint noise as a share of each joint's range."""
-CONTROL_RATE = 60
-"""Control steps per second of every class (docs/figures.md, control)."""
 
 
 class TaskClass(ABC):
@@ -93,18 +107,18 @@ class TaskClass(ABC):
             at ``camera_target`` from the front.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[Text]
     summary: ClassVar[str]
     formula: ClassVar[str]
     solved: ClassVar[str]
     deviations: ClassVar[tuple[str, ...]] = ()
-    episode_steps: int
+    episode_steps: Count
     wide_steps: ClassVar[int | None] = None
     right: ClassVar[HandPose]
     left: ClassVar[HandPose]
-    transition_scale: ClassVar[float]
-    orientation_scale: ClassVar[float]
-    start_draws: ClassVar[int]
+    transition_scale: ClassVar[NonNegative]
+    orientation_scale: ClassVar[NonNegative]
+    start_draws: ClassVar[Whole]
     variation_space: VariationSpace
     wide_space: VariationSpace | None = None
     wide_solved: ClassVar[str] = ""
@@ -116,10 +130,10 @@ class TaskClass(ABC):
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
     needs: Capacity = Capacity(71, 20, 134)
-    camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
-    camera_distance: ClassVar[float] = 1.15
-    camera_angle: ClassVar[tuple[float, float]] = (150.0, -35.0)
-    depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
+    camera_target: ClassVar[Point] = (0.0, -0.58, 0.5)
+    camera_distance: ClassVar[Positive] = 1.15
+    camera_angle: ClassVar[tuple[Finite, Finite]] = (150.0, -35.0)
+    depth_camera: ClassVar[tuple[Point, Point] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
         default = self.moves_by_default if moving_base is None else moving_base

@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
+from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Count, Finite, Text
 
 VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
 """Scales of joint and objects' angular velocities, and of forces and torques (docs/figures.md, observation)."""
@@ -16,6 +19,7 @@ _POSE = "position (m) and quaternion (x, y, z, w), world frame"
 _DIFFERENCE = "object times inverse goal quaternion, (x, y, z, w)"
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Block:
     """Consecutive entries of an observation.
@@ -27,19 +31,26 @@ class Block:
         description: One line for documentation, with unit and frame.
     """
 
-    name: str
-    size: int
-    sensors: tuple[str, ...] = ()
-    scale: float = 1.0
+    name: Text
+    size: Count
+    sensors: tuple[Text, ...] = ()
+    scale: Finite = 1.0
     goal: bool = False
     description: str = ""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Layout:
     """An observation: its blocks in order."""
 
     blocks: tuple[Block, ...]
+
+    def __post_init__(self) -> None:
+        names = [block.name for block in self.blocks]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise BidexError(f"Layout: expected each block once, got two of the name {twice!r}. Rename one.")
 
     @property
     def size(self) -> int:
@@ -53,10 +64,11 @@ class Layout:
             yield block, slice(start, start + block.size)
             start += block.size
 
+    @checked_arguments
     def range(self, name: str) -> slice:
-        """Index range of the named block; KeyError if there is none."""
+        """Index range of the named block; BidexError if there is none."""
         if name not in self._ranges:
-            raise KeyError(f"No block {name!r}; there are {', '.join(self._ranges)}")
+            raise unknown_name("block", name, self._ranges)
         return self._ranges[name]
 
     @cached_property
@@ -94,7 +106,8 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
     return (*blocks, last)
 
 
-def object_blocks(sensors: str, name: str | None = None) -> tuple[Block, ...]:
+@checked_arguments
+def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
     """Pose and velocities of a free object (13 entries), ``<name>_...``, read from the sensors ``<sensors>/...``."""
     name, spin = name or sensors, f"{sensors}/angular_velocity"
     return (
@@ -104,7 +117,8 @@ def object_blocks(sensors: str, name: str | None = None) -> tuple[Block, ...]:
     )
 
 
-def goal_blocks(name: str) -> tuple[Block, ...]:
+@checked_arguments
+def goal_blocks(name: Text) -> tuple[Block, ...]:
     """Goal pose and the rotation from goal to object (11 entries), zeroed in meta suites."""
     return (
         Block(f"{name}_pose", 7, goal=True, description=_POSE),
@@ -112,7 +126,8 @@ def goal_blocks(name: str) -> tuple[Block, ...]:
     )
 
 
-def point_block(name: str, sensor: str, description: str) -> Block:
+@checked_arguments
+def point_block(name: Text, sensor: Text, description: str) -> Block:
     """A point that moves with an object: its position (3 entries), read from one sensor."""
     return Block(name, 3, (sensor,), description=f"{description}, world frame, m")
 
@@ -123,6 +138,7 @@ def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
     return point_block(first, f"{sensors}/{first}", right), point_block(second, f"{sensors}/{second}", left)
 
 
+@cache
 def both_hands(moving: bool) -> tuple[Block, ...]:
     """Table 7: 398 entries with moving bases, 374 with fixed ones."""
     return tuple(block for side in SIDES for block in hand_blocks(side, moving))

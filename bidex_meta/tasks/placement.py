@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant, multiply, wxyz, xyzw
+from bidex_meta.utils.validation import NonNegative, Text
 
 SHIFT, TURN = 0.03, 0.2617993877991494
 """Half widths of a task's shift along x and y, metres, and turn, radians: 15 degrees (docs/figures.md, decisions)."""
@@ -19,7 +21,8 @@ DRAWS = 3
 """Uniform numbers that an episode draws for an object that it jitters: x, y, turn."""
 
 
-def placed(name: str, shift: float = SHIFT, turn: float = TURN) -> VariationSpace:
+@checked_arguments
+def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> VariationSpace:
     """An object's shift and turn as components ``<name>_x``, ``<name>_y`` (metres) and ``<name>_yaw`` (radians)."""
     half = (shift, shift, turn)
     return VariationSpace((f"{name}_x", f"{name}_y", f"{name}_yaw"), tuple(-h for h in half), half)

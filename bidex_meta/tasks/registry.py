@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.suite import V2
+from bidex_meta.utils.arguments import check_attributes
 from bidex_meta.utils.plugins import is_outside, outside_class
 
 if TYPE_CHECKING:
@@ -98,4 +99,5 @@ def _outside(name: str) -> "type[TaskClass]":
     missing = [*sorted(found.__abstractmethods__), *(x for x in TaskClass.__annotations__ if not hasattr(found, x))]
     if missing:
         raise BidexError(f"task {name}: expected the class to have {', '.join(missing)}. See docs/own-task.md.")
+    check_attributes(found, TaskClass, f"task {name}")
     return found

@@ -11,19 +11,22 @@ from bidex_meta.hands.hand import FIXTURE, OBJECT, SIDES, add_hands, damp_bases,
 from bidex_meta.hands.looks import dress
 from bidex_meta.tasks.state import unknown_sensor
 from bidex_meta.utils import paths
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import quaternion_from_rpy
+from bidex_meta.utils.validation import Finite, Fraction, NonNegative, Text
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
-Point = tuple[float, float, float]
-Colour = tuple[float, float, float, float]
+Point = tuple[Finite, Finite, Finite]
+Colour = tuple[Fraction, Fraction, Fraction, Fraction]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
 """Gravity compensation with which an object falls by 9.81 m/s² where gravity, a millionth of that, points up."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class SceneObject:
     """An object of a scene: a free body, or a fixture whose place differs from task to task (a mocap body).
@@ -36,8 +39,8 @@ class SceneObject:
         colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
     """
 
-    name: str
-    asset: str
+    name: Text
+    asset: Text
     position: Point
     rpy: Point = (0.0, 0.0, 0.0)
     colour: Colour | None = None
@@ -77,7 +80,8 @@ class Table(NamedTuple):
     priority: int = 0
 
 
-def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: float = 1.0, priority: int = 0) -> None:
+@checked_arguments
+def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: NonNegative = 1.0, priority: int = 0) -> None:
     """Adds a fixed box, the table of a task; see ``Table``."""
     floor = scene.geom("floor")
     scene.worldbody.add_geom(

@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bidex_meta.errors import BidexError
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole
 
+
+@checked_arguments
 @dataclass(frozen=True)
 class VariationSpace:
     """The box from which a class's variations are drawn uniformly.
@@ -12,20 +17,30 @@ class VariationSpace:
     Component names, e.g. ``goal_x``, with their lower and upper ends; in metres, radians, or a draw in [-1, 1].
     """
 
-    names: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    names: tuple[Text, ...]
+    low: tuple[Finite, ...]
+    high: tuple[Finite, ...]
 
     def __post_init__(self) -> None:
         if not len(self.names) == len(self.low) == len(self.high):
-            raise ValueError(f"names, low and high need one length, got {self.names}, {self.low}, {self.high}")
+            raise BidexError(
+                f"Expected names, low and high of one length, got {self.names}, {self.low} and {self.high}."
+            )
+        if len(set(self.names)) < len(self.names):
+            raise BidexError(f"VariationSpace: expected each name once, got {', '.join(self.names)}. Rename one.")
+        for name, low, high in zip(self.names, self.low, self.high, strict=True):
+            if low > high:
+                raise BidexError(
+                    f"{name}: expected its lower end before its upper end, got {low} and {high}. Swap them."
+                )
 
     @property
     def size(self) -> int:
         """Number of components."""
         return len(self.names)
 
-    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    @checked_arguments
+    def sample(self, rng: np.random.Generator, n: Whole) -> np.ndarray:
         """N variations, uniform in the box. Shape (n, size), float64."""
         return rng.uniform(self.low, self.high, size=(n, self.size))
 
@@ -35,6 +50,7 @@ class VariationSpace:
         return vector.shape == (self.size,) and bool(np.all((vector >= self.low) & (vector <= self.high)))
 
 
+@checked_arguments
 def join(*parts: VariationSpace) -> VariationSpace:
     """One space of the components of several, in their order."""
     return VariationSpace(
@@ -42,17 +58,20 @@ def join(*parts: VariationSpace) -> VariationSpace:
     )
 
 
-def component(name: str, low: float, high: float) -> VariationSpace:
+@checked_arguments
+def component(name: Text, low: Finite, high: Finite) -> VariationSpace:
     """A space of one number."""
     return VariationSpace((name,), (low,), (high,))
 
 
-def box(prefix: str, centre: tuple[float, float, float], half: float) -> VariationSpace:
+@checked_arguments
+def box(prefix: Text, centre: tuple[Finite, Finite, Finite], half: NonNegative) -> VariationSpace:
     """A cube of positions around a centre: components ``<prefix>_x``, ``_y``, ``_z`` in metres."""
     names = tuple(f"{prefix}_{axis}" for axis in "xyz")
     return VariationSpace(names, tuple(c - half for c in centre), tuple(c + half for c in centre))
 
 
-def orientation(prefix: str) -> VariationSpace:
+@checked_arguments
+def orientation(prefix: Text) -> VariationSpace:
     """The two draws of a random orientation (docs/figures.md, start noise): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
     return VariationSpace((f"{prefix}_u0", f"{prefix}_u1"), (-1.0, -1.0), (1.0, 1.0))

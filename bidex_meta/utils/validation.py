@@ -37,6 +37,7 @@ Widths = Annotated[tuple[Width, ...], Meta(min_length=1, max_length=64)]
 Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
 Positive = Annotated[float, Meta(gt=0.0, le=_LARGE)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
+Seconds = Annotated[float, Meta(ge=0.0)]  # may be infinite
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
 BelowOne = Annotated[float, Meta(ge=0.0, lt=1.0)]
@@ -110,6 +111,23 @@ def true_or_false(name: str, value: object) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
     return bool(value)
+
+
+def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
+    """An argument as an array of float64 numbers, a copy, whatever type they had.
+
+    Raises BidexError where it is no array of real numbers of so many dimensions.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors of an accelerator
+        array = np.array(None)
+    if array.dtype.kind not in "fiu" or array.ndim != dimensions:
+        got = f"shape {array.shape}" if array.dtype.kind in "fiu" else shortened(value)
+        raise BidexError(
+            f"{name}: expected an array of numbers of {dimensions} dimension{'s' * (dimensions > 1)}, got {got}."
+        )
+    return array.astype(np.float64)
 
 
 @functools.cache

@@ -15,7 +15,8 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.utils.validation import true_or_false
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Text, true_or_false
 from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
@@ -271,16 +272,19 @@ class BatchedWorld(VectorEnv, ABC):
         """This world with NumPy arrays, as Gymnasium's vector wrappers expect."""
         return NumpyWorld(self, stagger)
 
+    @checked_arguments
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute for each environment: its own entry where there is one for each, else the world's value."""
         value = getattr(self, name)
         each = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         return tuple(value) if each else (value,) * self.num_envs
 
-    def set_attr(self, name: str, values: Any) -> None:
+    @checked_arguments
+    def set_attr(self, name: Text, values: Any) -> None:
         """Sets an attribute of the world."""
         setattr(self, name, values)
 
+    @checked_arguments
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls a method of the world (or reads an attribute) and returns the result for each environment."""
         value = getattr(self, name)

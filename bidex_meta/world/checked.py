@@ -1,6 +1,6 @@
 """What a world is given, checked before anything changes: arguments, actions, saved states, formulas of classes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import check_precision
@@ -52,7 +53,7 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
         raise BidexError(f"points: expected a PointsRule or None, got {shortened(points)}. Write PointsRule(768).")
 
 
-def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.device) -> Tensor:
+def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.device) -> Tensor:
     """Actions as a float32 tensor on the device, without a gradient; non-finite ones are left to :func:`clean`.
 
     Raises BidexError where they are not real numbers of this shape, or torch's default precision is not single.
@@ -65,6 +66,12 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.dev
     if tensor.shape != shape:
         raise BidexError(f"{wanted}, got {tuple(tensor.shape)}.")
     return tensor
+
+
+def one_row(action: Any) -> Any:
+    """The action (a,) of a single environment as a batch (1, a); what is no array of numbers stays as it is."""
+    given = dense(action, torch.device("cpu"))
+    return action if given is None else given[None]
 
 
 def clean(action: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,6 +163,34 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
         if key not in sizes:
             raise BidexError(f"{name}.observe: expected blocks of the layout ({', '.join(sizes)}), got {key!r}.")
         _check_shape(f"{name}.observe: {key!r}", value, sizes[key])
+
+
+def own_numbers(
+    task: TaskClass,
+    method: str,
+    values: Mapping[str, Tensor],
+    unstable: Callable[[], Tensor] | None = None,
+    rows: Tensor | slice = slice(None),
+) -> None:
+    """Raise BidexError where a method of the user's own class gave numbers that are not finite in sound environments.
+
+    ``values`` by name, each (n, ...), are of these ``rows`` of what ``unstable`` gives: broken physics, bool (num,).
+    Shipped classes are not looked at: their formulas are tested.
+    """
+    if type(task).__module__.startswith("bidex_meta."):
+        return
+    for name, value in values.items():
+        bad = ~value.isfinite().reshape(len(value), -1).all(dim=1)
+        if bool(bad.any()) and unstable is not None:
+            bad = bad & ~unstable()[rows]
+        if bool(bad.any()):
+            row = int(bad.nonzero()[0])
+            where = f"{type(task).__name__}.{method}: {name!r}"
+            raise BidexError(
+                f"{where}: expected finite numbers, got {shortened(value[row].tolist())} in a state whose physics is "
+                f"sound ({int(bad.sum())} of {len(bad)} environments). Look for a division by 0, a root or logarithm "
+                "of a negative number, or exp of a large one."
+            )
 
 
 def _named(where: str, given: object) -> dict[str, Tensor]:

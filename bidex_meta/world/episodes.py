@@ -13,7 +13,7 @@ from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.suite import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
-from bidex_meta.utils.validation import whole_number
+from bidex_meta.utils.validation import true_or_false, whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
 
 _MODES = {mode.name: mode for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)}
@@ -141,6 +141,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
     Other libraries sum rewards from the first step to the first end, so what is made for them begins at 0 by default.
     The world may be wrapped; one without ``stagger`` is left as it is.
     """
+    stagger = true_or_false("stagger", stagger)
     inner: Any = getattr(world, "unwrapped", world)
     if hasattr(inner, "stagger"):
         inner.stagger = stagger
@@ -178,3 +179,13 @@ def checked_seed(seed: object, mask: Tensor) -> int:
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")
     return number
+
+
+def check_single_reset(seed: object, options: object) -> None:
+    """Raise BidexError unless a single environment can be reset so: with a seed from 0 on or None, without options."""
+    if seed is not None:
+        whole_number("seed", seed, 0)
+    if options is not None and not isinstance(options, Mapping):
+        raise BidexError(f"Expected reset options as a dict, got {shortened(options)}. Leave options out.")
+    if options:
+        raise BidexError(f"Expected no reset options, got {', '.join(map(str, options))}. Leave options out.")

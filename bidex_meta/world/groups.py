@@ -2,9 +2,11 @@
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from bidex_meta.engine.capacity import room_for
@@ -13,23 +15,26 @@ from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import BelowOne, Text
 from bidex_meta.world.depth_sensor import DepthSensor, PointsRule
 
 _LARGEST = 1e6
 """Bound of a variation's numbers (metres, radians, draws): single precision keeps the square of a distance finite."""
 
 
+@checked_arguments
 @dataclass(frozen=True)
 class Slot:
     """A task class with its pool of tasks and its share of a world."""
 
-    name: str
+    name: Text
     """E.g. ``CatchUnderarm`` or ``CatchUnderarm/left``."""
     task_class: TaskClass
     tasks: np.ndarray
     """Variations, shape (n, variation_space.size), float64."""
-    reward_scale: float = 1.0
-    gamma: float | None = None
+    reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
+    gamma: BelowOne | None = None
     """Discount that learners shall take for it; None: their own."""
 
 

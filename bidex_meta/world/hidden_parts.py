@@ -5,7 +5,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world.part import judge
 from bidex_meta.world.world import World
 
@@ -13,6 +15,7 @@ from bidex_meta.world.world import World
 class HiddenParts:
     """The hidden parts of the tasks that a world plays: numbers of a variation (``TaskClass.hides``), in [-1, 1]."""
 
+    @checked_arguments
     def __init__(self, world: World) -> None:
         self._world = world
 
@@ -47,7 +50,12 @@ class HiddenParts:
 
     def rewards(self, values: Tensor) -> Tensor:
         """What the step just made would have paid had the tasks hidden other values (..., N, n): (..., N)."""
-        world, given = self._world, values.reshape(-1, *values.shape[-2:])
+        world = self._world
+        shape = (world.num_envs, world.hidden_size)
+        if not isinstance(values, Tensor) or values.shape[-2:] != shape:
+            got = tuple(values.shape) if isinstance(values, Tensor) else shortened(values)
+            raise BidexError(f"HiddenParts.rewards: expected values of shape (..., {shape[0]}, {shape[1]}), got {got}.")
+        given = values.reshape(-1, *shape)
         rewards = torch.zeros(given.shape[:2], device=world.device)
         for part in world.parts:
             sensors = part.group.engine.sensordata

@@ -76,6 +76,8 @@ class Part:
         self.engine_rows[group.rows] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
+        self.looks = self._engine.device.type == "cpu"
+        """Whether the numbers of the user's own classes are checked in every step; on a GPU that would stall it."""
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
@@ -163,7 +165,7 @@ class Part:
         sensors = self._engine.sensordata
         values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)
         if self._rule != "masked":
-            self._show_goals(values, states)
+            self._show_goals(values, states, rows)
         self._observer.choose_signs(values)
         if self._sights is not None:
             position, rotation = self._engine.body_poses()
@@ -172,9 +174,15 @@ class Part:
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
         return values.clamp_(-CLIP, CLIP)
 
-    def _show_goals(self, values: Tensor, states: list[tuple[Member, slice, TaskState]]) -> None:
+    def _show_goals(
+        self, values: Tensor, states: list[tuple[Member, slice, TaskState]], rows: Tensor | None = None
+    ) -> None:
         for member, where, state in states:
-            for name, block in member.scene.task.observe(state).items():
+            blocks = member.scene.task.observe(state)
+            if self.looks:
+                engine_rows = member.engine_rows if rows is None else rows[where]
+                checked.own_numbers(member.scene.task, "observe", blocks, self.unstable, engine_rows)
+            for name, block in blocks.items():
                 values[where, self._observer.layout.range(name)] = block.float()
 
     def goals(self, task_index: Tensor, width: int) -> Tensor:
@@ -186,6 +194,13 @@ class Part:
         self._show_goals(values, list(self.states(task_index)))
         self._observer.choose_signs(values)
         return values.clamp_(-CLIP, CLIP)
+
+    def check_formulas(self, task_index: Tensor) -> None:
+        """Raise BidexError where a class of the user's own gives numbers that are not finite in the present state."""
+        for member, _, state in self.states(task_index):
+            task = member.scene.task
+            checked.own_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
+            checked.own_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
         """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
@@ -201,6 +216,8 @@ class Part:
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
             task.begin(draws[where, : task.draws], self.frozen(i, task_index[where]), views)
+            if self.looks:
+                checked.own_numbers(task, "start", views)
         return qpos
 
 
@@ -254,6 +271,8 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
         broke = part.unstable()
         for member, where, state in states:
             rows, judged = member.world_rows, judge(member.scene.task, state)
+            if part.looks:
+                checked.own_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
             reward[rows], success[rows], failed[rows] = judged.reward, judged.success, judged.failed
             unstable[rows] = broke[where]
             found.append((rows, judged.terms))

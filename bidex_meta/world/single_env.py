@@ -17,8 +17,12 @@ from bidex_meta.errors import BidexError
 from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import Pixels, Whole, true_or_false, whole_number
+from bidex_meta.world.checked import one_row
 from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.depth_sensor import PointsRule
+from bidex_meta.world.episodes import check_single_reset
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
 from bidex_meta.world.world import World
@@ -96,13 +100,14 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     task_class: ClassVar[TaskClass]
     """What the class is: scene, variations, observation, reward, success."""
 
+    @checked_arguments
     def __init__(
         self,
         render_mode: str | None = None,
         camera_name: str | None = None,
-        camera_id: int | None = None,
-        width: int = 480,
-        height: int = 480,
+        camera_id: Whole | None = None,
+        width: Pixels = 480,
+        height: Pixels = 480,
         reward_function_version: str = "v2",
     ) -> None:
         if render_mode not in (None, "rgb_array"):
@@ -146,11 +151,13 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     def seed(self, seed: int) -> list[int]:
         """Starts the random numbers anew, as `reset(seed=...)` does: of starts, of the spaces and of wrappers."""
+        seed = whole_number("seed", seed, 0)
         super().reset(seed=seed)
         for space in (self.action_space, self.observation_space, self.goal_space):
             space.seed(seed)
         return [seed]
 
+    @checked_arguments
     def set_task(self, task: AnyTask) -> None:
         """Plays one of the benchmark's tasks of this class from the next reset on.
 
@@ -168,9 +175,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
         Raises BidexError where no task was set, and for options, of which there are none.
         """
+        check_single_reset(seed, options)
         super().reset(seed=seed)
-        if options:
-            raise BidexError(f"Expected no options, got {', '.join(options)}.")
         if self._given is not None:
             self._world.set_tasks({self.recipe.name: self._given.variation[None]})
             self._task, self._given = self._given, None
@@ -189,7 +195,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")
-        obs, reward, terminated, truncated, info = self._world.step(torch.as_tensor(np.asarray(action))[None])
+        obs, reward, terminated, truncated, info = self._world.step(one_row(action))
         ended = bool(terminated | truncated)
         success = bool(info["success"]) and (ended or not self._world.success_at_end)
         lost = bool(terminated) or (self.terminate_on_success and success)
@@ -200,7 +206,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     def toggle_terminate_on_success(self, on: bool) -> None:
         """Whether an episode ends at its first success; in version 2 there is none before the time limit."""
-        self.terminate_on_success = bool(on)
+        self.terminate_on_success = true_or_false("on", on)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A picture, shape (height, width, 3), uint8; None without a render mode."""
@@ -222,7 +228,7 @@ def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
 
 def _camera(name: str | None, number: int | None) -> str:
     names = list(CAMERAS)
-    chosen = name or names[0] if number is None else next(iter(names[number : number + 1]), None)
+    chosen = (names[0] if name is None else name) if number is None else next(iter(names[number : number + 1]), None)
     if chosen not in names:
         raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
     return chosen

@@ -7,12 +7,13 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
+from msgspec import Meta
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
@@ -20,6 +21,7 @@ from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
+from bidex_meta.utils.arguments import check_argument
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
@@ -90,6 +92,7 @@ class World(BatchedWorld):
         Raises BidexError for fewer environments than slots, unknown device, engine, mode or sampling, too narrow a
         padding.
         """
+        check_argument("slots", slots, Annotated[Sequence[Slot], Meta(min_length=1)])
         place, make_engine = choose_engine(device, engine, threads)
         checked.choices(task_sampling, observation, points)
         checked.seed(seed)
@@ -286,6 +289,15 @@ class World(BatchedWorld):
         obs = self._noisy(transition.obs, self.episodes.elapsed + 1)
         self._write_ids(obs)
         return transition._replace(obs=obs)
+
+    def check_formulas(self) -> None:
+        """Raise BidexError where a class of the user's own gives numbers that are not finite in the present state.
+
+        On the CPU every step and reset does so by itself. On a GPU, where looking would stall each step, a learner
+        asks when its loss is no longer finite.
+        """
+        for part in self.parts:
+            part.check_formulas(part.group.take(self.task_index))
 
     def step_engines(self, active: Tensor | None = None) -> None:
         """Physics alone: a control step of all environments, or those of a mask (num_envs,), under their controls."""

@@ -18,6 +18,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
 from bidex_meta.world.episodes import ended_info, set_stagger
 
@@ -27,6 +29,7 @@ _OF_THE_CONTRACT = ("so_far", "counted", "final_obs", "_final_obs", "episode", "
 class WorldWrapper(VectorWorld):
     """A ``VectorWorld`` that passes everything on to another one; attributes are read from it each time."""
 
+    @checked_arguments
     def __init__(self, world: VectorWorld) -> None:
         self.world = world
 
@@ -93,6 +96,7 @@ class NumpyWorld(VectorEnv):
     count them too short.
     """
 
+    @checked_arguments
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         set_stagger(world, stagger)
         self.world, self.num_envs = world, world.num_envs
@@ -111,7 +115,7 @@ class NumpyWorld(VectorEnv):
 
         Returns observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
         """
-        *flags, step_info = self.world.step(torch.as_tensor(actions, dtype=torch.float32, device=self.world.device))
+        *flags, step_info = self.world.step(checked.action(actions, self.world.action_space.shape, self.world.device))
         info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}
         ended = _arrays(step_info["_final_obs"])
         if ended.any():

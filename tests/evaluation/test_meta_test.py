@@ -12,6 +12,7 @@ from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.metaworld.adapters import FromMetaWorld
 from bidex_meta.worlds import Worlds
 from tests.fakes import ToyWorld
 from tests.points import Finder, PointWorld, Still, ring
@@ -279,3 +280,14 @@ def test_others_are_tasks_of_another_seed(suite):
     by_name = benchmark.make_world("others", 4, device="cpu", autoreset_mode="DISABLED", threads=1)
     assert np.array_equal(by_name.pools[0], others)
     assert len(set(benchmark.train_tasks) & set(benchmark.others.train_tasks)) == 0
+
+
+@pytest.mark.parametrize("returned", [torch.zeros(12, 2), (torch.zeros(12, 2),), (torch.zeros(12, 2), None), None])
+def test_exploring_actions_without_their_dict_are_refused_in_one_line(returned: object) -> None:
+    agent = Finder()
+    agent.adapt_action = lambda obs: returned  # type: ignore[method-assign]
+    calls = lambda: meta_evaluate(agent, world(), 1), lambda: FromMetaWorld(agent).adapt_action(torch.zeros(12, 3))
+    for call in calls:
+        with pytest.raises(BidexError, match=r"Finder\.adapt_action: expected actions and a dict") as raised:
+            call()
+        assert "\n" not in str(raised.value) and "Return (actions, {})" in str(raised.value)

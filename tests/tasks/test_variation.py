@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.tasks import registry
-from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.errors import BidexError
+from bidex_meta.tasks import registry, variation
+from bidex_meta.tasks.variation import VariationSpace, join
 from tests.tasks.wide import HIDDEN
 from tests.tasks.worlds import each_case, each_version
 
@@ -112,5 +113,12 @@ def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
 
 
 def test_a_lopsided_space_is_refused() -> None:
-    with pytest.raises(ValueError, match="one length"):
+    with pytest.raises(BidexError, match="one length"):
         VariationSpace(("a", "b"), (0.0,), (1.0, 1.0))
+
+
+def test_an_inverted_component_and_a_name_twice_are_refused() -> None:
+    with pytest.raises(BidexError, match=r"goal_x: expected its lower end before its upper end, got 0\.25 and 0\.1"):
+        variation.component("goal_x", 0.25, 0.1)
+    with pytest.raises(BidexError, match="each name once, got a, a"):
+        join(variation.component("a", 0, 1), variation.component("a", 0, 2))
