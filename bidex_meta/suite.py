@@ -3,9 +3,10 @@
 Names of task classes and of their variations are checked where the classes are known, in `bidex_meta.benchmark`.
 """
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
@@ -68,6 +69,19 @@ class Rules:
 
 
 V1, V2 = Rules(), Rules("v2", "wide", "at-end", "jittered")
+_VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
+
+
+def plain_name(name: str) -> str:
+    """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
+    found = _VERSIONED.match(name)
+    return name if found is None else found[1] + name[found.end() :]
+
+
+def versioned_name(name: str, rules: Rules) -> str:
+    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
+    task_class, dash, thing = plain_name(name).partition("-")
+    return f"{task_class}-v2{dash}{thing}" if rules == V2 else name
 
 
 _Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
@@ -171,6 +185,10 @@ class Suite:
     randomisation: Randomisation | None = None
     """Of training worlds."""
 
+    def __post_init__(self) -> None:
+        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
+        object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
+
     @property
     def splits(self) -> tuple[Split, ...]:
         """The splits that hold at least one class."""
@@ -179,6 +197,17 @@ class Suite:
     def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
         """The classes of one split, in file order."""
         return tuple(entry for entry in self.classes if split in entry.splits)
+
+
+def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
+    plain = plain_name(entry.class_name)
+    if plain == entry.class_name:
+        return entry
+    if suite.rules != V2:
+        rules = ", ".join(f'{name} = "{value}"' for name, value in vars(V2).items())
+        mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
+        raise _error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
+    return replace(entry, name=plain_name(entry.name), class_name=plain)
 
 
 def suite_names() -> list[str]:

@@ -20,7 +20,7 @@ from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, ident
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.tasks.registry import plain_name
+from bidex_meta.suite import plain_name
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of

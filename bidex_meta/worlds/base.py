@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_randomisation, load_suite, suite_names
+from bidex_meta.suite import (
+    METAWORLD_SUITES,
+    SPLITS,
+    Suite,
+    load_randomisation,
+    load_suite,
+    plain_name,
+    suite_names,
+)
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -85,7 +93,7 @@ class Worlds(ABC):
             return own.SingleClass(registry.resolve(task, "task"), config)
         suite = config.suite
         if not suite.endswith(".toml"):
-            if registry.plain_name(suite) in registry.names():
+            if plain_name(suite) in registry.names():
                 raise BidexError(f"{suite} is a class, not a suite: name it by task (--task {suite}).")
             suite = known_name("suite", suite, suites_to_run())
         return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
