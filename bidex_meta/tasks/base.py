@@ -81,7 +81,7 @@ class TaskClass(ABC):
         jittered_hands: Hands that jittered starts give joint noise, where ``start`` gives none.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
         rules: Those of the suite; ``adopt`` sets them.
-        chosen: Options that were given to the constructor by name; ``registry.get`` sets them.
+        chosen: Options of the constructor by name, given or by default; ``registry.get`` sets them.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
             class says (fixed for HandOver alone).

@@ -83,13 +83,13 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
         task_class = vars(importlib.import_module(module_of(plain)))[plain]
     else:
         raise unknown_name("task class", name, _MODULES)
-    known = list(inspect.signature(task_class).parameters)[1:]
+    known = dict(list(inspect.signature(task_class).parameters.items())[1:])
     for option in options:
         if option not in known:
             raise unknown_name(f"option of {name}", option, known)
     check_object(options.get("object"))
     made = task_class(moving_base, **options)
-    made.chosen = dict(options)
+    made.chosen = {option: parameter.default for option, parameter in known.items()} | options
     if name != plain:
         made.adopt(V2)
     return made
