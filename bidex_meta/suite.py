@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
 from bidex_meta.utils.files import absolute, expanded, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
@@ -208,6 +208,12 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
         mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
         raise _error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
     return replace(entry, name=plain_name(entry.name), class_name=plain)
+
+
+def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
+    """Return in words how other rules, by name, differ from some; empty where they are equal."""
+    pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
+    return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
 
 def suite_names() -> list[str]:

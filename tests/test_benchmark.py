@@ -191,6 +191,8 @@ def test_a_class_has_one_version(tmp_path: Path) -> None:
     with pytest.raises(BidexError, match="other than v2"):
         make_task_world("CatchUnderarm", object=str(tmp_path / "v2.xml"))
     assert registry.resolve("handover-V2") == "HandOver-v2"
+    assert registry.name_among("Switch-v2", Benchmark("MT20-v2").task_classes()) == "Switch"
+    assert registry.name_among("Switch-v2", Benchmark("MT20").task_classes()) == "Switch-v2"
     assert registry.name_among("CatchUnderarm-v2-mug", {"CatchUnderarm-mug": task_class}) == "CatchUnderarm-mug"
 
 

@@ -11,7 +11,7 @@ import tyro
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.parsing import JsonSwitch, parse
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.policies import load_policy, say_other_rules
 from bidex_meta.cli.tables import Json, plain_table, print_table, say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED, HeldAgent, RandomAgent, ZeroAgent, evaluate
@@ -158,6 +158,7 @@ def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, di
         folder = RunFolder.open(path)
         config = replace(WorldConfig.of(folder.config().to_json()), task_seed=flags.seed, threads=flags.threads)
         own = Worlds.open(config)
+        say_other_rules(folder, worlds)
         agent, _ = load_policy(folder, "cpu")
         for name, result in own.judge(agent, own.world(), 1, EVALUATION_SEED).classes.items():
             if rules.get(plain_name(name)) == own.task_classes()[name].rules:

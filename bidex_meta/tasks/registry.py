@@ -37,7 +37,8 @@ def module_of(name: str) -> str:
 def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
     """A class's name among those of a suite: ``Switch-v2`` on its own is ``Switch`` in a suite of version 2."""
     plain = plain_name(name)
-    return plain if name not in classes and plain in classes and classes[plain].rules == V2 else name
+    written = list(classes)
+    return plain if name not in written and plain in written and classes[plain].rules == V2 else name
 
 
 def resolve(name: str, kind: str = "task class") -> str:

@@ -11,6 +11,7 @@ from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import (
     METAWORLD_SUITES,
     SPLITS,
+    Rules,
     Suite,
     load_randomisation,
     load_suite,
@@ -113,6 +114,11 @@ class Worlds(ABC):
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
         """The classes of its train split by name; BidexError where they are of another library."""
+
+    @property
+    def rules(self) -> Rules | None:
+        """The rules of all its classes; None where they are of another library."""
+        return None
 
     @property
     def splits(self) -> list[str]:
