@@ -4,9 +4,10 @@ The four properties and `Task` are Meta-World's, so that code written against it
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -18,12 +19,16 @@ from bidex_meta.suite import (
     OTHER_SEED,
     OTHERS,
     SPLITS,
+    V2,
     ListedTask,
     Randomisation,
+    Rules,
     Split,
     Suite,
     SuiteClass,
     load_suite,
+    plain_name,
+    versioned_name,
 )
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
@@ -38,13 +43,14 @@ from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
 TaskSampling = Literal["uniform", "fixed"]
 
 _NUMBERS = np.dtype("<f8")
+Entry = TypeVar("Entry")
 
 
 class Task(NamedTuple):
     """One task class with one variation. `data` holds plain numbers: nothing is run to read it."""
 
     env_name: str
-    """Name of the task class, a key of `train_classes` or `test_classes`."""
+    """Name of the task class, a key of `train_classes` or `test_classes`; in suites of version 2 `CatchUnderarm-v2`."""
     data: bytes
     """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
 
@@ -67,6 +73,40 @@ class Task(NamedTuple):
             ) from None
 
 
+class ByClass(dict[str, Entry]):
+    """Entries by classes' names; in a suite of version 2 `CatchUnderarm` and `CatchUnderarm-v2` are the same key."""
+
+    def __init__(self, entries: Mapping[str, Entry], rules: Rules) -> None:
+        super().__init__(entries)
+        self._rules = rules
+
+    def _key(self, name: object) -> str:
+        if self._rules == V2 and isinstance(name, str):
+            for known in self:
+                if plain_name(known) == plain_name(name):
+                    return known
+        raise KeyError(name)
+
+    def __missing__(self, name: str) -> Entry:
+        return self[self._key(name)]
+
+    def __contains__(self, name: object) -> bool:
+        try:
+            return super().__contains__(name) or bool(self._key(name))
+        except KeyError:
+            return False
+
+    def __or__(self, other: Any) -> Any:
+        return ByClass({**self, **other}, self._rules)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return the entry of a name, or the default where there is none."""
+        try:
+            return self[name]
+        except KeyError:
+            return default
+
+
 class Benchmark:
     """A suite with its task classes, its tasks and the worlds made of them.
 
@@ -87,12 +127,13 @@ class Benchmark:
     def __init__(self, name_or_path: str | Path | Suite, seed: int = 0) -> None:
         self.suite = name_or_path if isinstance(name_or_path, Suite) else load_suite(name_or_path)
         self.seed = whole_number("seed", seed, 0)
-        self._classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
+        classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
+        self._classes = ByClass(classes, self.suite.rules)
         self._tasks = {
-            split: [task for entry in self.suite.split_classes(split) for task in self._draw(entry, split)]
+            split: {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
             for split in SPLITS
         }
-        overlap = set(self._tasks["train"]) & set(self._tasks["test"])
+        overlap = set(self.train_tasks) & set(self.test_tasks)
         if overlap:
             raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
         actions = {name: task_class.action_size for name, task_class in self._classes.items()}
@@ -112,28 +153,42 @@ class Benchmark:
 
     @property
     def train_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the train split by name, in the order of the suite file."""
+        """Environment classes of the train split by their tasks' `env_name`, in the order of the suite file.
+
+        Classes of version 2 are also found by their name without `-v2`.
+        """
         return self._env_classes("train")
 
     @property
     def test_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the test split by name; empty in a multi-task suite."""
+        """Environment classes of the test split, as `train_classes`; empty in a multi-task suite."""
         return self._env_classes("test")
 
     @checked_arguments
     def task_classes(self, split: Split = "train") -> dict[str, TaskClass]:
         """What the classes of a split are (scene, observation, reward), by name."""
-        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
+        classes = {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
+        return ByClass(classes, self.suite.rules)
 
     @property
     def train_tasks(self) -> list[Task]:
         """Tasks of the train split, class after class."""
-        return list(self._tasks["train"])
+        return list(chain.from_iterable(self._tasks["train"].values()))
 
     @property
     def test_tasks(self) -> list[Task]:
         """Tasks of the test split, class after class; empty in a multi-task suite."""
-        return list(self._tasks["test"])
+        return list(chain.from_iterable(self._tasks["test"].values()))
+
+    def tasks_of(self, name: str, split: str = "train") -> list[Task]:
+        """Tasks of a class in a split; in version 2 the name may end in `-v2` or not.
+
+        Raises BidexError for a class that the split does not have.
+        """
+        tasks = ByClass(self._tasks[self._checked_split(split)], self.suite.rules)
+        if name not in tasks:
+            raise unknown_name(f"class of {self.name}", name, tasks)
+        return list(tasks[name])
 
     @property
     def others(self) -> "Benchmark":
@@ -214,16 +269,18 @@ class Benchmark:
             variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.split == split]
         else:
             variations = _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0)
-        return [Task.from_variation(entry.name, variation) for variation in variations]
+        env_name = versioned_name(entry.name, self.suite.rules)
+        return [Task.from_variation(env_name, variation) for variation in variations]
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        points, classes = (self.suite.points, self.suite.point_kinds), {}
+        points, classes = (self.suite.points, self.suite.point_kinds), dict[str, type[SuiteEnv]]()
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
-            recipe = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, self.suite.rules, points)
-            classes[entry.name] = recipe.make_class()
-        return classes
+            own = entry.reward_scale, entry.class_name, self.suite.rules, points, bool(entry.tasks)
+            recipe = EnvRecipe(entry.name, *look, *own)
+            classes[recipe.env_name] = recipe.make_class()
+        return ByClass(classes, self.suite.rules)
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
@@ -236,7 +293,7 @@ class Benchmark:
         slots = []
         for entry in self.suite.split_classes(split):
             task_class = self._classes[entry.name]
-            variations = [task.variation for task in self._tasks[split] if task.env_name == entry.name]
+            variations = [task.variation for task in self._tasks[split][entry.name]]
             if self.suite.task_id == "class":
                 slots.append(Slot(entry.name, task_class, np.stack(variations), entry.reward_scale, entry.gamma))
                 continue

@@ -5,16 +5,17 @@ Names of task classes and of their variations are checked where the classes are 
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
@@ -74,6 +75,19 @@ class Rules:
 
 
 V1, V2 = Rules(), Rules("v2", "wide", "at-end", "jittered")
+_VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
+
+
+def plain_name(name: str) -> str:
+    """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
+    found = _VERSIONED.match(name)
+    return name if found is None else found[1] + name[found.end() :]
+
+
+def versioned_name(name: str, rules: Rules) -> str:
+    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
+    task_class, dash, thing = plain_name(name).partition("-")
+    return f"{task_class}-v2{dash}{thing}" if rules == V2 else name
 
 
 _Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
@@ -180,6 +194,10 @@ class Suite:
     randomisation: Randomisation | None = None
     """Of training worlds."""
 
+    def __post_init__(self) -> None:
+        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
+        object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
+
     @property
     def digest(self) -> str:
         """Twelve hexadecimal digits of all that decides tasks, rewards and observations, whatever the file's version.
@@ -212,6 +230,23 @@ def _chosen(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_chosen(each) for each in value]
     return portable(str(value)) if isinstance(value, Path | str) else value
+
+
+def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
+    plain = plain_name(entry.class_name)
+    if plain == entry.class_name:
+        return entry
+    if suite.rules != V2:
+        rules = ", ".join(f'{name} = "{value}"' for name, value in vars(V2).items())
+        mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
+        raise _error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
+    return replace(entry, name=plain_name(entry.name), class_name=plain)
+
+
+def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
+    """Return in words how other rules, by name, differ from some; empty where they are equal."""
+    pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
+    return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
 
 def suite_names() -> list[str]:

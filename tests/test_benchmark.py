@@ -3,6 +3,7 @@ import multiprocessing
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +18,8 @@ import bidex_meta.benchmark
 from bidex_meta.benchmark import Benchmark, Task, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import CustomML
-from bidex_meta.suite import V1, suite_names
+from bidex_meta.suite import V1, V2, suite_names
+from bidex_meta.tasks import registry
 
 MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
 
@@ -140,6 +142,58 @@ def test_each_rule_of_version_2_works_alone(rule: str, tmp_path: Path) -> None:
     assert torch.equal(reward, paid) == (rule == "success") == (gain == got)
     assert (paid.max() < 1.0) == (rule == "reward")
     assert info["so_far"]["success"].all() and told["so_far"]["success"].any() == (rule != "success")
+
+
+VERSION_2 = {'reward = "paper"\n': "".join(f'{name} = "{value}"\n' for name, value in RULES.items())}
+
+
+@pytest.mark.parametrize("name", ["PushBlock-v2", "Switch-V2", "CatchUnderarm-v2"])
+def test_a_class_with_a_version_is_refused_among_other_rules(name: str, tmp_path: Path) -> None:
+    """It would mix version 2's length and variation with the suite's reward and success."""
+    mixed = [{}, *({'reward = "paper"\n': f'reward = "paper"\n{rule} = "{RULES[rule]}"\n'} for rule in [*RULES][1:])]
+    mixed.append({'reward = "paper"': 'reward = "v2"'})
+    for rules in mixed:
+        with pytest.raises(BidexError, match=f"own.toml: classes: .* got {name}") as error:
+            Benchmark(own_suite(tmp_path, **{'"HandOver"': f'"{name}"'}, **rules))
+        assert f'Write name = "{name[:-3]}"' in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(BidexError, match="Write name"):
+        suite = Benchmark("MT1").suite
+        replace(suite, classes=tuple(replace(entry, class_name=name) for entry in suite.classes))
+
+
+def test_a_class_with_a_version_means_itself_in_a_suite_of_version_2(tmp_path: Path) -> None:
+    found = []
+    for name in ("CatchUnderarm", "CatchUnderarm-v2"):
+        suite = Benchmark(own_suite(tmp_path, **{'"HandOver"': f'"{name}"\nobjects = ["egg", "mug"]'}, **VERSION_2))
+        found.append(suite)
+        world = suite.make_world(num_envs=2, device="cpu", threads=1)
+        assert world.task_names == ["CatchUnderarm-egg", "CatchUnderarm-mug"] == list(suite.task_classes())
+        assert list(suite.train_classes) == ["CatchUnderarm-v2-egg", "CatchUnderarm-v2-mug"]
+        for task in suite.train_tasks:
+            classes = suite.train_classes
+            assert classes[task.env_name] is classes[task.env_name.replace("-v2", "")]
+            classes[task.env_name]().set_task(task)
+        assert suite.tasks_of("CatchUnderarm-egg") == suite.tasks_of("CatchUnderarm-v2-egg") == suite.train_tasks[:3]
+    assert found[0].suite == found[1].suite and found[0].train_tasks == found[1].train_tasks
+    with pytest.raises(BidexError, match="each name once"):
+        twice = {'"HandOver"': '"HandOver"\n[[classes]]\nname = "HandOver-v2"'}
+        Benchmark(own_suite(tmp_path, **twice, **VERSION_2))
+    with pytest.raises(BidexError, match="Unknown class of MT4 'HandOver-v2'"):
+        Benchmark("MT4").tasks_of("HandOver-v2")
+
+
+def test_a_class_has_one_version(tmp_path: Path) -> None:
+    task_class = registry.get("Switch-v2", True)
+    task_class.adopt(V2)
+    for rules in (V1, replace(V2, reward="paper")):
+        with pytest.raises(BidexError, match="one version"):
+            task_class.adopt(rules)
+    with pytest.raises(BidexError, match="other than v2"):
+        make_task_world("CatchUnderarm", object=str(tmp_path / "v2.xml"))
+    assert registry.resolve("handover-V2") == "HandOver-v2"
+    assert registry.name_among("Switch-v2", Benchmark("MT20-v2").task_classes()) == "Switch"
+    assert registry.name_among("Switch-v2", Benchmark("MT20").task_classes()) == "Switch-v2"
+    assert registry.name_among("CatchUnderarm-v2-mug", {"CatchUnderarm-mug": task_class}) == "CatchUnderarm-mug"
 
 
 def test_tasks_depend_on_seed_class_and_split_only(tmp_path: Path) -> None:

@@ -85,6 +85,11 @@ def test_rules_that_it_lacks_are_refused_and_others_work(rule: str, working_fold
     assert rule.split()[-1] in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_it_has_a_version_as_other_classes_have() -> None:
+    with pytest.raises(BidexError, match='got "v2", which the class does not have'):
+        make_task_world(f"{NAME}-v2", 2, device="cpu", threads=1)
+
+
 def test_an_object_of_its_own_lies_beside_the_file() -> None:
     world = make_task_world("with_own_object:SlideBlock", 2, device="cpu", threads=1)
     assert world.reset(seed=0)[0].shape == (2, 422)

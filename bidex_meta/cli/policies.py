@@ -11,11 +11,13 @@ from bidex_meta.agents import Agent
 from bidex_meta.cli.conditions import note
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.parsing import LookFlags
-from bidex_meta.cli.tables import Json
+from bidex_meta.cli.tables import Json, say
 from bidex_meta.engine.choice import checked_device
 from bidex_meta.errors import BidexError, known_name, one_line
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
+from bidex_meta.suite import rules_apart
+from bidex_meta.tasks.registry import name_among
 from bidex_meta.train.distributed import LostProcess
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import is_file
@@ -134,8 +136,18 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     worlds = Worlds.open(config)
     slots, classes = slots_of(worlds), worlds.task_classes()  # which refuses what is not of ours
-    task = (flags.task and name_with_object(flags.task, flags.object)) or slots[0]
+    if flags.actor not in ("zero", "random"):
+        say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
+    task = name_among(name_with_object(flags.task, flags.object), classes) if flags.task else slots[0]
     return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)
+
+
+def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
+    """Say in one line how the rules that a run's policy has learned by differ from those of some worlds, if they do."""
+    with contextlib.suppress(BidexError):  # the suite's file of the run may be gone
+        learned = Worlds.open(folder.config().to_json())
+        if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
+            say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")
 
 
 def slots_of(worlds: Worlds) -> list[str]:

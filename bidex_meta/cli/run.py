@@ -16,7 +16,7 @@ from typing import Any
 from bidex_meta.cli import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.cli.conditions import conditions
 from bidex_meta.cli.evaluate import judged, judged_on_others
-from bidex_meta.cli.policies import checkpoint, fitting
+from bidex_meta.cli.policies import checkpoint, fitting, say_other_rules
 from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.cli.tables import Json, print_table, say
 from bidex_meta.config import RunConfig, printed
@@ -153,9 +153,9 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
     if plan.kind.make.offline:
-        learner.learn_from(join(run_data.announced(config.dataset, "Reading"), world))
+        learner.learn_from(join(run_data.announced(config.dataset, "Reading", plan.source), world))
     if config.demonstrations:
-        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:")
+        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:", plan.source)
         learner.learn_from_demonstrations(join(demonstrations, world, every=False))
     if config.teacher:
         learner.learn_from_teachers(run_teachers.teachers_of(config, plan.source, world))
@@ -165,6 +165,7 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
         with fitting(start.path):
             learner.start_from(state["learner"]["policy"])
         say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
+        say_other_rules(start, plan.source)
     return learner
 
 

@@ -1,18 +1,18 @@
 """Data sets of ``bidex-meta run``: what it learns from (--dataset) or imitates (--demonstrations), and metadata."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 import gymnasium
 
 from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.cli.tables import Json
+from bidex_meta.cli.tables import Json, say
 from bidex_meta.clients.gymnasium_ids import task_id
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.suite import V1
+from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.files import absolute, expanded
@@ -137,9 +137,13 @@ def _check_goals(dataset: Dataset, source: Worlds) -> None:
         raise BidexError(f"{dataset.name} has point clouds, where {source.name} hides goals. Record without --points.")
 
 
-def announced(names: Sequence[str], what: str) -> list[Dataset]:
-    """The data sets, after a line of what they are for."""
+def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
+    """Open data sets, after a line of what they are for and one for each that was recorded by other rules."""
     datasets = open_datasets(names)
     steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
     print(f"{what} {steps:,} transitions of {episodes:,} episodes.", file=sys.stderr, flush=True)
+    for dataset in datasets:
+        recorded = dataset.metadata.get("rules")
+        if isinstance(recorded, Mapping) and source.rules and (apart := rules_apart(recorded, source.rules)):
+            say(f"Note: {dataset.name} was recorded by other rules than those of {source.name}: {apart}.")
     return datasets

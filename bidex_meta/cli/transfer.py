@@ -8,6 +8,7 @@ import numpy as np
 
 from bidex_meta.cli.conditions import note
 from bidex_meta.cli.parsing import RunPath, parse
+from bidex_meta.cli.policies import say_other_rules
 from bidex_meta.cli.run_config import plan_run
 from bidex_meta.cli.sweep import choose_cores, state_of, work
 from bidex_meta.cli.tables import NONE, Json, plain_table, print_table, say
@@ -70,6 +71,8 @@ def main(arguments: Sequence[str]) -> None:
         note(RunFolder.open(run))
     config = RunFolder.open(flags.run).config()
     worlds = Worlds.open(config.to_json())
+    for path in flags.start_from:
+        say_other_rules(RunFolder.open(path), worlds)
     classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
     words = shared_words(flags.num_envs, arguments[at + 1 :])
     planned = plan_run([f"--suite={config.suite}", *words]).config  # refuses what follows -- before anything is written

@@ -20,8 +20,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.transfer_measures import NOTHING
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
-from bidex_meta.suite import V1, Suite, SuiteClass
-from bidex_meta.tasks.registry import plain_name
+from bidex_meta.suite import V1, Suite, SuiteClass, plain_name
 from bidex_meta.utils.files import absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted
@@ -90,7 +89,7 @@ def suite_file(worlds: Any, name: str, folder: Path) -> Path:
     """
     suite: Suite = worlds.suite
     names = worlds.benchmark.task_classes("test")[name].variation_space.names
-    tasks = [task.variation.tolist() for task in worlds.benchmark.test_tasks if task.env_name == name]
+    tasks = [task.variation.tolist() for task in worlds.benchmark.tasks_of(name, "test")]
     listed = [{"name": str(i), "fixed": dict(zip(names, task, strict=True))} for i, task in enumerate(tasks)]
     entries = [_entry(each, "train" if each.name == name else "test") for each in suite.classes]
     for entry, each in zip(entries, suite.classes, strict=True):

@@ -11,7 +11,7 @@ import tyro
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.parsing import JsonSwitch, parse
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.policies import load_policy, say_other_rules
 from bidex_meta.cli.tables import Json, plain_table, print_table, say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
@@ -20,7 +20,7 @@ from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, ident
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.tasks.registry import plain_name
+from bidex_meta.suite import plain_name
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
@@ -159,6 +159,7 @@ def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, di
         folder = RunFolder.open(path)
         config = replace(WorldConfig.of(folder.config().to_json()), task_seed=flags.seed, threads=flags.threads)
         own = Worlds.open(config)
+        say_other_rules(folder, worlds)
         agent, _ = load_policy(folder, "cpu")
         for name, result in own.judge(agent, own.world(), own.protocol("train", 1)).classes.items():
             if rules.get(plain_name(name)) == own.task_classes()[name].rules:

@@ -7,7 +7,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Suite, load_suite, suite_names
+from bidex_meta.suite import Suite, load_suite, plain_name, suite_names
 from bidex_meta.tasks import registry
 
 NAMESPACE = "bidex-meta"
@@ -23,7 +23,7 @@ def suite_ids(suite: Suite) -> dict[str, str]:
 
 def task_id(task_name: str) -> str:
     """The Gymnasium id of a task class: `"bidex-meta/CatchUnderarm-v1"`, or `-v2` of `CatchUnderarm-v2`."""
-    return f"{NAMESPACE}/{task_name}" + ("" if task_name != registry.plain_name(task_name) else "-v1")
+    return f"{NAMESPACE}/{task_name}" + ("" if task_name != plain_name(task_name) else "-v1")
 
 
 def register_ids() -> None:

@@ -1,8 +1,8 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
 As there, `MT1` and `ML1` are of any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
-`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`. Hands move, as in every suite; `seed` chooses the tasks,
-None: 0.
+`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. Hands move, as in every suite;
+`seed` chooses the tasks, None: 0.
 """
 
 from collections.abc import Sequence
@@ -11,15 +11,17 @@ from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass
+from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass, plain_name, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.utils.arguments import checked_arguments
+
+_ENV_NAMES = [versioned_name(name, rules) for rules in (V1, V2) for name in registry.names()]
 
 
 class MT1(Benchmark):
     """One class with its goal visible, 50 tasks."""
 
-    ENV_NAMES: ClassVar[list[str]] = registry.names()
+    ENV_NAMES: ClassVar[list[str]] = _ENV_NAMES
 
     @checked_arguments
     def __init__(self, env_name: str, seed: int | None = None) -> None:
@@ -29,7 +31,7 @@ class MT1(Benchmark):
 class ML1(Benchmark):
     """One class with its goal hidden: 50 tasks to train on, 50 others to be tested on."""
 
-    ENV_NAMES: ClassVar[list[str]] = registry.names()
+    ENV_NAMES: ClassVar[list[str]] = _ENV_NAMES
 
     @checked_arguments
     def __init__(self, env_name: str, seed: int | None = None) -> None:
@@ -83,13 +85,13 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         splits |= {entry: (*splits.get(entry, ()), split) for entry in _named(given)}
     if not all(classes.values()):
         raise BidexError(f"{name}: expected at least one class in each list, got an empty one.")
-    second = {entry != registry.plain_name(entry) for entry in splits}
-    if len(second) > 1:
+    versions = {entry != plain_name(entry) for entry in splits}
+    if len(versions) > 1:
         raise BidexError(f"{name}: expected classes of one version, got {', '.join(splits)}.")
-    (second,) = second
-    splits = {registry.plain_name(entry): where for entry, where in splits.items()}
+    (second,) = versions
+    splits = {plain_name(entry): where for entry, where in splits.items()}
     return Suite(
-        name=name,
+        name=f"{name}-v2" if second else name,
         version=1 + second,
         kind="meta" if "test" in classes else "multi-task",
         description=", ".join(splits),

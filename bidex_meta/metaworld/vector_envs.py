@@ -16,7 +16,7 @@ from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
-from bidex_meta.suite import suite_names
+from bidex_meta.suite import V1, load_suite, plain_name, suite_names, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Few, true_or_false
@@ -44,7 +44,7 @@ def make_mt_envs(
             "num_tasks": num_tasks or 1,
             "env_id": 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None,
         }
-        return make_env(env_class.recipe, _tasks(benchmark, "train", env_name), seed, **(one | options))
+        return make_env(env_class.recipe, benchmark.tasks_of(env_name), seed, **(one | options))
     return _multi_task(Benchmark(name, seed or 0), seed, num_tasks, **options)
 
 
@@ -78,16 +78,32 @@ def make_split(
     """The environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
     `task_seed` chooses the tasks, `seed` the starts and the task draws. For the ids of ML1 `env_name` replaces the
-    suite, as in Meta-World; with another suite it raises BidexError. Options are those of `make_mt_envs` or
-    `make_ml_envs`.
+    suite by this class in the id's version, as in Meta-World; with another suite it raises BidexError. Options are
+    those of `make_mt_envs` or `make_ml_envs`.
     """
-    if env_name is not None and suite != "ML1":
-        raise BidexError(f"env_name goes with the ids of ML1, got it with {suite}. For one class: make_mt_envs(name).")
-    benchmark = ML1(env_name, task_seed) if env_name is not None else Benchmark(suite, task_seed)
+    benchmark = Benchmark(suite, task_seed) if env_name is None else _of_one_class(suite, env_name, task_seed)
     if benchmark.suite.kind == "multi-task":
         return _multi_task(benchmark, seed, **options)
     select = {"task_select": "pseudorandom", "terminate_on_success": split == "test"}
     return _meta(benchmark, seed, split=split, **(select | options))
+
+
+def _of_one_class(suite: str, env_name: str, seed: int) -> Benchmark:
+    """Make the benchmark that `env_name` asks for: ML1 of a class in the version of the suite.
+
+    Raises BidexError for another suite than ML1, and for a class's name of another version.
+    """
+    rules = load_suite(suite).rules
+    given = registry.resolve(env_name)
+    named = versioned_name(given, rules)
+    if suite not in ("ML1", "ML1-v2"):
+        make = "make_ml_envs" if load_suite(suite).kind == "meta" else "make_mt_envs"
+        raise BidexError(f"env_name goes with the ids of ML1, got it with {suite}. For one class: {make}({named!r}).")
+    if rules == V1 and given != plain_name(given):
+        raise BidexError(
+            f"env_name: expected a class of version 1 for this id, got {env_name!r}. Take ML1's id that ends in -v2."
+        )
+    return ML1(named, seed)
 
 
 @checked_arguments
@@ -117,7 +133,7 @@ def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = 
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
         raise BidexError(f"meta_batch_size and total_tasks_per_cls are of meta suites; {benchmark.name} is none.")
     classes = benchmark.train_classes
-    places = [(env_class.recipe, _tasks(benchmark, "train", name)) for name, env_class in classes.items()]
+    places = [(env_class.recipe, benchmark.tasks_of(name)) for name, env_class in classes.items()]
     return _make_vector(places, seed, num_tasks=num_tasks or len(places), **options)
 
 
@@ -141,7 +157,7 @@ def _meta(
     places = [
         (env_class.recipe, share)
         for name, env_class in classes.items()
-        for share in _split_tasks(_tasks(benchmark, split, name)[:total_tasks_per_cls], size // len(classes))
+        for share in _split_tasks(benchmark.tasks_of(name, split)[:total_tasks_per_cls], size // len(classes))
     ]
     return _make_vector(places, seed, **options)
 
@@ -194,7 +210,7 @@ def make_env(
     env = gymnasium.wrappers.RecordEpisodeStatistics(env)
     random = task_select == "random"
     select: Any = wrappers.RandomTaskSelectWrapper if random else wrappers.PseudoRandomTaskSelectWrapper
-    return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.name}_{env_id}")
+    return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.env_name}_{env_id}")
 
 
 @checked_arguments
@@ -224,14 +240,10 @@ def _split_tasks(tasks: Sequence[Task], envs: int) -> list[list[Task]]:
     return [list(tasks[i::envs]) for i in range(envs)]
 
 
-def _tasks(benchmark: Benchmark, split: str, name: str) -> list[Task]:
-    tasks = benchmark.train_tasks if split == "train" else benchmark.test_tasks
-    return [task for task in tasks if task.env_name == name]
-
-
 def _is_class(name: str) -> bool:
     """Whether it names a class; raises BidexError where it names no suite either."""
     folded = {known.casefold() for known in registry.names()}
-    if registry.plain_name(name).casefold() not in folded and not name.endswith(".toml"):
+    is_class = plain_name(name).casefold() in folded
+    if not is_class and not name.endswith(".toml"):
         known_name("class or suite", name, [*registry.names(), *suite_names()])
-    return registry.plain_name(name).casefold() in folded
+    return is_class

@@ -1,8 +1,9 @@
 """What a task class is: one scene, one variation space, one reward formula, one success test."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import mujoco
@@ -94,6 +95,8 @@ class TaskClass(ABC):
         wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
         jittered_hands: Hands that jittered starts give joint noise, where ``start`` gives none.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
+        rules: Those of the suite; ``adopt`` sets them.
+        chosen: Options of the constructor by name, given or by default; ``registry.get`` sets them.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
             class says (fixed for HandOver alone).
@@ -126,6 +129,7 @@ class TaskClass(ABC):
     jittered_hands: ClassVar[tuple[str, ...]] = ()
     jittered_fixtures: ClassVar[tuple[str, ...]] = ()
     rules: Rules = V1
+    chosen: Mapping[str, float | str] = MappingProxyType({})
     blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
@@ -140,7 +144,16 @@ class TaskClass(ABC):
         self.moving_base = true_or_false("moving_base", default)
 
     def adopt(self, rules: Rules) -> None:
-        """Takes a suite's rules; BidexError for wide variation, or the reward of version 2, of a class without."""
+        """Take a suite's rules, once.
+
+        Raises BidexError for wide variation or the reward of version 2 of a class that has none, and for a class that
+        has other rules already.
+        """
+        if self.rules not in (V1, rules):
+            raise BidexError(
+                f"{self.name}: expected one version, got a class that has other rules already. Leave -v2 out of its "
+                "name; the suite's rules say the version."
+            )
         self.rules = rules
         if rules.reward == "v2" and type(self).errors is TaskClass.errors:
             raise BidexError(f'{self.name}: expected reward = "paper", got "v2", which the class does not have.')

@@ -3,10 +3,11 @@
 import importlib
 import inspect
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
-from bidex_meta.suite import V2
+from bidex_meta.suite import V2, plain_name, versioned_name
 from bidex_meta.utils.arguments import check_attributes
 from bidex_meta.utils.plugins import is_outside, outside_class
 
@@ -22,7 +23,6 @@ _MODULES = {
     "ReOrientation": "cubes", "OpenPenCap": "articulated", "Switch": "articulated", "StackBlock": "cubes",
     "PourWater": "bucket", "GraspAndPlace": "bucket",
 }  # fmt: skip
-_V2 = "-v2"
 
 
 def names() -> list[str]:
@@ -35,34 +35,38 @@ def module_of(name: str) -> str:
     return f"bidex_meta.tasks.{_MODULES[name]}"
 
 
-def plain_name(name: str) -> str:
-    """A class's name without the ``-v2`` that gives it the rules of version 2."""
-    return name.removesuffix(_V2)
-
-
 def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
     """A class's name among those of a suite: ``Switch-v2`` on its own is ``Switch`` in a suite of version 2."""
     plain = plain_name(name)
-    return plain if name not in classes and plain in classes and classes[plain].rules == V2 else name
+    written = list(classes)
+    return plain if name not in written and plain in written and classes[plain].rules == V2 else name
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """The name by which ``get`` knows a class, given in any case; ``package.module:Class`` stays as it is.
+    """Return the name by which ``get`` knows a class, given in any case; ``package.module:Class`` keeps its case.
 
     A name may end in ``-v2``.
 
     Raises BidexError where there is no such class; the message calls it a ``kind``.
     """
-    if not is_outside(name):
-        version = _V2 if str(name).lower().endswith(_V2) else ""
-        return known_name(kind, str(name)[: len(str(name)) - len(version)], names()) + version
-    _outside(name)
-    return name
+    plain = plain_name(str(name))
+    has_version = plain != str(name)
+    if is_outside(name):
+        _outside(plain)
+    else:
+        plain = known_name(kind, plain, names())
+    return versioned_name(plain, V2) if has_version else plain
 
 
 def with_object(name: str | None) -> dict[str, str]:
     """The option of ``get`` that chooses an object; none for None."""
     return {} if name is None else {"object": name}
+
+
+def check_object(name: object) -> None:
+    """Raise BidexError for an object called ``v2``: with it a class's name would be that of version 2."""
+    if isinstance(name, str) and Path(name).stem.casefold() == "v2":
+        raise BidexError(f"object: expected a name other than v2, which stands for a version, got {name!r}. Rename it.")
 
 
 def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
@@ -74,18 +78,21 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
 
     Raises BidexError where there is no such class or option; the message gives the nearest name and the list.
     """
+    plain = plain_name(name)
     if is_outside(name):
-        task_class = _outside(name)
-    elif (plain := plain_name(name)) in _MODULES:
+        task_class = _outside(plain)
+    elif plain in _MODULES:
         task_class = vars(importlib.import_module(module_of(plain)))[plain]
     else:
         raise unknown_name("task class", name, _MODULES)
-    known = list(inspect.signature(task_class).parameters)[1:]
+    known = dict(list(inspect.signature(task_class).parameters.items())[1:])
     for option in options:
         if option not in known:
             raise unknown_name(f"option of {name}", option, known)
+    check_object(options.get("object"))
     made = task_class(moving_base, **options)
-    if name.endswith(_V2):
+    made.chosen = {option: parameter.default for option, parameter in known.items()} | options
+    if name != plain:
         made.adopt(V2)
     return made
 

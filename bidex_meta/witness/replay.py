@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
-from bidex_meta.tasks.registry import plain_name
+from bidex_meta.suite import plain_name
 from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
@@ -42,8 +42,7 @@ def task_slot(name: str) -> Slot:
     classes = benchmark.task_classes()
     if plain not in classes:
         raise unknown_name("task", name, classes)
-    task = next(t for t in benchmark.train_tasks if t.env_name == plain)
-    return Slot(name, classes[plain], task.variation[None])
+    return Slot(name, classes[plain], benchmark.tasks_of(plain)[0].variation[None])
 
 
 class Simulator:

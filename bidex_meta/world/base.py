@@ -93,6 +93,7 @@ class BatchedWorld(VectorEnv, ABC):
         self.stagger = true_or_false("stagger", stagger)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.task_names, self.gammas = list(slots.names), tuple(slots.gammas)
+        self._slots = slots
         self.num_tasks = len(self.task_names)
         self.slot_rows = split_rows(self.num_envs, self.num_tasks)
         counts = [rows.stop - rows.start for rows in self.slot_rows]
@@ -242,15 +243,27 @@ class BatchedWorld(VectorEnv, ABC):
 
     def state_dict(self) -> State:
         """Tensors and plain values, copied, from which the world continues bit for bit."""
-        state = {"seed": self.seed, "episodes": self.episodes.state_dict()}
+        state = {"made": self._made(), "seed": self.seed, "episodes": self.episodes.state_dict()}
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
+    def _made(self) -> dict[str, str]:
+        """Return what decides the world's future beside its state, as texts by name.
+
+        A state is loaded into a world with the same. Devices, engines, threads and pictures are left out, since a run
+        may continue with others, and modes, since what was begun in training may be played to its end in evaluation.
+        """
+        made = {"slots": ", ".join(self.task_names)}
+        for name, steps, scale in zip(*self._slots[:3], strict=True):
+            made |= {f"time limit of {name}": str(steps), f"reward scale of {name}": str(scale)}
+        return made
+
     def _upgraded(self, state: State) -> State:
-        """A state of version 0.2, which has no ``held``, as one of now."""
+        """A state of before version 0.3, which has no ``held`` or ``made``, as one of now."""
         episodes = state.get("episodes") if isinstance(state, Mapping) else None
-        if not isinstance(episodes, Mapping) or "held" in episodes:
+        if not isinstance(episodes, Mapping):
             return state
-        return {**state, "episodes": {**episodes, "held": torch.zeros(self.num_envs, dtype=torch.int64)}}
+        held = {"held": torch.zeros(self.num_envs, dtype=torch.int64)}
+        return {"made": self._made(), **state, "episodes": held | dict(episodes)}
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:

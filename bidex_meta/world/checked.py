@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
-from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.errors import BidexError, one_line, shortened, unknown_name
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
@@ -24,6 +24,8 @@ _LARGEST_SEED = 2**128
 _LEAST = {"episodes/number": -1}
 """Of whole numbers in a state; the number of an environment's episode before its first is -1."""
 _AGAIN = "build the world with the same suite, split and num_envs."
+_TOLD, _LONGEST = 5, 100
+"""Differences that a message names, and the most letters of one."""
 _ROWS = 11
 """Rows that formulas are tried with: as many as no sensor and no block has numbers."""
 
@@ -103,14 +105,16 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
 
 
 def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
-    """Raises BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
+    """Raise BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
 
-    ``inside``: where in a larger state both stand.
+    The entry ``made`` of a world's state must be equal. ``inside``: where in a larger state both stand.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
         where = inside or "it"
         raise BidexError(f"Expected the state of a world with {sorted(own)} in {where}, got {shortened(got)}; {_AGAIN}")
+    if "made" in own:
+        _check_made(given["made"], own["made"])
     for name, value in own.items():
         if isinstance(value, Mapping):
             fits(given[name], value, f"{inside}{name}/")
@@ -121,6 +125,25 @@ def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
             raise BidexError(f"Expected {inside}{name} of a world's state as {got}; {_AGAIN}")
     if "seed" in own:
         seed(given["seed"])
+
+
+def _check_made(given: Any, own: Mapping[str, str]) -> None:
+    """Raise BidexError, naming the differences, where a state's world was made otherwise."""
+    there = given if isinstance(given, Mapping) else {}
+    told: dict[str, str] = {}
+    count = 0
+    for name in dict.fromkeys((*own, *map(str, there))):
+        value = there.get(name, "none")
+        if isinstance(value, str) and value == own.get(name, "none"):
+            continue
+        count += 1
+        kind = name.partition(" of ")[0]  # one slot is an example of all
+        told.setdefault(kind, one_line(f"{name} {value}, here {own.get(name, 'none')}")[:_LONGEST])
+    if count:
+        differences = "; ".join(list(told.values())[:_TOLD])
+        raise BidexError(
+            f"Expected the state of a world that was made alike, got {count} differences: {differences}; {_AGAIN}"
+        )
 
 
 def _check_tensor(name: str, given: object, own: Tensor) -> None:

@@ -14,7 +14,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, Rules
+from bidex_meta.suite import V1, Rules, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.utils.arguments import checked_arguments
@@ -62,6 +62,13 @@ class EnvRecipe:
     """Those of the suite."""
     points: tuple[int, bool] = (0, False)
     """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
+    listed: bool = False
+    """Whether the suite's file lists the tasks, which may then lie outside of the class's variation space."""
+
+    @property
+    def env_name(self) -> str:
+        """The name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
+        return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
         """The environment's class: the same object for equal recipes."""
@@ -91,7 +98,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     `success` is 0.0 before the last step. An episode is a success if any of its steps has `success` 1.0.
 
     `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
-    `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the paper's:
+    `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the suite's:
     `reward_function_version="v2"`, Meta-World's default, stands for it. Raises BidexError for another of these.
     """
 
@@ -114,7 +121,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
         if reward_function_version != "v2":
             raise BidexError(
-                f"reward_function_version: expected 'v2', which stands for the paper's reward, the only one here; got "
+                "reward_function_version: expected 'v2', which stands for the suite's reward, the only one here; got "
                 f"{reward_function_version!r}."
             )
         self.render_mode = render_mode
@@ -141,8 +148,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @property
     def task_name(self) -> str:
-        """The task class's name."""
-        return self.recipe.name
+        """The task class's name with its version, as the class's tasks have it."""
+        return self.recipe.env_name
 
     @property
     def max_path_length(self) -> int:
@@ -161,13 +168,22 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     def set_task(self, task: AnyTask) -> None:
         """Plays one of the benchmark's tasks of this class from the next reset on.
 
-        Raises BidexError for a task of another class, or with a variation of another size.
+        Raises BidexError for a task of another class or version, or with a variation of another size or range.
         """
-        if task.env_name != self.recipe.name:
-            raise BidexError(f"Expected a task of {self.recipe.name}, got one of {task.env_name}.")
-        size = self.task_class.variation_space.size
-        if task.variation.shape != (size,):
-            raise BidexError(f"Expected a task of {size} numbers, got {task.variation.shape}.")
+        name = self.recipe.env_name
+        if task.env_name != name:
+            raise BidexError(
+                f"Expected a task of {name}, got one of {task.env_name}. Take tasks and classes of one benchmark."
+            )
+        space, variation = self.task_class.variation_space, task.variation
+        if variation.shape != (space.size,):
+            raise BidexError(f"Expected a task of {space.size} numbers, got {variation.shape}.")
+        if not self.recipe.listed and not space.contains(variation):
+            outside = next(i for i in range(space.size) if not space.low[i] <= variation[i] <= space.high[i])
+            raise BidexError(
+                f"Expected a task of {name} with {space.names[outside]} from {space.low[outside]:g} to "
+                f"{space.high[outside]:g}, got {variation[outside]:g}. Take tasks and classes of one benchmark."
+            )
         self._given = task
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
@@ -223,7 +239,7 @@ def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
     task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
     task_class.adopt(recipe.rules)
     text = f"{task_class.summary}."
-    return _Remade(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
+    return _Remade(recipe.env_name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
 
 
 def _camera(name: str | None, number: int | None) -> str:

@@ -7,6 +7,7 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -39,6 +40,7 @@ from bidex_meta.world.threads import keep_freed_memory
 
 _DEFAULT_SIZES = {"cpu": 1024, "cuda": 8192}
 _MOST_COLUMNS = 1_000_000
+_NOTHING = vars(Randomisation())
 _STATE = ("_action", "_past", "_obs", "task_index")
 """What a step changes beside the episodes' counters."""
 
@@ -114,11 +116,12 @@ class World(BatchedWorld):
         self.success_at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
-        self.points, self.hides_goals = points, observation == "masked"
+        self.points, self.hides_goals, self._observation = points, observation == "masked", observation
         self._describe_observations(observation, pad_to, points, groups)
         width = self.observation_size
         self.parts = [Part(g, self.slots, observation, width, self.num_envs, self._sights) for g in groups]
         self._masked = groups[0].engine.masked
+        self._randomisation = randomisation
         self._randomiser = None if randomisation is None else self._randomised(randomisation)
         remembered = self._randomiser.remembered if self._randomiser else 0
         self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
@@ -318,8 +321,21 @@ class World(BatchedWorld):
             }
         )
 
+    def _made(self) -> dict[str, str]:
+        made = super()._made()
+        made |= {"observation": self._observation, "points": str(self.points)}
+        drawn = vars(self._randomisation or Randomisation())
+        made |= {f"randomised {name}": str(value) for name, value in drawn.items() if value != _NOTHING[name]}
+        for slot in self.slots:
+            task = slot.task_class
+            made |= {f"class of {slot.name}": f"{type(task).__module__}:{type(task).__qualname__}"}
+            made |= {f"moving base of {slot.name}": str(task.moving_base)}
+            made |= {f"{rule} of {slot.name}": str(value) for rule, value in vars(task.rules).items()}
+            made |= {f"{option} of {slot.name}": _option(value) for option, value in task.chosen.items()}
+        return made
+
     def load_state_dict(self, state: State) -> None:
-        """As in ``BatchedWorld``, on a world of the same suite and size."""
+        """As in ``BatchedWorld``; raises BidexError for the state of a world that was made otherwise."""
         state = self._upgraded(state)
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
@@ -354,3 +370,8 @@ class World(BatchedWorld):
     def close_extras(self, **kwargs: Any) -> None:
         """Frees what pictures were drawn with."""
         self._painter.close()
+
+
+def _option(value: float | str) -> str:
+    """Return an option of a class as text; of an object's file the name, since a run may continue elsewhere."""
+    return Path(value).stem if isinstance(value, str) else str(value)

@@ -9,7 +9,17 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
+from bidex_meta.suite import (
+    METAWORLD_SUITES,
+    OTHER_SEED,
+    SPLITS,
+    Rules,
+    Suite,
+    load_randomisation,
+    load_suite,
+    plain_name,
+    suite_names,
+)
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -86,7 +96,7 @@ class Worlds(ABC):
             return own.SingleClass(registry.resolve(task, "task"), config)
         suite = config.suite
         if not suite.endswith(".toml"):
-            if registry.plain_name(suite) in registry.names():
+            if plain_name(suite) in registry.names():
                 raise BidexError(f"{suite} is a class, not a suite: name it by task (--task {suite}).")
             suite = known_name("suite", suite, suites_to_run())
         return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
@@ -106,6 +116,11 @@ class Worlds(ABC):
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
         """The classes of its train split by name; BidexError where they are of another library."""
+
+    @property
+    def rules(self) -> Rules | None:
+        """The rules of all its classes; None where they are of another library."""
+        return None
 
     @property
     def splits(self) -> list[str]:

@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import Split, Suite, load_suite
+from bidex_meta.suite import V1, V2, Rules, Split, Suite, load_suite, plain_name
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import V2_PRESET, Identity, WorldConfig, Worlds, physics_of
@@ -58,6 +58,11 @@ class OwnSuite(Worlds):
         """As in ``Worlds``."""
         return self.benchmark.task_classes()
 
+    @property
+    def rules(self) -> Rules:
+        """As in ``Worlds``: the suite's."""
+        return self.suite.rules
+
     def identity(self) -> Identity:
         """As in ``Worlds``; of the classes of both splits."""
         classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
@@ -98,3 +103,8 @@ class SingleClass(Worlds):
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Worlds``."""
         return {self.name: registry.get(self.class_name, self.moving_base, **registry.with_object(self.object))}
+
+    @property
+    def rules(self) -> Rules:
+        """As in ``Worlds``: those that the class's name asks for."""
+        return V1 if self.class_name == plain_name(self.class_name) else V2

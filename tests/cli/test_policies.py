@@ -1,12 +1,18 @@
 """From a checkpoint to its policy."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from bidex_meta.cli.policies import checkpoint, policy_of
+from bidex_meta.cli import run_data
+from bidex_meta.cli.parsing import LookFlags
+from bidex_meta.cli.policies import checkpoint, looked_at, policy_of
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
+from bidex_meta.suite import V1, V2
+from bidex_meta.utils import paths
+from bidex_meta.worlds import Worlds
 
 RUNS = Path(__file__).parents[1] / "data" / "old_runs"
 
@@ -30,3 +36,37 @@ def test_a_checkpoint_that_asks_for_more_than_its_weights_takes_no_memory(
     state["learner"]["policy"][part] |= change
     with pytest.raises(BidexError, match="does not fit its config"):
         policy_of(folder, state, "cpu")
+
+
+def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RUNS / "mtppo"
+    own = RunFolder.open(run).config()
+    assert own.suite == "MT4"
+    own_file = tmp_path / "own.toml"
+    text = (paths.suites_dir() / "MT4.toml").read_text()
+    own_file.write_text(text.replace('reward = "paper"', 'reward = "paper"\nstarts = "jittered"'))
+    told = {None: "", "MT4": "", "MT4-v2": "reward paper, not v2, ", str(own_file): ": starts plain, not jittered."}
+    for suite, expected in told.items():
+        looked_at(LookFlags(run=run, suite=suite))
+        shown = capsys.readouterr().err
+        assert expected in shown and shown.count("Note: ") == shown.count("\n") == bool(expected)
+    looked_at(LookFlags(policy="zero", suite="MT4-v2"))
+    assert not capsys.readouterr().err
+
+
+def test_a_class_may_be_named_with_the_version_of_its_suite() -> None:
+    assert looked_at(LookFlags(policy="zero", suite="MT4-v2", task="HandOver-v2"))[2] == "HandOver"
+    with pytest.raises(BidexError, match="Unknown task of MT4 'HandOver-v2'"):
+        looked_at(LookFlags(policy="zero", suite="MT4", task="HandOver-v2"))
+
+
+def test_data_of_other_rules_are_noted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for recorded in ({}, {"rules": vars(V1)}, {"rules": vars(V2)}, {"rules": {"reward": 3}}, {"rules": 3}):
+        dataset = SimpleNamespace(name="some/data-v0", metadata=recorded, num_steps=1, num_episodes=1)
+        monkeypatch.setattr(run_data, "open_datasets", lambda names, dataset=dataset: [dataset])
+        run_data.announced(["some/data-v0"], "Reading", Worlds.open({"task": "HandOver-v2"}))
+        shown.append(capsys.readouterr().err.splitlines()[1:])
+    assert shown[0] == shown[2] == shown[4] == [] and len(shown[1]) == len(shown[3]) == 1
+    note = "Note: some/data-v0 was recorded by other rules than those of HandOver-v2: reward"
+    assert shown[1][0].startswith(f"{note} paper,") and shown[3][0].startswith(f"{note} 3,")

@@ -298,6 +298,11 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
     assert run("--start-from", first, "--steps", 24, "--run-dir", second, "--no-evaluate", "--seed", 1) == 0
     assert f"Starting from the policy of {first} at 48 steps." in capsys.readouterr().err
     assert RunFolder.open(second).config().start_from == str(first)
+    flags = ["--start-from", first, "--steps", 24, "--run-dir", tmp_path / "other", "--no-evaluate"]
+    assert run(*flags, "--suite", "MT4-v2") == 0
+    note = f"Note: {first} learned MT4 by other rules than those of MT4-v2: reward paper, not v2, variation narrow, "
+    note += "not wide, success once, not at-end, starts plain, not jittered."
+    assert capsys.readouterr().err.count(note) == 1
     layers = [final(path)[0]["learner"]["policy"]["weights"]["actor.mean.body.0.weight"] for path in (first, second)]
     assert 0 < (layers[0] - layers[1]).abs().max() < 0.02  # one update away; fresh weights of seed 1 differ by 1
     assert main(["run", "--resume", str(second), "--steps", "48", "--no-evaluate"]) == 0

@@ -58,7 +58,7 @@ def test_make_vec_gives_the_split_it_names(split: str, version: str) -> None:
     world = gymnasium.make_vec(asked, num_envs=6, device="cpu", threads=1, benchmark_seed=2)
     classes = bidex_meta.Benchmark("ML4" if version == "v1" else "ML4-v2", seed=2)
     assert {slot.task_class.rules for slot in world.unwrapped.slots} == {classes.suite.rules}  # type: ignore[attr-defined]
-    expected = classes.train_classes if split == "train" else classes.test_classes
+    expected = classes.task_classes(split)
     assert world.unwrapped.task_names == list(expected) and world.num_envs == 6  # type: ignore[attr-defined]
 
 

@@ -227,7 +227,7 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(BidexError, match="from 0 to 49"):
         world.set_tasks({"reach-v3": [50]})
     world.reset(seed=0)
-    with pytest.raises(BidexError, match="build the world with the same"):
+    with pytest.raises(BidexError, match="seed of tasks 0, here 1; build the world with the same"):
         make(seed=1).load_state_dict(world.state_dict())
 
 

@@ -192,6 +192,79 @@ def test_an_environment_plays_what_a_row_of_the_world_plays(suite: str) -> None:
             assert told["unscaled_reward"] == float(info["reward_unscaled"][i])
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("kind", ["ML", "MT"])
+def test_a_client_gets_the_version_that_it_names(kind: str, version: int) -> None:
+    """A loop over names, classes and tasks plays what the suite's worlds play: lengths, rewards and hidden parts."""
+    names = [name for name in ours.ML1.ENV_NAMES if name.endswith("-v2") == (version == 2)]
+    suite = Benchmark(f"{kind}20" + "-v2" * (version == 2))
+    drawn = int(seeding.np_random(5)[0].integers(2**31))
+    generator = torch.Generator().manual_seed(0)
+    action = 2.0 * torch.rand(4, 52, generator=generator) - 1.0
+    played = 0
+    for split in suite.suite.splits:
+        classes = suite.train_classes if split == "train" else suite.test_classes
+        world = suite.make_world(split, num_envs=len(classes), device="cpu", autoreset_mode="DISABLED", threads=1)
+        envs, goals = [], {}
+        for slot in world.slots:
+            (name,) = [each for each in names if each.removesuffix("-v2") == slot.name]
+            one: Any = getattr(ours, f"{kind}1")(name, seed=1)
+            task = one.train_tasks[3]
+            again: Any = getattr(ours, f"{kind}1")(task.env_name, seed=1)
+            env = again.train_classes[task.env_name]()
+            env.set_task(task)
+            goals[slot.name] = task.variation[None]
+            envs.append(env)
+            assert again.train_tasks == one.train_tasks and task.env_name == name == env.task_name
+            assert one.train_classes[slot.name] is type(env) and list(one.train_classes) == [name]
+            assert env.recipe.hides_goal == world.hides_goals and env.task_class.hides() == slot.task_class.hides()
+        world.set_tasks(goals)
+        starts, _ = world.reset(seed=drawn)
+        for row, env in enumerate(envs):
+            obs, _ = env.reset(seed=5)
+            np.testing.assert_array_equal(obs, starts[row, : len(obs)].numpy(), err_msg=env.task_name)
+            assert env.max_path_length == int(world.max_episode_steps[row])
+            played += 1
+        for step in range(4):
+            *_, terminated, truncated, info = world.step(action[step].expand(len(envs), -1))
+            for row, env in enumerate(envs):
+                if not env._over:
+                    *_, lost, late, told = env.step(action[step].numpy())
+                    assert told["unscaled_reward"] == float(info["reward_unscaled"][row])
+                    assert (lost, late) == (bool(terminated[row]), bool(truncated[row]))
+        for env in envs:
+            env.close()
+    assert played == len(names) == 20
+
+
+def test_a_version_2_episode_is_as_long_as_the_suites() -> None:
+    one = ours.ML1("HandOver-v2", seed=1)
+    env = one.train_classes[one.train_tasks[0].env_name]()
+    envs: Any = gymnasium.make_vec("bidex-meta/ML1-train-v2", env_name="HandOver", seed=1)
+    assert envs.get_attr("recipe")[0] == env.recipe and envs.get_attr("tasks")[0] == one.train_tasks
+    single: Any = gymnasium.make("bidex-meta/HandOver-v2").unwrapped
+    for world in (Benchmark("MT4-v2").make_world(num_envs=4, device="cpu", threads=1), single.world):
+        slot = next(slot for slot in world.slots if slot.name.startswith("HandOver"))
+        assert slot.task_class.rules == V2 and slot.task_class.episode_steps == env.max_path_length
+        assert slot.task_class.hides() == env.task_class.hides()
+    assert ours.MT1("HandOver").train_classes["HandOver"]().max_path_length < env.max_path_length
+
+
+@pytest.mark.parametrize("name", ["CatchUnderarm", "Switch"])
+def test_tasks_of_another_version_are_refused(name: str) -> None:
+    one, two = ours.ML1(name), ours.ML1(f"{name}-v2")
+    for benchmark, other in ((one, two), (two, one)):
+        env = next(iter(benchmark.train_classes.values()))()
+        with pytest.raises(BidexError, match="of one benchmark") as error:
+            env.set_task(other.train_tasks[0])
+        assert "\n" not in str(error.value)
+        with pytest.raises(BidexError):  # by shape or range, where a name is written by hand
+            numbers = two.train_tasks[0].variation if benchmark is one else np.full(len(env.goal_space.low), 9.0)
+            env.set_task(Task.from_variation(env.task_name, numbers))
+    assert f"{name}-v2" not in one.train_classes and one.train_classes.get(f"{name}-v2") is None
+    assert name in two.train_classes and two.train_classes.get(name) is two.train_classes[f"{name}-v2"]
+
+
 @pytest.mark.parametrize("strategy", ["sync", "async"])
 def test_strategies_play_alike_and_the_seed_decides(strategy: str) -> None:
     def play(vector_strategy: str, seed: int) -> list[np.ndarray]:
@@ -374,11 +447,13 @@ def test_constructors_take_what_meta_worlds_take() -> None:
         (lambda: ours.make_mt_envs("MT4", meta_batch_size=4), "of meta suites"),
         (lambda: ours.make_mt_envs("MT5"), "Did you mean 'MT4'?"),
         (lambda: ours.make_mt_envs("MT4", vector_strategy="threads"), "Known: async, sync"),
-        (lambda: ours.make_mt_envs("HandOver", reward_function_version="v1"), "the paper's reward"),
+        (lambda: ours.make_mt_envs("HandOver", reward_function_version="v1"), "the suite's reward"),
         (lambda: ours.make_mt_envs("HandOver", render_mode="human"), "rgb_array"),
         (lambda: ours.CustomML(["HandOver"], ["handover"]), "HandOver in both"),
         (lambda: gymnasium.make_vec("bidex-meta/custom-ml-envs", envs_list=[]), "at least one class"),
-        (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", env_name="HandOver"), "make_mt_envs(name)"),
+        (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", env_name="HandOver"), "make_mt_envs('HandOver')"),
+        (lambda: gymnasium.make_vec("bidex-meta/ML4-train-v2", env_name="handover"), "make_ml_envs('HandOver-v2')"),
+        (lambda: gymnasium.make_vec("bidex-meta/ML1-test-v1", env_name="HandOver-v2"), "ends in -v2"),
         (lambda: ours.ML4().train_classes["HandOver"]().set_task(ours.MT1("Switch").train_tasks[0]), "one of Switch"),
     ],
 )

@@ -1,12 +1,18 @@
 """What is no seed, action, pool, state or size is refused in one line that says what was expected; nothing changes."""
 
+import io
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
+from bidex_meta.suite import Randomisation, load_suite
+from bidex_meta.utils import paths
 from bidex_meta.world import World
 from bidex_meta.worlds.humanoid import HumanoidWorld
 from tests.world.play import engine_state, flat, suite_world
@@ -169,6 +175,54 @@ def test_states(world: World) -> None:
         assert all(torch.equal(a[n], b[n]) for a, b in zip(engines, engine_state(world), strict=True) for n in a)
     world.load_state_dict(before)
     world.step(torch.zeros(ROWS, 52))
+
+
+ROUGH = Randomisation(friction=(0.5, 2.0))
+PLAIN: dict[str, Any] = {"device": "cpu", "threads": 1, "randomisation": False}
+OTHERS: dict[str, tuple[dict[str, Any], str]] = {
+    "version": ({"suite": "MT4-v2"}, "19 differences: time limit of CatchUnderarm 225, here 75; reward of"),
+    "randomisation": ({"randomisation": ROUGH}, "randomised friction (0.5, 2.0), here none"),
+    "reward": ({"rules": {"reward": "v2"}}, "reward of CatchUnderarm v2, here paper"),
+    "starts": ({"rules": {"starts": "jittered"}}, "starts of CatchUnderarm jittered, here plain"),
+    "goals": ({"observation": "masked"}, "observation masked, here one-hot"),
+}  # fmt: skip
+"""How a world is made otherwise, with tensors of the same shapes, and what is said of it."""
+
+
+def _made(suite: str = "MT4", rules: dict[str, Any] | None = None, observation: str | None = None, **named: Any) -> Any:
+    given = load_suite(suite)
+    given = replace(given, rules=replace(given.rules, **(rules or {})), observation=observation or given.observation)
+    return Benchmark(given).make_world(num_envs=ROWS, **(PLAIN | named))
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_states_of_worlds_that_were_made_otherwise(world: World, other: str) -> None:
+    named, told = OTHERS[other]
+    found = _made(**named)
+    found.reset(seed=0)
+    state = found.state_dict()
+    state["observation"] = world.state_dict()["observation"]  # a plain and a masked one may be equally wide
+    before = world.state_dict()
+    assert told in refused(world.load_state_dict, state) and unchanged(world, before)
+    found.load_state_dict(found.state_dict())
+
+
+def test_states_of_classes_with_other_options(tmp_path: Path) -> None:
+    text = (paths.suites_dir() / "MT1-v2.toml").read_text()
+    made = []
+    for options in ("water = 12", "water = 13", ""):
+        changed = text.replace("CatchUnderarm", "PourWater")
+        (tmp_path / "pour.toml").write_text(f"{changed}\noptions = {{ {options} }}\n")
+        made.append(Benchmark(tmp_path / "pour.toml").make_world(num_envs=1, **PLAIN))
+        made[-1].reset(seed=0)
+    assert "water of PourWater 13, here 12" in refused(made[0].load_state_dict, made[1].state_dict())
+    made[0].load_state_dict(made[2].state_dict())
+    state = io.BytesIO()
+    torch.save(made[0].state_dict(), state)
+    state.seek(0)
+    made[0].load_state_dict(torch.load(state, weights_only=True))
+    for bad in ({}, None, 3, {"slots": torch.zeros(2)}):
+        refused(made[0].load_state_dict, made[0].state_dict() | {"made": bad})
 
 
 def test_masks_of_other_types_start_the_same_rows() -> None:

@@ -73,7 +73,7 @@ def _slot(benchmark: Any, task: str) -> Any:
 
     from bidex_meta.world import Slot
 
-    variations = [one.variation for one in benchmark.train_tasks if one.env_name == task]
+    variations = [one.variation for one in benchmark.train_tasks if one.env_name in (task, f"{task}-v2")]
     task_class = benchmark.train_classes[task]
     task_class = getattr(task_class, "task_class", task_class)  # older code has descriptions there
     return Slot(task, task_class, np.stack(variations))
