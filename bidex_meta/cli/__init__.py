@@ -19,8 +19,11 @@ from bidex_meta import errors
 from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, shortened
 from bidex_meta.train.launch import hangup, launch
 from bidex_meta.utils.plugins import own_fault
-from bidex_meta.utils.streams import open_missing, silence, unread
+from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
 
+_MEANT = {"train": "run", "test": "evaluate", "learn": "run", "fit": "run", "view": "play", "watch": "play"}
+_MEANT |= {"show": "render", "film": "render", "video": "render", "download": "pull", "upload": "push"}
+"""Names that other programs have for these commands."""
 _LONGEST = 2000  # letters of an error: what was given may be any text
 
 
@@ -69,6 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     open_missing()
+    print_anything()
+    bound_width()
     try:
         with _signals_raise():
             try:
@@ -160,7 +165,7 @@ def _dispatch(arguments: list[str]) -> int:
 
         print(__version__)
         return 0
-    name = known_name("command", name, COMMANDS)
+    name = known_name("command", name, COMMANDS, _MEANT)
     for place, word in enumerate(rest):
         if not word or re.fullmatch(r"--[\w.-]+=", word):
             flag = word.rstrip("=") or (rest[place - 1] if place else "a word")

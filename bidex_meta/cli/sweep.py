@@ -163,7 +163,7 @@ class Job:
             _beside(run, "failed").unlink(missing_ok=True)
         elif not self.stopped:
             why = _last_line(_beside(run, "log")) or f"ended with exit code {code}"
-            _beside(run, "failed").write_text(f"{why}\n")
+            _beside(run, "failed").write_text(f"{why}\n", encoding="utf-8")
             raise BidexError(why)
 
     def stop(self) -> None:
@@ -286,7 +286,7 @@ def _beside(run: PlannedRun, kind: str) -> Path:
 
 
 def _last_line(path: Path) -> str:
-    lines = path.read_text(errors="replace").splitlines() if is_file(path) else []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if is_file(path) else []
     return next((one_line(line) for line in reversed(lines) if line.strip()), "")
 
 
