@@ -8,8 +8,8 @@ EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141
-"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM and
-SIGHUP), and of SIGPIPE where nobody reads any more what is printed."""
+"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM, SIGHUP,
+SIGUSR1 and SIGUSR2), and of SIGPIPE where nobody reads any more what is printed."""
 
 
 class BidexError(ValueError):

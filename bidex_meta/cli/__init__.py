@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from bidex_meta import errors
 from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, shortened
-from bidex_meta.train.launch import hangup, launch
+from bidex_meta.train.launch import launch, notices
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
 
@@ -65,8 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of what follows ``bidex-meta``, the process's own by default, and return the exit code.
 
     0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the system refuses (a
-    full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C, 141 where nobody reads
-    stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM). A subcommand may raise SystemExit.
+    full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, 141 where nobody reads stderr any more,
+    128 and the number of SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM after that (0 where training saved and ended at SIGTERM).
+    A subcommand may raise SystemExit.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP came: everything is cleaned up as after Ctrl-C."""
+    """SIGTERM or one of ``notices()`` came: everything is cleaned up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -117,7 +118,7 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Turns SIGTERM and SIGHUP into an exception, so that no half-written file is left and it is said why."""
+    """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and it is said why."""
     # Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
@@ -126,7 +127,7 @@ def _signals_raise() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         raise _Terminated(number)
 
-    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *hangup())}
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *notices())}
     for number in before:
         signal.signal(number, stop)
     try:

@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
         failed = work(left, cores, say)
     _report(flags, worlds.name, cells)
     if failed:
-        say(f"{failed} failed. Started again, it tries them anew.")
+        say(f"{failed} failed or were stopped. Start it again to go on with them.")
         raise SystemExit(EXIT_FAILED)
 
 

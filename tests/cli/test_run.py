@@ -283,7 +283,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGPIPE])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR2, signal.SIGPIPE]
+)
 def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
