@@ -356,7 +356,8 @@ def _print(states: Sequence[State]) -> None:
         goal = f"{each.goal:,}" if minutes is None else f"{minutes:g} min"
         cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "–" if math.isnan(hours) else f"{hours:.2f}"]
         rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
-    print_table(plain_table(["run", "state", "steps", "of", "steps/s", "hours left", "why"], rows))
+    headers = ["run", "state", "steps", "of", "steps/s", "hours left", "why"]
+    print_table(plain_table(headers, rows, spare=("steps/s", "of", "steps")))
     names = [each.state for each in states]
     counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
     print(counts + ("" if math.isnan(total) else f"; about {total:.2f} core-hours of training left"))

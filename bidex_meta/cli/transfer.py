@@ -121,9 +121,9 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
     made = {"run": str(flags.run), "suite": suite, "steps": flags.steps, "versions": collect_versions()}
     write_json(flags.out / "transfer.json", made | {"reinforcement": steps, "demonstrations": shots})
     if steps:
-        print_table(plain_table(*_steps_table(steps, flags.steps)))
+        print_table(plain_table(*_steps_table(steps, flags.steps), spare=("seeds", "return")))
     if shots:
-        print_table(plain_table(*_shots_table(shots)))
+        print_table(plain_table(*_shots_table(shots), spare=("seeds", "return")))
     _draw(flags.out, steps, shots)
     say(f"Tables and figures: {flags.out}")
 
