@@ -1,14 +1,15 @@
 """The one exception for bad input (a line that names the expected, the received and the mend), and exit codes."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141
-"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM and
-SIGHUP), and of SIGPIPE where nobody reads any more what is printed."""
+"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM, SIGHUP,
+SIGUSR1 and SIGUSR2), and of SIGPIPE where nobody reads any more what is printed."""
 
 
 class BidexError(ValueError):
@@ -19,17 +20,17 @@ class BidexError(ValueError):
         super().__init__(" ".join(message.split()) if "\n" in message else message)
 
 
-def known_name(kind: str, name: str, known: Iterable[str]) -> str:
+def known_name(kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})) -> str:
     """The known name that a given one is, without regard to case; ``kind`` is what is looked up, e.g. ``"suite"``.
 
-    Raises BidexError where there is none, with the nearest name and the list.
+    Raises BidexError where there is none, with the nearest name (or the one that ``meant`` has for it) and the list.
     """
     names = list(known)
     if isinstance(name, str) and name in names:
         return name
     found = [other for other in names if other.casefold() == str(name).casefold()]
     if len(found) != 1:
-        raise unknown_name(kind, name, names)
+        raise unknown_name(kind, name, names, meant)
     return found[0]
 
 
@@ -44,10 +45,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return folded[near[0]] if near else None
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
+def unknown_name(
+    kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})
+) -> BidexError:
     """An error for a name of a kind, e.g. ``"suite"``, that does not exist, with the nearest known one and the list."""
     names = sorted(known)
-    near = nearest(str(name), names)
+    near = meant.get(str(name).casefold()) or nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
     return BidexError(f"Unknown {kind} {shortened(name)}.{hint} Known: {', '.join(names) or 'none'}.")
 

@@ -266,6 +266,7 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
         ({"split": "test"}, "MT4 has the splits train, got 'test'"),
         ({"autoreset_mode": "LAST_STEP"}, "Unknown autoreset_mode 'LAST_STEP'"),
         ({"device": "gpu"}, "device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ({"device": "mps"}, "device: expected auto, cpu, cuda or cuda:N, got 'mps'. The physics runs on a CPU or"),
         ({"seed": -1}, "seed: expected a whole number"),
     ],
 )

@@ -17,10 +17,13 @@ from typing import NamedTuple
 
 from bidex_meta import errors
 from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, shortened
-from bidex_meta.train.launch import hangup, launch
+from bidex_meta.train.launch import launch, notices
 from bidex_meta.utils.plugins import own_fault
-from bidex_meta.utils.streams import open_missing, silence, unread
+from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
 
+_MEANT = {"train": "run", "test": "evaluate", "learn": "run", "fit": "run", "view": "play", "watch": "play"}
+_MEANT |= {"show": "render", "film": "render", "video": "render", "download": "pull", "upload": "push"}
+"""Names that other programs have for these commands."""
 _LONGEST = 2000  # letters of an error: what was given may be any text
 
 
@@ -62,13 +65,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of what follows ``bidex-meta``, the process's own by default, and return the exit code.
 
     0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the system refuses (a
-    full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C, 141 where nobody reads
-    stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM). A subcommand may raise SystemExit.
+    full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, 141 where nobody reads stderr any more,
+    128 and the number of SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM after that (0 where training saved and ended at SIGTERM).
+    A subcommand may raise SystemExit.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     open_missing()
+    print_anything()
+    bound_width()
     try:
         with _signals_raise():
             try:
@@ -103,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP came: everything is cleaned up as after Ctrl-C."""
+    """SIGTERM or one of ``notices()`` came: everything is cleaned up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -112,7 +118,7 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Turns SIGTERM and SIGHUP into an exception, so that no half-written file is left and it is said why."""
+    """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and it is said why."""
     # Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
@@ -121,7 +127,7 @@ def _signals_raise() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         raise _Terminated(number)
 
-    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *hangup())}
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *notices())}
     for number in before:
         signal.signal(number, stop)
     try:
@@ -160,7 +166,7 @@ def _dispatch(arguments: list[str]) -> int:
 
         print(__version__)
         return 0
-    name = known_name("command", name, COMMANDS)
+    name = known_name("command", name, COMMANDS, _MEANT)
     for place, word in enumerate(rest):
         if not word or re.fullmatch(r"--[\w.-]+=", word):
             flag = word.rstrip("=") or (rest[place - 1] if place else "a word")

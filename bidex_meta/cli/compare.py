@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
 from bidex_meta.cli.plot import named_runs
 from bidex_meta.cli.tables import NONE, Json, plain_table, print_table, say
@@ -39,7 +41,7 @@ def main(arguments: Sequence[str]) -> None:
     if flags.json:
         print(json.dumps([_row(group, groups[0]) for group in groups], indent=2))
         return
-    print_table(plain_table(*group_table(groups)))
+    print_table(plain_table(*group_table(groups), spare=("hours", "steps")))
     print_table(plain_table(*class_table(groups)))
     print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")
 
@@ -75,15 +77,19 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 
 
 def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of each class by name: mean over seeds, and the seeds' range."""
-    names = list(dict.fromkeys(name for group in groups for name in group.classes))
+    """Columns and rows of each class by name, a row a group: the mean over seeds, and the seeds' range."""
     rows = []
-    for group in groups:
-        measures = ("success", group.success, 100.0, " %"), ("return", group.returns, 1.0, "")
-        for measure, table, factor, unit in measures:
-            cells = {
-                name: f"{factor * of.mean():.4g}{unit} ({factor * of.min():.4g} to {factor * of.max():.4g})"
-                for name, of in zip(group.classes, table.T, strict=True)
-            }
-            rows.append([group.label, measure, *(cells.get(name, NONE) for name in names)])
-    return ["group", "measure", *names], rows
+    for name in dict.fromkeys(name for group in groups for name in group.classes):
+        for group in groups:
+            if name not in group.classes:
+                continue
+            place = list(group.classes).index(name)
+            success = 100.0 * group.success[:, place]
+            returns = group.returns[:, place]
+            rows.append([name, group.label, _spread(success, ".1f"), _spread(returns, ".4g")])
+    return ["class", "group", "success, mean (%) [seeds]", "return, mean [seeds]"], rows
+
+
+def _spread(values: np.ndarray, form: str) -> str:
+    """The mean of values, and the least and the largest."""
+    return f"{values.mean():{form}} [{values.min():{form}} to {values.max():{form}}]"

@@ -9,7 +9,7 @@ from bidex_meta.cli import metatest
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
 from bidex_meta.cli.policies import policy_loader
-from bidex_meta.cli.tables import Json, gained, percent, plain, print_table, say, titled
+from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table, say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.control_arms import Control, arms, control
@@ -72,13 +72,14 @@ def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
     caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
     )
-    headers = ("return", "return of each run", "success", "success gained", "return gained", "score gained")
-    table = titled(title, caption, ["adapted to"], headers)
+    headers = ["adapted to", "return", "return of each run", "success"]
+    headers += ["success gained [95 %]", "return gained [95 %]", "score gained [95 %]"]
+    table = Sheet(headers, title, caption, spare=("return of each run", "score gained", "success"))
     labels = {"before": "nothing", "own": "its own data", "foreign": "train tasks' data, mean"}
     for arm, of in by_arm.items():
-        cells = [labels.get(arm) or plain(f"data of {arm}"), f"{of['return']:.4g}"]
+        cells = [labels.get(arm) or f"data of {arm}", f"{of['return']:.4g}"]
         cells += [" ".join(f"{value:.4g}" for value in of["runs"]), percent(of["success"])]
-        table.add_row(*cells, *(gained(of["own_minus"]) if "own_minus" in of else []))
+        table.add(*cells, *(gained(of["own_minus"]) if "own_minus" in of else []))
     print_table(table)
 
 

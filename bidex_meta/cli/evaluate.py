@@ -6,15 +6,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from rich.table import Table
-
 from bidex_meta.agents import Agent
 from bidex_meta.cli.conditions import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.policies import load_policy, policy_loader
-from bidex_meta.cli.tables import Json, evaluation_table, print_table, result_table, say
+from bidex_meta.cli.tables import Json, Sheet, evaluation_table, print_table, result_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent, Watched
@@ -103,7 +101,7 @@ def judged_on_others(
     options: Options,
     random: bool,
     brief: bool = False,
-) -> tuple[Json, Table]:
+) -> tuple[Json, Sheet]:
     """``judged`` on as many tasks of each class that the run was not trained on."""
     others = worlds.others
     title = f"{algo} on {others.name}, other tasks (seed {others.seed})"
@@ -120,7 +118,7 @@ def judged(
     random: bool,
     title: str,
     brief: bool = False,
-) -> tuple[Json, Table]:
+) -> tuple[Json, Sheet]:
     """The evaluation of a policy on a split, beside that of a random one if asked, as JSON and as a table.
 
     ``brief`` ones, always beside random, have a table for a terminal.

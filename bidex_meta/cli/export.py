@@ -33,7 +33,8 @@ class ExportFlags:
 
     Example: bidex-meta export assets/policies/MT20 --out mt20.onnx
 
-    The running statistics of observations are inside. Policies that remember or adapt are refused.
+    The running statistics of observations are inside. Policies that remember or adapt are refused. The file computes in
+    float32; how far a policy that computes in bfloat16 here differs from it is printed.
     """
 
     run: RunPath  # Run folder.
@@ -58,16 +59,19 @@ def main(arguments: Sequence[str]) -> None:
     state, steps = checkpoint(folder, flags.checkpoint)
     policy: Any = policy_of(folder, state, "cpu")
     shape = parse_content(state["learner"]["policy"].get("shape"), _SHAPE, f"{folder.path}: the policy's shape")
-    content, gap = exported(policy, shape, _metadata(folder, config, steps, shape))
+    content, gap, gap_as_played = exported(policy, shape, _metadata(folder, config, steps, shape))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(out, lambda file: file.write(content))
-    print(f"{out}: {len(content) / 1e6:.1f} MB, within {gap:.1g} of torch on {_ROWS} random observations")
+    print(f"{out}: {len(content) / 1e6:.1f} MB, within {gap:.1g} of torch in float32 on {_ROWS} random observations")
+    if gap_as_played > TOLERANCE:
+        print(f"On this machine the run's policy computes in bfloat16: its actions are up to {gap_as_played:.1g} away.")
 
 
-def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float]:
-    """A policy as the bytes of an ONNX file, and the largest difference to torch's actions.
+def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float, float]:
+    """Return a policy as the bytes of an ONNX file, which computes in float32, and two largest differences of actions.
 
-    ``shape`` is as in a checkpoint. Raises BidexError where torch cannot export it, or the actions differ.
+    The first is to torch's in float32, the second to those of the policy as it was given, which may compute in
+    bfloat16. ``shape`` is as in a checkpoint. Raises BidexError where torch cannot export it or the first is large.
     """
     import onnxruntime
     import torch
@@ -75,7 +79,10 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     network: Any = policy
     if not isinstance(policy, torch.nn.Module):
         raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
-    network.low_precision = False  # the file computes in float32
+    obs = _observations(_ROWS, shape)
+    as_played = network.eval_action(obs).numpy()
+    low_precision = getattr(network, "low_precision", False)
+    network.low_precision = False
     # Another library's product, by the size of a batch, which is left open here.
     with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
         try:
@@ -85,13 +92,14 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
                 f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
                 "look at numbers; --debug shows where."
             ) from error
-        obs = _observations(_ROWS, shape)
         wanted = network.eval_action(obs).numpy()
+    network.low_precision = low_precision
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    gap = float(abs(session.run(None, {"observations": obs.numpy()})[0] - wanted).max())
+    actions = session.run(None, {"observations": obs.numpy()})[0]
+    gap = float(abs(actions - wanted).max())
     if not gap <= TOLERANCE:
         raise BidexError(f"The exported actions differ by {gap:.2g} from torch's, more than {TOLERANCE:g}: none kept.")
-    return content, gap
+    return content, gap, float(abs(actions - as_played).max())
 
 
 def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
@@ -103,7 +111,9 @@ def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
             self.policy = policy
 
         def forward(self, observations: torch.Tensor) -> torch.Tensor:
-            return self.policy.eval_action(observations)
+            # Some products of no rows end onnxruntime's process by SIGFPE, so there is always one row more.
+            padded = torch.cat([observations, observations.new_zeros(1, observations.shape[1])])
+            return self.policy.eval_action(padded)[:-1]
 
     for name in ("torch.onnx", "onnxscript", "onnx_ir"):
         logging.getLogger(name).setLevel(logging.ERROR)

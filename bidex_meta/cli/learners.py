@@ -126,12 +126,15 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
 def resolve_device(asked: str, on_gpu: bool) -> str:
     """``auto`` to ``cuda`` where there is one and it is of use (``Worlds.on_gpu``), else ``cpu``; others as they are.
 
-    Raises BidexError where torch does not know the device, or it is not there (for each of several processes).
+    Raises BidexError where no world runs on the device, or it is not there (for each of several processes).
     """
     import torch
 
+    from bidex_meta.engine.choice import known_device
+
     if asked == "auto":
         asked = "cuda" if on_gpu and torch.cuda.is_available() else "cpu"
+    known_device(asked)
     here = launch()
     if here.count > 1 and asked.startswith("cuda:"):
         raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")
@@ -144,5 +147,5 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
         torch.zeros(1, device=here.own_device(asked))
     except Exception as error:  # torch raises RuntimeError, AssertionError or its own kinds
         reason = str(error).splitlines()[0]
-        raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu or cuda:N.") from None
+        raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu, cuda or cuda:N.") from None
     return asked

@@ -36,7 +36,8 @@ def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
     kinds = {"suites": listed, "tasks": _tasks, "hidden": _hidden, "algos": _algos, "objects": _objects}
-    print_rows(kinds[known_name("list", flags.what, kinds)](), flags.json)
+    rows = kinds[known_name("list", flags.what, kinds)]()
+    print_rows(rows, flags.json, spare=("test classes", "train classes", "presets"))
 
 
 def _tasks() -> list[Json]:

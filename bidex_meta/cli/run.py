@@ -39,7 +39,8 @@ def main(arguments: Sequence[str]) -> None:
     """Train and evaluate. After bad input nothing has been written.
 
     Raises SystemExit where another process was lost (exit code 1), or has reported what is wrong with the input (2);
-    where Ctrl-C (130), SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
+    where a signal other than SIGTERM (128 and its number) or the end of what reads stderr (141) came while it trained,
+    which has saved then.
     """
     try:
         distributed.init_from_environment()

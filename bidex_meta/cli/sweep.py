@@ -7,6 +7,7 @@ On this machine runs are called by a pool of threads, each of which keeps to a c
 import math
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
+from types import FrameType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
@@ -27,10 +29,13 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line, shortened
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.metrics import last_rows
+from bidex_meta.train.launch import BATCH_SIGNALS
 from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 
 COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # what a run's words are given to
+_STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
+"""Tells a run to save and end. It may get it from a batch system too; of SIGTERM the second would act at once."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ def main(arguments: Sequence[str]) -> None:
         failed = work(left, cores, say)
     _print([state_of(run) for run in runs])
     if failed:
-        say(f"{failed} failed. Started again, the sweep tries them anew.")
+        say(f"{failed} failed or were stopped. Start the sweep again to go on with them.")
         raise SystemExit(EXIT_FAILED)
 
 
@@ -142,13 +147,18 @@ class Job:
         self.run, self.command, self.stopped = run, command, False
         self.process: subprocess.Popen[bytes] | None = None
 
-    def __call__(self) -> None:
-        """Begins or resumes the run and waits for its end; BidexError, the last line of its log, where it failed."""
+    def __call__(self) -> bool:
+        """Begin or resume the run and wait for its end; return False where a signal stopped it before.
+
+        Raises BidexError, the last line of its log, where it failed.
+        """
         run = self.run
         while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
             time.sleep(1.0)
-        if self.stopped or state_of(run).state == "done":
-            return
+        if state_of(run).state == "done":
+            return True
+        if self.stopped:
+            return False
         words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
         with _beside(run, "log").open("ab") as log:
             one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -157,38 +167,69 @@ class Job:
                 start_new_session=True,
             )  # fmt: skip
         if self.stopped:
-            self.process.terminate()
+            self.process.send_signal(_STOP)
         code = self.process.wait()
-        if code == 0 and state_of(run).state == "done":
-            _beside(run, "failed").unlink(missing_ok=True)
-        elif not self.stopped:
+        done = code == 0 and state_of(run).state == "done"
+        if not done and not self.stopped and _signal_of(code) is None:
             why = _last_line(_beside(run, "log")) or f"ended with exit code {code}"
-            _beside(run, "failed").write_text(f"{why}\n")
+            _beside(run, "failed").write_text(f"{why}\n", encoding="utf-8")
             raise BidexError(why)
+        _beside(run, "failed").unlink(missing_ok=True)
+        return done
 
     def stop(self) -> None:
-        """Has the run save and end; does not wait for it."""
+        """Have the run save and end; does not wait for it."""
         self.stopped = True
         if self.process is not None:
-            self.process.terminate()
+            self.process.send_signal(_STOP)
+
+
+class QueuedJob(Job):
+    """A job of a batch system, which goes back into the queue when its time is up before the run's end.
+
+    The signal before that interrupts the wait for the run's process, within which nothing can wait for it: a handler
+    would wait for ever. So ours tells the run to save and end, and submitit's is called when it has.
+    """
+
+    def __call__(self) -> bool:
+        """Begin or resume the run, as ``Job`` does; if a batch system stops it, queue the job again and exit."""
+        asked: list[int] = []
+
+        def note(number: int, frame: FrameType | None) -> None:
+            asked.append(number)
+            self.stop()
+
+        requeueing = signal.Signals[f"SIG{os.environ.get('SUBMITIT_PREEMPT_SIGNAL', 'USR2')}"]  # read by submitit too
+        numbers = {*BATCH_SIGNALS, signal.SIGTERM, requeueing}
+        handlers = {number: signal.signal(number, note) for number in numbers}
+        try:
+            done = super().__call__()
+            if not asked and self.process is not None:  # the signal reached the run alone, or before it reached us
+                asked.append(_signal_of(self.process.returncode) or 0)
+            requeue = handlers[requeueing]
+            # SIGTERM is no such request: it comes when somebody cancels the job.
+            if not done and callable(requeue) and {*BATCH_SIGNALS, requeueing}.intersection(asked):
+                requeue(requeueing, None)
+            return done
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
     def checkpoint(self) -> Any:
-        """Called by submitit before the job's time is up: what it queues again."""
+        """Return what submitit queues again; the run's process has ended by then."""
         import submitit
 
-        self.stop()
-        if self.process is not None:
-            self.process.wait()
-        return submitit.helpers.DelayedSubmission(Job(self.run, self.command))
+        return submitit.helpers.DelayedSubmission(QueuedJob(self.run, self.command))
 
 
 def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[[str], None]) -> int:
     """Runs everything in order, a run at a time on each core; returns how many have failed.
 
-    A failure stops no other run but those that start from it. After Ctrl-C or SIGTERM each run saves and stops.
+    A failure stops no other run but those that start from it, and so does a signal to a run, which counts as one here.
+    After Ctrl-C or SIGTERM of the sweep each run saves and stops.
     """
-    waiting, failed, free = list(runs), set[Path](), list(cores)
-    own: dict[Future[None], Job] = {}
+    waiting, failed, free = list(runs), dict[Path | None, str](), list(cores)
+    own: dict[Future[bool], Job] = {}
     jobs: list[Job] = []
 
     def bind() -> None:
@@ -202,17 +243,22 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
                 ready = [run for run in waiting if run.after not in unfinished]
                 for run in ready[: len(cores) - len(own)]:
                     waiting.remove(run)
-                    if run.after in failed:
-                        failed.add(run.path)
-                        say(f"{run.name} failed: it starts from {run.after.name}, which has")
+                    if run.after is not None and run.after in failed:
+                        failed[run.path] = "has failed"
+                        say(f"{run.name} failed: it starts from {run.after.name}, which {failed[run.after]}")
                         continue
                     say(f"{run.name} {'is waited for: another process trains it' if _locked(run) else 'begins'}")
                     jobs.append(Job(run, COMMAND))
                     own[pool.submit(jobs[-1])] = jobs[-1]
                 for future in wait(own, return_when=FIRST_COMPLETED).done:
                     run, error = own.pop(future).run, future.exception()
-                    failed |= {run.path} if error else set()
-                    end = f"failed: {one_line(error)}" if error else "done"
+                    end = "done"
+                    if error is not None:
+                        failed[run.path] = "has failed"
+                        end = f"failed: {one_line(error)}"
+                    elif not future.result():
+                        failed[run.path] = "was stopped"
+                        end = "was stopped by a signal"
                     say(f"{run.name} {end} ({len(waiting) + len(own)} to go)")
         except BaseException:
             for job in jobs:
@@ -244,7 +290,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
                     continue
             executor.update_parameters(name=run.name)
             after = None if run.after is None else run.after.resolve()
-            jobs[run.name] = executor.submit(Job(replace(run, path=run.path.resolve(), after=after), COMMAND))
+            jobs[run.name] = executor.submit(QueuedJob(replace(run, path=run.path.resolve(), after=after), COMMAND))
             number.write_text(f"{jobs[run.name].job_id}\n")
     except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
         raise BidexError(f"submitit: {one_line(error)[:300].rstrip('.')}. Mend [slurm], or --submit.") from None
@@ -269,6 +315,14 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
     return chosen[:count]
 
 
+def _signal_of(code: int) -> int | None:
+    """Return the signal of a batch system that ended a run, which may have saved; None after any other end."""
+    if code == 0:  # a run that is not done saved at SIGTERM
+        return signal.SIGTERM
+    number = -code if code < 0 else code - 128
+    return number if number in (*BATCH_SIGNALS, signal.SIGTERM) else None
+
+
 def _locked(run: PlannedRun) -> bool:
     """Whether a process trains in a run's folder."""
     try:
@@ -286,7 +340,7 @@ def _beside(run: PlannedRun, kind: str) -> Path:
 
 
 def _last_line(path: Path) -> str:
-    lines = path.read_text(errors="replace").splitlines() if is_file(path) else []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if is_file(path) else []
     return next((one_line(line) for line in reversed(lines) if line.strip()), "")
 
 
@@ -302,7 +356,8 @@ def _print(states: Sequence[State]) -> None:
         goal = f"{each.goal:,}" if minutes is None else f"{minutes:g} min"
         cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "–" if math.isnan(hours) else f"{hours:.2f}"]
         rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
-    print_table(plain_table(["run", "state", "steps", "of", "steps/s", "hours left", "why"], rows))
+    headers = ["run", "state", "steps", "of", "steps/s", "hours left", "why"]
+    print_table(plain_table(headers, rows, spare=("steps/s", "of", "steps")))
     names = [each.state for each in states]
     counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
     print(counts + ("" if math.isnan(total) else f"; about {total:.2f} core-hours of training left"))

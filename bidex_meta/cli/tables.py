@@ -1,19 +1,22 @@
 """What commands print: tables for people, rows as JSON, and what they are at."""
 
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
 from bidex_meta.train.launch import launch
+from bidex_meta.utils.streams import output_width
 
 Json = dict[str, Any]  # what JSON holds, or goes into it
 NONE = "–"
@@ -29,26 +32,139 @@ def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.") -> None:
+@dataclass
+class Sheet:
+    """Rows under headers; where it is too wide for the terminal it leaves columns out, and says which.
+
+    A number with its interval, ``0.7 [0.6, 0.8]`` under ``return [95 %]``, takes two columns. Intervals are left out
+    first, then the columns named in ``spare`` in this order, then the last ones. Names and numbers are never cut.
+    """
+
+    headers: Sequence[str]
+    title: str = ""
+    caption: str = ""
+    spare: Sequence[str] = ()
+    rows: list[list[str]] = field(default_factory=list)
+    styles: list[str] = field(default_factory=list)
+
+    def add(self, *cells: object, style: str = "") -> None:
+        """Add a row, which may be shorter than the headers."""
+        texts = [f"{cell:,.4g}" if isinstance(cell, float) else one_line(cell) for cell in cells]
+        self.rows.append(texts + [""] * (len(self.headers) - len(texts)))
+        self.styles.append(style)
+
+    def printed(self, width: int) -> str:
+        """Lay the table out in ``width`` columns, or in as many more as its first two columns need."""
+        shown = self._columns()
+        left_out: list[str] = []
+        for column in sorted(shown[2:], key=self._first_to_go):
+            if _needed(shown) > width:
+                shown.remove(column)
+                left_out.append(column.header)
+        caption = self.caption
+        if left_out:
+            caption += f"\nIn a wider terminal, or with COLUMNS=200: {', '.join(reversed(left_out))}."
+        table = Table(
+            title=Text(self.title) if self.title else None, title_justify="left",
+            caption=Text(caption.strip()) if caption else None, caption_justify="left",
+        )  # fmt: skip
+        for column, size in zip(shown, _widths(shown, width), strict=True):
+            table.add_column(Text(column.header), justify="right" if column.is_numbers else "left", width=size)
+        for number, style in enumerate(self.styles):
+            table.add_row(*(Text(column.cells[number]) for column in shown), style=style or None)
+        console = Console(width=max(width, _needed(shown)))
+        with console.capture() as text:  # rich would end the process where nobody reads it
+            console.print(table)
+        return text.get()
+
+    def _columns(self) -> list["_Column"]:
+        columns = []
+        for place, header in enumerate(self.headers):
+            cells = [row[place] for row in self.rows]
+            name, _, ends = header.rstrip("]").partition(" [")
+            if not any(_RANGED.fullmatch(cell) for cell in cells):
+                columns.append(_Column(place, header, cells))
+                continue
+            pairs = [_RANGED.fullmatch(cell) for cell in cells]
+            values = [pair[1] if pair else cell for pair, cell in zip(pairs, cells, strict=True)]
+            columns.append(_Column(place, name, values))
+            columns.append(_Column(place, ends or "95 %", [pair[2] if pair else "" for pair in pairs], True))
+        return columns
+
+    def _first_to_go(self, column: "_Column") -> tuple[int, int]:
+        if column.is_interval:
+            return 0, -column.place
+        if column.header in self.spare:
+            return 1, self.spare.index(column.header)
+        return 2, -column.place
+
+
+_RANGED = re.compile(r"([-+]?(?:[\d.,]+(?:e[-+]?\d+)?|nan|inf)(?: %)?) (\[.*\])")
+_NUMBER = re.compile(rf"{NONE}|[-+>]? ?[\d.]+.*|\[.*\]|[-+]?(nan|inf).*|")
+_PROSE = 24  # letters from which a cell of several words is wrapped
+
+
+@dataclass
+class _Column:
+    place: int  # of the header that it belongs to
+    header: str
+    cells: list[str]
+    is_interval: bool = False
+
+    @property
+    def is_numbers(self) -> bool:
+        return all(_NUMBER.fullmatch(cell) for cell in self.cells)
+
+    @property
+    def is_prose(self) -> bool:
+        return not self.is_numbers and any(len(cell) > _PROSE and " " in cell for cell in self.cells)
+
+    @property
+    def least(self) -> int:
+        """The columns of a terminal that it needs: its cells, or of prose the longest word and some room."""
+        words = self.header.split()
+        if self.is_prose:
+            words += [word for cell in self.cells for word in cell.split()]
+            return max(_PROSE, *map(len, words))
+        return max(map(len, [*self.cells, *words]), default=1)
+
+
+def _needed(columns: Sequence[_Column]) -> int:
+    return sum(column.least + 3 for column in columns) + 1  # with a rule and two spaces between columns
+
+
+def _widths(columns: Sequence[_Column], width: int) -> list[int]:
+    """Return the columns' widths: the least ones, and of the room left each letter goes where most are wrapped."""
+    widths = [column.least for column in columns]
+    wanted = [max(map(len, [*column.cells, column.header]), default=1) for column in columns]
+    for _ in range(width - _needed(columns)):
+        lacking = [most - size for most, size in zip(wanted, widths, strict=True)]
+        if max(lacking) <= 0:
+            break
+        widths[lacking.index(max(lacking))] += 1
+    return widths
+
+
+def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.", spare: Sequence[str] = ()) -> None:
     """Rows of equal keys as JSON, or as a table headed by them; ``otherwise`` in place of a table of none."""
     if as_json:
         print(json.dumps(rows, indent=2))
     elif rows:
         cells = [[", ".join(cell) if isinstance(cell, list) else cell for cell in row.values()] for row in rows]
-        print_table(plain_table([name.replace("_", " ") for name in rows[0]], cells))
+        print_table(plain_table([name.replace("_", " ") for name in rows[0]], cells, spare))
     else:
         print(otherwise)
 
 
 def evaluation_table(
     title: str, policy: Evaluation, random: Evaluation | None = None, gains: Gains | None = None
-) -> Table:
+) -> Sheet:
     """Success, return and score per class; beside those of a random policy with the difference; what adaptation gained.
 
     Both evaluations are on the same tasks.
     """
     caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: by the suite's rule, once or at end"
-    headers = ["episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
+    headers = ["task", "episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
     if gains is not None:
@@ -56,12 +172,13 @@ def evaluation_table(
         caption += "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
     if any(result.unstable for result in policy.classes.values()):
         caption += f"\n{_BROKEN}"
-    table = titled(title, caption, ["task"], headers)
+    table = Sheet(headers, title, caption, _SPARE)
     differences = compare(policy, random) if random is not None else {}
-    rows, others = policy.to_json(), random.to_json() if random is not None else None
+    rows = policy.to_json()
+    others = random.to_json() if random is not None else None
     for name, row in rows["classes"].items():
         episodes = f"{row['episodes']}" + (f" ({row['unstable']} unstable)" if row["unstable"] else "")
-        cells = [plain(name), episodes, f"{row['length']:.1f}", percent(row["success"])]
+        cells = [name, episodes, f"{row['length']:.1f}", percent(row["success"])]
         cells += [NONE if row[key] is None else percent(row[key]) for key in ("success_once", "success_at_end")]
         cells += [ranged(row["return"], row["return_interval"]), _score(row["score"])]
         if others is not None:
@@ -70,7 +187,7 @@ def evaluation_table(
             cells += [ranged(difference.value, difference.interval, sign=True)]
         if gains is not None:
             cells += gained(gains.classes[name])
-        table.add_row(*cells)
+        table.add(*cells)
     for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
         success, score = rows["aggregate"]["success"], rows["aggregate"]["score"]
         cells = [label, "", "", percent(success[key]), "", "", "", _score(score[key] if score else None)]
@@ -78,21 +195,24 @@ def evaluation_table(
             cells += [percent(others["aggregate"]["success"][key])]
         if gains is not None and key == "mean":
             cells += gained({**gains.aggregate, "return": None})  # returns of different classes have different scales
-        table.add_row(*cells, style="dim")
+        table.add(*cells, style="dim")
     return table
 
 
-def result_table(title: str, policy: Evaluation, random: Evaluation) -> Table:
-    """The least of ``evaluation_table``, for a terminal of 80 columns."""
-    headers = ["success", "random", "return [95 %]", "random return"]
-    table = titled(title, "[..] 95 % bootstrap interval over tasks", ["task"], headers)
+_SPARE = ("once", "at end", "length", "episodes", "score gained", "random return", "return gained", "score")
+
+
+def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
+    """The least of ``evaluation_table``, with intervals where there is room."""
+    headers = ["task", "success", "random", "return [95 %]", "random return"]
+    table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks")
     rows, others = policy.to_json(), random.to_json()
     for name, row in rows["classes"].items():
         other = others["classes"][name]
         cells = [percent(row["success"]), percent(other["success"]), ranged(row["return"], row["return_interval"])]
-        table.add_row(plain(name), *cells, f"{other['return']:.4g}")
+        table.add(name, *cells, f"{other['return']:.4g}")
     means = [percent(each["aggregate"]["success"]["mean"]) for each in (rows, others)]
-    table.add_row("mean over tasks", *means, style="dim")
+    table.add("mean over tasks", *means, style="dim")
     return table
 
 
@@ -110,33 +230,17 @@ def gained(measures: Mapping[str, Difference | None]) -> list[str]:
     ]
 
 
-def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
-    """A table of anything; numbers to the right."""
-    table = Table()
-    for place, column in enumerate(columns):
-        numbers = bool(rows) and all(isinstance(row[place], int | float) for row in rows)
-        table.add_column(plain(column), justify="right" if numbers else "left")
+def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]], spare: Sequence[str] = ()) -> Sheet:
+    """A table of anything."""
+    table = Sheet(columns, spare=spare)
     for row in rows:
-        table.add_row(*(f"{cell:,.4g}" if isinstance(cell, float) else plain(str(cell)) for cell in row))
+        table.add(*row)
     return table
 
 
-def titled(title: str, caption: str, left: Sequence[str], right: Sequence[str]) -> Table:
-    """An empty table of columns to the left and to the right."""
-    table = Table(title=escape(title), title_justify="left", caption=caption, caption_justify="left")
-    for header in (*left, *right):
-        table.add_column(header)
-    for column in table.columns[len(left) :]:
-        column.justify = "right"
-    return table
-
-
-def print_table(table: Table) -> None:
-    """To stdout; wide enough for every column where stdout is a file or a pipe."""
-    console = Console(width=None if sys.stdout.isatty() else 180)
-    with console.capture() as shown:  # rich would end the process where nobody reads it
-        console.print(table)
-    sys.stdout.write(shown.get())
+def print_table(table: Sheet) -> None:
+    """To stdout, as wide as the terminal or COLUMNS says; wide enough for most where it is a file or a pipe."""
+    sys.stdout.write(table.printed(output_width(180)))
 
 
 def percent(value: float) -> str:
@@ -152,9 +256,4 @@ def ranged(value: float, interval: Interval | None, sign: bool = False, unit: st
     """A value and the ends of its interval."""
     form = "+.4g" if sign else ".4g"
     ends = NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
-    return f"{value:{form}}{unit} \\[{ends}]"
-
-
-def plain(name: str) -> str:
-    """A text that rich shall show as it is: a name of a class or a task may be anybody's."""
-    return escape(one_line(name))
+    return f"{value:{form}}{unit} [{ends}]"

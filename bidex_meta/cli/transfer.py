@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> None:
         failed = work(left, cores, say)
     _report(flags, worlds.name, cells)
     if failed:
-        say(f"{failed} failed. Started again, it tries them anew.")
+        say(f"{failed} failed or were stopped. Start it again to go on with them.")
         raise SystemExit(EXIT_FAILED)
 
 
@@ -131,9 +131,9 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
     made |= {"versions": collect_versions()}
     write_json(flags.out / "transfer.json", made | {"reinforcement": steps, "demonstrations": shots})
     if steps:
-        print_table(plain_table(*_steps_table(steps, flags.steps)))
+        print_table(plain_table(*_steps_table(steps, flags.steps), spare=("seeds", "return")))
     if shots:
-        print_table(plain_table(*_shots_table(shots)))
+        print_table(plain_table(*_shots_table(shots), spare=("seeds", "return")))
     _draw(flags.out, steps, shots)
     say(f"Tables and figures: {flags.out}")
 

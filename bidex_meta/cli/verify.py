@@ -12,7 +12,7 @@ from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import TASKS, Options, meta_test
 from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
 from bidex_meta.cli.policies import checkpoint, policy_of
-from bidex_meta.cli.tables import Json, percent, plain, print_table, ranged, say, titled
+from bidex_meta.cli.tables import Json, Sheet, percent, print_table, ranged, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
@@ -116,12 +116,12 @@ def main(arguments: Sequence[str]) -> None:
 def _print_table(title: str, found: Sequence[Agreement]) -> None:
     """A class a row."""
     caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
-    table = titled(title, caption, ["task", "outcome"], ("success", "again", "return [95 %]", "again"))
+    table = Sheet(["task", "outcome", "success", "again", "return [95 %]", "return again [95 %]"], title, caption)
     for each in found:
         both = each.recorded, each.again
-        cells = [plain(each.name), each.outcome, *(percent(row["success"]) for row in both)]
+        cells = [each.name, each.outcome, *(percent(row["success"]) for row in both)]
         cells += [ranged(row["return"], row.get("return_interval")) for row in both]
-        table.add_row(*cells, style="bold red" if each.outcome == DIFFERS else None)
+        table.add(*cells, style="bold red" if each.outcome == DIFFERS else "")
     print_table(table)
 
 

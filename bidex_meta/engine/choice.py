@@ -20,7 +20,8 @@ def choose_engine(
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)
-    place, engine = checked_device(device), known_name("engine", engine, ENGINES)
+    place = checked_device(device)
+    engine = known_name("engine", engine, ENGINES)
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
@@ -30,16 +31,25 @@ def choose_engine(
     return place, lambda models, rows, room: CpuEngine(models, rows, threads)
 
 
-def checked_device(device: str | torch.device) -> torch.device:
-    """The device of a name, ``auto`` resolved; BidexError where this machine has none such."""
-    if isinstance(device, str) and device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+def known_device(device: str | torch.device) -> torch.device:
+    """Return the device of a name; BidexError unless it is the CPU or a CUDA device, which may be missing here."""
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError, ValueError):
         place = None
-    if place is None or place.type not in ("cpu", "cuda"):
-        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}.")
+    if place is None or place.type not in ("cpu", "cuda") or (place.type == "cpu" and place.index):
+        raise BidexError(
+            f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}. The physics runs on a CPU or on an "
+            "NVIDIA GPU."
+        )
+    return place
+
+
+def checked_device(device: str | torch.device) -> torch.device:
+    """Return the device of a name, ``auto`` resolved; BidexError if this machine has no such device."""
+    if isinstance(device, str) and device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    place = known_device(device)
     if place.type == "cpu":
         return place
     if (place.index or 0) >= torch.cuda.device_count():

@@ -31,7 +31,7 @@ class MetricsWriter:
         path = folder / "metrics.jsonl"
         if resume_step is not None:
             _keep(path, [line for line, row in _lines(path) if row is not None and row["step"] <= resume_step])
-        self._file = path.open("a")
+        self._file = path.open("a", encoding="utf-8")
         self.writer: Writer = make_writer(logger, folder, resume_step)
 
     @checked_arguments

@@ -7,11 +7,12 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TextIO, TypeVar
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 from typing_extensions import override
 
 from bidex_meta.utils.arguments import checked_arguments
@@ -97,15 +98,17 @@ class Progress:
     def _print(self, parts: Iterable[str]) -> None:
         self._console.print(" | ".join(parts), soft_wrap=True, highlight=False, markup=False)
 
-    def _table(self, step: int) -> Table:
-        table = Table(title="  ".join(self._overall(step)), title_justify="left", title_style="bold")
+    def _table(self, step: int) -> Group:
+        parts = "  ".join(self._overall(step)).split("  ")
+        heading = Text("\n".join(_lines(parts, self._console.width)), style="bold")
+        table = Table()
         table.add_column("task")
         for column in ("success", "return"):
             table.add_column(column, justify="right")
         for name in self._tasks():
             success, mean_return = self._shown.get(_SUCCESS + name), self._shown.get(_RETURN + name)
             table.add_row(escape(name), _percent(success), _number(mean_return))
-        return table
+        return Group(heading, table)
 
     def _rate(self, step: int) -> float:
         return (step - self._start_step) / max(time.monotonic() - self._start_time, 1e-9)
@@ -119,15 +122,15 @@ class Progress:
     def _overall(self, step: int) -> list[str]:
         seconds = self._seconds_left(step)
         left = _duration(seconds) if seconds < math.inf else "?"
-        done = f"{step:,} / {self._total:,} steps"
+        done = [f"{step:,} / {self._total:,} steps"]
         if self._total_seconds < math.inf:
             spent = self._shown.get("Perf/training_time", 0.0)
-            done = f"{_duration(spent)} of {_duration(self._total_seconds)}  {step:,} steps"
-        speed = f"{done}  {self._rate(step):,.0f} steps/s  {left} left"
+            done = [f"{_duration(spent)} of {_duration(self._total_seconds)}", f"{step:,} steps"]
+        speed = [*done, f"{self._rate(step):,.0f} steps/s", f"{left} left"]
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
         teacher = self._shown.get("Policy/teacher_share", 0.0)
         plays = [f"teacher plays {_percent(teacher)}"] if teacher else []
-        return [speed, f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
+        return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
 def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
@@ -142,6 +145,18 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
         if time.monotonic() - reported >= _COUNTED_SECONDS:
             reported = time.monotonic()
             console.print(f"{number} of {total} {what}", highlight=False, markup=False)
+
+
+def _lines(parts: Iterable[str], width: int) -> list[str]:
+    """Join parts to lines of ``width`` at most; a part is broken nowhere."""
+    lines: list[str] = []
+    for part in parts:
+        joined = f"{lines[-1]}  {part}" if lines else part
+        if lines and len(joined) <= width:
+            lines[-1] = joined
+        else:
+            lines.append(part)
+    return lines
 
 
 def _percent(value: float | None) -> str:

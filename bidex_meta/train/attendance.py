@@ -10,7 +10,7 @@ from typing import Any
 
 from typing_extensions import override
 
-from bidex_meta.train.launch import hangup
+from bidex_meta.train.launch import notices
 
 _BEAT_SECONDS = 0.5
 _LISTEN_SECONDS = 3.0
@@ -87,7 +87,7 @@ class Attendance(threading.Thread):
 
     def _was_asked_to_end(self) -> bool:
         try:
-            return bool(set(os.read(self._signals, 64)) & {signal.SIGINT, signal.SIGTERM, *hangup()})
+            return bool(set(os.read(self._signals, 64)) & {signal.SIGINT, signal.SIGTERM, *notices()})
         except BlockingIOError:
             return False
 

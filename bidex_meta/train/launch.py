@@ -29,9 +29,18 @@ def launch() -> Launch:
     return Launch(*(int(os.environ.get(name, default)) for name, default in defaults.items()))
 
 
-def hangup() -> tuple[signal.Signals, ...]:
-    """SIGHUP, which comes when the terminal closes; nothing where it is ignored (``nohup``), and on Windows."""
-    return () if os.name != "posix" or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else (signal.SIGHUP,)
+BATCH_SIGNALS = tuple(signal.Signals[name] for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
+"""Sent by batch systems before the time of a job is up; Windows has none of these."""
+
+
+def notices() -> tuple[signal.Signals, ...]:
+    """Return the signals beside SIGINT and SIGTERM that ask a process to end, without those that it ignores.
+
+    SIGHUP comes when the terminal closes (``nohup`` ignores it), the others are ``BATCH_SIGNALS``. Each may come
+    several times: from the terminal and its shell, or from the batch system and the job that it runs.
+    """
+    numbers = (signal.SIGHUP, *BATCH_SIGNALS) if os.name == "posix" else ()
+    return tuple(number for number in numbers if signal.getsignal(number) != signal.SIG_IGN)
 
 
 def resume_command(path: Path, processes: int) -> str:

@@ -18,7 +18,7 @@ import gymnasium
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.recorder import Recorder
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
-from bidex_meta.train.launch import hangup
+from bidex_meta.train.launch import notices
 from bidex_meta.train.learner import Learner, State
 from bidex_meta.world.contract import VectorWorld
 
@@ -46,8 +46,9 @@ def train(
 
     Both include those of a run that is resumed (``spent_seconds``). Time, which metrics get as ``Perf/training_time``,
     counts from the first world step to the end of an iteration, with checkpoints; there is at least one iteration.
-    SIGINT, SIGTERM or SIGHUP (unless ignored), in any process, finishes the iteration, saves and returns; so does a
-    BrokenPipeError of ``record``, ``watch`` or ``enough``. A second SIGINT or SIGTERM acts at once.
+    SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 (unless ignored), in any process, finishes the iteration, saves and
+    returns; so does a BrokenPipeError of ``record``, ``watch`` or ``enough``. After SIGINT or SIGTERM another one of
+    these two acts at once.
 
     Args:
         learner: On ``world``.
@@ -172,15 +173,16 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator["_Stop"]:
-    """Turns the first SIGINT, SIGTERM or SIGHUP into a set event, then restores the first two's old handlers.
+    """Turn signals that ask for the end into a set event; the first SIGINT or SIGTERM restores the two's old handlers.
 
-    A terminal that closes may send SIGHUP twice, its shell's and its own: later ones are ignored until the end.
+    The other signals may come twice, and SIGTERM after them, all for one reason: they never break off an iteration.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # Python lets only the main thread set handlers
         return
-    numbers = (signal.SIGINT, signal.SIGTERM, *hangup())
+    asking = (signal.SIGINT, signal.SIGTERM)
+    numbers = (*asking, *notices())
     # None stands for a handler that was not set from Python and cannot be put back.
     old = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
 
@@ -190,7 +192,8 @@ def _stop_requests() -> Iterator["_Stop"]:
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         stop.ask(number)
-        restore(numbers[:2])
+        if number in asking:
+            restore(asking)
 
     for number in numbers:
         signal.signal(number, on_signal)

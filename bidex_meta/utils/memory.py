@@ -1,7 +1,12 @@
-"""Memory of a world, a replay or a network, checked before it is allocated: running out ends others' work."""
+"""Memory and cores that this process may use.
 
+The memory of a world, a replay or a network is checked before it is allocated: running out ends others' work.
+"""
+
+import math
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -12,18 +17,22 @@ ROW_BYTES = 500_000
 """Of an environment on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 each."""
 POINT_BYTES = 100
 """Of a point of an environment's cloud: calculated, in the observation, its copies in a step's info and sources."""
+_ROOT = Path("/")  # holds proc and sys; tests give another folder
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, not those of the machine: containers and batch systems give a share."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    """Count the cores that this process may use, by its affinity and by the CPU quota of its control groups.
+
+    A quota of one core and a half counts as two: the last thread then waits for a part of its time.
+    """
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    return max(1, min([cores, *map(math.ceil, _cpu_quotas())]))
 
 
 def available() -> int:
-    """Free bytes, by the system (with what can be swapped) and by the container's limit."""
+    """Count the free bytes of the system (with what can be swapped), or of the control group that has fewer."""
     of_system = psutil.virtual_memory().available + psutil.swap_memory().free
-    of_container = _of_container()
-    return of_system if of_container is None else min(of_system, of_container)
+    return max(0, min([of_system, *_free_of_groups()]))
 
 
 def check_memory(needed: float, what: str, mend: str) -> None:
@@ -36,12 +45,59 @@ def check_memory(needed: float, what: str, mend: str) -> None:
         raise BidexError(f"{what} would take about {needed / 1e9:,.1f} GB, and {there / 1e9:,.1f} are free. {mend}")
 
 
-def _of_container() -> int | None:
-    """What a control group still gives (version 2)."""
-    group = Path("/sys/fs/cgroup")
+def _free_of_groups() -> Iterator[int]:
+    """Yield what each limit on memory leaves free; the kernel gives pages of files back before it kills a process."""
+    names = (
+        ("memory.max", "memory.current", "inactive_file"),  # version 2 of control groups
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
+    )
+    for group in _groups("memory"):
+        for limit, used, inactive in names:
+            values = _numbers(group / limit) + _numbers(group / used)
+            if len(values) == 2:
+                yield values[0] - values[1] + _entries(group / "memory.stat").get(inactive, 0)
+
+
+def _cpu_quotas() -> Iterator[float]:
+    """Yield the cores' worth of time that each quota allows."""
+    for group in _groups("cpu"):
+        version_1 = _numbers(group / "cpu.cfs_quota_us") + _numbers(group / "cpu.cfs_period_us")
+        for quota in (_numbers(group / "cpu.max"), version_1):
+            if len(quota) == 2 and min(quota) > 0:  # version 1 has a quota of -1 for none
+                yield quota[0] / quota[1]
+
+
+def _groups(controller: str) -> Iterator[Path]:
+    """Yield the folders of this process's control groups of a controller, and of the groups that they lie in.
+
+    Inside a container the path may be the host's, of which only the last group is there, as the root folder.
+    """
+    root = _ROOT / "sys" / "fs" / "cgroup"
+    for line in _text(_ROOT / "proc" / "self" / "cgroup").splitlines():
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if controllers and controller not in controllers.split(","):
+            continue
+        place = Path(path.lstrip("/"))
+        # Version 2 has one tree, which lies in a folder "unified" where the machine has version 1 too.
+        for tree in (controller, controllers) if controllers else (".", "unified"):
+            yield from (root / tree / group for group in (place, *place.parents))
+
+
+def _numbers(path: Path) -> list[int]:
+    """Read the numbers of a file; none where it is missing, or says ``max``."""
+    words = _text(path).split()
+    return [int(word) for word in words] if all(word.lstrip("-").isdigit() for word in words) else []
+
+
+def _entries(path: Path) -> dict[str, int]:
+    """Read a file of lines ``name number``."""
+    pairs = [line.split() for line in _text(path).splitlines()]
+    return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2 and pair[1].isdigit()}
+
+
+def _text(path: Path) -> str:
     try:
-        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        return limit - used + int(stat.get("inactive_file", 0))  # pages of files are given back
+        return path.read_text()
     except (OSError, ValueError):
-        return None
+        return ""

@@ -1,10 +1,14 @@
-"""The standard streams of the command line: closed ones, and ones without a reader."""
+"""The standard streams of the command line: closed ones, odd encodings and widths, and ones without a reader."""
 
 import contextlib
+import io
 import os
 import select
+import shutil
 import sys
 from typing import IO
+
+_WIDTHS = (40, 1000)  # columns that tables and help texts can be laid out in
 
 
 def open_missing() -> None:
@@ -20,6 +24,34 @@ def open_missing() -> None:
     for name in ("stdout", "stderr"):
         if vars(sys)[name] is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+
+
+def print_anything() -> None:
+    """Make stdout and stderr replace the letters that their encoding lacks, instead of raising an error.
+
+    Otherwise a dash in a table ends hours of training in a traceback where the encoding is not UTF-8.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def bound_width() -> None:
+    """Set COLUMNS to a width that text can be laid out in, where it or the terminal is of another one.
+
+    Every library that wraps lines reads COLUMNS first; of one column the help of ``run`` would take minutes.
+    """
+    width = shutil.get_terminal_size().columns
+    bounded = min(max(width, _WIDTHS[0]), _WIDTHS[1])
+    if bounded != width or "COLUMNS" in os.environ:
+        os.environ["COLUMNS"] = str(bounded)
+
+
+def output_width(unknown: int) -> int:
+    """Return the columns of what stdout is printed on: COLUMNS, else the terminal's, else ``unknown``."""
+    if "COLUMNS" in os.environ or sys.stdout.isatty():
+        return shutil.get_terminal_size().columns
+    return unknown
 
 
 def silence(stream: IO[str]) -> None:

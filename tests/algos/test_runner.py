@@ -6,6 +6,7 @@ import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.train import runner
+from bidex_meta.train.launch import BATCH_SIGNALS
 from bidex_meta.train.runner import train
 from tests.algos.toy import ToyWorld, nearness
 
@@ -87,7 +88,7 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
     assert saved == [60.0, 264.0, 468.0, 672.0, 716.0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *BATCH_SIGNALS])
 def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     before = signal.getsignal(number)
     notes = Notes(after=lambda i: os.kill(os.getpid(), number) if i == 2 else None)
@@ -129,6 +130,18 @@ def test_of_sighup_a_second_one_changes_nothing_and_nohup_ignores_the_first():
         assert (stopped, learner.env_steps) == (0, 3 * ITERATION)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_notice_of_a_batch_system_and_sigterm_after_it_are_one_request():
+    def as_slurm_does(iteration: int) -> None:
+        if iteration == 2:
+            for number in (signal.SIGUSR2, signal.SIGUSR2, signal.SIGTERM):
+                os.kill(os.getpid(), number)
+
+    notes = Notes(after=as_slurm_does)
+    stopped, learner = run(notes)
+    assert (stopped, learner.env_steps) == (signal.SIGUSR2, 2 * ITERATION)
+    assert [step for step, _ in notes.saved] == [2 * ITERATION]
 
 
 def test_a_second_signal_acts_at_once():

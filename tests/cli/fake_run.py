@@ -1,10 +1,12 @@
 """Stands for ``bidex-meta run`` in tests of sweeps: the same folder, lock and files, a checkpoint a step, no physics.
 
 Its seed says what becomes of it: 13 always fails. ``--stop-at-return`` ends it at that step, which is its return.
+Signals end it after the step that it is at, as they do a run.
 """
 
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -13,10 +15,13 @@ from bidex_meta.config import config_of
 from bidex_meta.runs import RunFolder
 
 STEPS = 6
+asked: list[int] = []
 
 
 def main(words: list[str]) -> int:
     """As ``bidex-meta run``, of the flags that a sweep gives."""
+    for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(number, lambda number, frame: asked.append(number))
     given = dict(word[2:].split("=", 1) for word in words if "=" in word)
     if "resume" in given:
         folder = RunFolder.open(Path(given["resume"]))
@@ -42,6 +47,8 @@ def main(words: list[str]) -> int:
                 row = {"step": step, "time": 1.0, "Train/mean_return": step, "Perf/training_time": 0.5 * step}
                 metrics.write(json.dumps(row) + "\n")
             saved.write_text(str(step))
+            if asked:
+                return 0 if asked[0] == signal.SIGTERM else 128 + asked[0]
         row = {"success": 0.5, "return": 1.0, "score": None}
         (folder.path / "evaluation.json").write_text(json.dumps({"steps": last, "classes": {"HandOver": row}}))
     return 0

@@ -1,5 +1,7 @@
 """``bidex-meta export``: the file does what torch does, says what it is, and what it cannot hold is refused."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import pytest
 import torch
 
 from bidex_algos.nets.shape import Shape
+from bidex_meta.cli import export
 from bidex_meta.cli.export import exported
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
@@ -45,7 +48,7 @@ def policy(algo: str, **options: object) -> torch.nn.Module:
 )
 def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: dict[str, object]) -> None:
     made = policy(algo, **{"hidden": (8, 8), **options})
-    content, gap = exported(made, SHAPE.state_dict(), {"suite": "mine"})
+    content, gap, _ = exported(made, SHAPE.state_dict(), {"suite": "mine"})
     assert gap < 1e-5
     assert str(ROOT).encode() not in content and b".py" not in content
     obs = torch.randn(5, 16)
@@ -54,6 +57,22 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: 
     wanted = made.eval_action(obs)  # type: ignore[operator]
     assert wanted.std() > 0.05
     torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
+    code = (
+        "import sys, numpy, onnxruntime; session = onnxruntime.InferenceSession(sys.stdin.buffer.read()); "
+        "print(session.run(None, {'observations': numpy.zeros((0, 16), numpy.float32)})[0].shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], input=content, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (0, b"(0, 4)\n"), "no rows end no process"
+
+
+def test_the_difference_to_a_policy_in_bfloat16_is_told(shown, tmp_path: Path, monkeypatch) -> None:
+    made = policy("mtppo", hidden=(8, 8), autocast="on")
+    _, gap, as_played = exported(made, SHAPE.state_dict(), {})
+    assert gap < 1e-5 < 1e-4 < as_played and made.low_precision
+    monkeypatch.setattr(export, "exported", lambda *_: (b"file", 7e-6, 0.038))
+    told = shown("export", ROOT / "tests" / "data" / "old_runs" / "mtppo", "--out", tmp_path / "policy.onnx")
+    assert "within 7e-06 of torch in float32" in told
+    assert "policy computes in bfloat16: its actions are up to 0.04 away" in told
 
 
 def test_a_policy_whose_file_would_differ_is_refused() -> None:
@@ -67,7 +86,7 @@ def test_a_policy_whose_file_would_differ_is_refused() -> None:
 
 def test_a_run_exports_with_its_name_tag(shown, tmp_path: Path) -> None:
     run, out = ROOT / "tests" / "data" / "old_runs" / "mtppo", tmp_path / "policy.onnx"
-    assert "of torch on 256 random observations" in shown("export", run, "--out", out)
+    assert "of torch in float32 on 256 random observations" in shown("export", run, "--out", out)
     model = onnx.load(out)
     said = {entry.key: entry.value for entry in model.metadata_props}
     assert (said["suite"], said["algorithm"], said["seed"]) == ("MT4", "mtppo", "3")

@@ -94,7 +94,12 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("run --suite MT4 --learner.gamma 7", "gamma"),
         ("run --suite MT4 --algo mtpo", "Did you mean 'mtppo'?"),
         ("run --suite MT4 --preset lap", "Did you mean 'laptop'?"),
-        ("run --suite MT4 --device gpu", "auto, cpu or cuda:N"),
+        ("run --suite MT4 --device gpu", "auto, cpu, cuda or cuda:N"),
+        ("run --suite MT4 --device mps", "expected auto, cpu, cuda or cuda:N, got 'mps'. The physics runs on a CPU or"),
+        ("run --suite MT4 --device meta", "expected auto, cpu, cuda or cuda:N, got 'meta'"),
+        ("run --suite MT4 --device cpu:1", "expected auto, cpu, cuda or cuda:N, got 'cpu:1'"),
+        ("train --suite MT4", "Did you mean 'run'?"),
+        ("Test --suite MT4", "Did you mean 'evaluate'?"),
         ("run", "either --suite SUITE or --task TASK"),
         ("run --suite MT4 --task HandOver", "either --suite SUITE or --task TASK"),
         ("run --suite MT5", "Did you mean 'MT4'?"),
@@ -337,7 +342,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGPIPE])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR2, signal.SIGPIPE]
+)
 def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]

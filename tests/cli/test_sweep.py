@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -227,11 +228,101 @@ def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, cap
     out, runs = Path("runs/tiny"), planned()
     out.mkdir(parents=True)
     for job in queue.submit(runs, out, "local", {"timeout_min": 2}).values():
-        assert job.result() is None
+        assert job.result()
     assert all(state(run).state == "done" for run in runs)
     with pytest.raises(BidexError, match="submitit: "):
         queue.submit(runs, out, "local", {"timeout": 2})
-    assert queue.Job(runs[0], FAKE).checkpoint().function.run == runs[0]
+    assert queue.QueuedJob(runs[0], FAKE).checkpoint().function.run == runs[0]
+
+
+class Scheduler:
+    """Stands for Slurm: has submitit's own handlers call it, and sends real signals when a run has begun."""
+
+    def __init__(self, run: PlannedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        from submitit.core import job_environment, utils
+
+        self.requeued = False
+        self.job = queue.QueuedJob(run, FAKE)
+        monkeypatch.setenv("FAKE_SECONDS", "0.1")
+        environment = type("Slurm", (job_environment.JobEnvironment,), {"_requeue": self._requeue})
+        environment._env = {"global_rank": "NO_RANK"}
+        submission = utils.DelayedSubmission(self.job)
+        submission.set_timeout(60, 3)
+        environment()._handle_signals(utils.JobPaths(tmp_path, "1"), submission)
+
+    def _requeue(self, countdown: int) -> None:
+        assert self.job.process is not None and self.job.process.returncode is not None, "the run has ended by then"
+        self.requeued = True
+
+    def send(self, *signals: tuple[str, int]) -> None:
+        """Signals to the ``job`` or to its ``run``, once that has saved something."""
+        saved = self.job.run.path / "checkpoints" / "step"
+        _wait(saved.is_file)
+        assert self.job.process is not None
+        for to, number in signals:
+            os.kill(os.getpid() if to == "job" else self.job.process.pid, number)
+
+
+USR1, USR2, TERM = signal.SIGUSR1, signal.SIGUSR2, signal.SIGTERM
+
+
+@pytest.mark.parametrize(
+    ("signals", "requeued"),
+    [
+        ([("job", USR2), ("run", USR2), ("job", TERM)], True),
+        ([("run", USR1)], True),
+        ([("run", TERM)], False),
+        ([("job", TERM), ("run", TERM)], False),
+    ],
+    ids=["time limit", "run alone", "run cancelled", "all cancelled"],
+)
+def test_a_job_whose_time_is_up_saves_and_is_queued_again(
+    file: Path, tmp_path: Path, monkeypatch, signals: list, requeued: bool
+) -> None:
+    pytest.importorskip("submitit", reason="needs the extra slurm")
+    numbers = (USR1, USR2, TERM, signal.SIGCONT)
+    before = {number: signal.getsignal(number) for number in numbers}
+    run = planned()[0]
+    run.path.parent.mkdir(parents=True)
+    scheduler = Scheduler(run, monkeypatch, tmp_path)
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    sender = threading.Thread(target=scheduler.send, args=signals)
+    sender.start()
+    try:
+        if requeued:
+            with pytest.raises(SystemExit):  # as submitit ends the job
+                scheduler.job()
+        else:
+            assert not scheduler.job()
+        sender.join()
+        assert {number: signal.getsignal(number) for number in numbers} == handlers
+        assert scheduler.requeued == requeued
+        assert state(run).state == "left" and 0 < state(run).step < 6
+        assert queue.QueuedJob(run, FAKE)(), "queued again it ends"
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert state(run).state == "done" and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
+    assert [start["resumed"] for start in starts(tmp_path)[run.name]] == [False, True]
+
+
+def test_a_run_that_a_signal_stopped_has_not_failed(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("FAKE_SECONDS", "0.1")
+    file.write_text(FILE.replace("[0, 1]", "[0]") + STARTING)
+
+    def stop() -> None:
+        _wait((tmp_path / "runs/tiny/HandOver-ppo-seed0/checkpoints/step").is_file)
+        for path in Path("/proc").iterdir():
+            if path.name.isdigit() and _parent(path) == os.getpid():
+                os.kill(int(path.name), signal.SIGTERM)
+
+    threading.Thread(target=stop).start()
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", str(file)])
+    told = capsys.readouterr()
+    assert "HandOver-ppo-seed0 was stopped by a signal" in told.err
+    assert "HandOver-on-seed0 failed: it starts from HandOver-ppo-seed0, which was stopped" in told.err
+    assert "0 done, 0 runs, 0 failed, 2 left" in told.out and not list(tmp_path.glob("runs/tiny/*.failed"))
 
 
 @pytest.mark.slow

@@ -214,7 +214,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGUSR2, 140)])
 def test_a_signal_before_training_is_one_line_and_leaves_nothing(number: int, code: int, tmp_path: Path) -> None:
     command = [sys.executable, "-c", _WAIT, "run", *SMALL, "--run-dir", str(tmp_path / "r")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}

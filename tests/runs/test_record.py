@@ -124,6 +124,22 @@ def test_progress_in_a_terminal_is_a_table(monkeypatch):
     assert left.startswith("600 / 1,000 steps") and left.count("\n") == 1
 
 
+@pytest.mark.parametrize("width", [80, 100, 160])
+def test_the_live_heading_breaks_no_number_from_its_unit(monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    progress = Progress(20_000_000, stream=io.StringIO())
+    progress._shown = {"Train/mean_return": -1234.5, "Train/success_rate": 0.123, "Policy/teacher_share": 0.5}
+    progress._shown |= {f"Train/success/{name}": 0.5 for name in ("CatchOver2Underarm", "DoorCloseOutward")}
+    monkeypatch.setattr(progress, "_rate", lambda step: 2099.0)
+    with progress._console.capture() as shown:
+        progress._console.print(progress._table(12_345_678))
+    lines = shown.get().splitlines()
+    heading = lines[: next(number for number, line in enumerate(lines) if "━" in line)]
+    assert len(heading) == (2 if width < 110 else 1) and max(map(len, heading)) <= width
+    for part in ("12,345,678 / 20,000,000 steps", "2,099 steps/s", "1:00:47 left", "return -1234", "success 12.3 %"):
+        assert any(part in line for line in heading)
+
+
 def curve(*values, spread=None):
     mean = np.array(values, float)
     ends = (None, None) if spread is None else (mean - spread, mean + spread)
