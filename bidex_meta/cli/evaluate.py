@@ -14,10 +14,11 @@ from bidex_meta.cli.policies import load_policy, policy_loader
 from bidex_meta.cli.tables import Json, Sheet, evaluation_table, print_table, result_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import RandomAgent, Watched
+from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.versions import package_versions
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
@@ -123,13 +124,12 @@ def judged(
 
     ``brief`` ones, always beside random, have a table for a terminal.
     """
+    note(f"Building the world of {worlds.name}")
     world = worlds.world(split, options.num_envs)
-    longest = int(world.max_episode_steps.max())
-    found = worlds.judge(Watched(policy, longest, "Evaluating"), world, options.episodes, options.starts)
+    found = worlds.judge(policy, world, options.episodes, options.starts)
     result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
     if random:
-        uniform = Watched(RandomAgent(world.action_space), longest, "A random policy")
-        other = worlds.judge(uniform, world, options.episodes, options.starts)
+        other = worlds.judge(RandomAgent(world.action_space), world, options.episodes, options.starts)
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
         result |= {"random": other.to_json(), "return_above_random": differences}
     world.close()

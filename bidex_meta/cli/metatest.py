@@ -11,6 +11,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, MetaEvaluation, meta_evaluate
 from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
+from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
 OTHER_SEED = 500_000  # added to a run's seed for tasks that it was not trained on
@@ -72,6 +73,7 @@ def meta_test(
             f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
             f"episodes, {num_envs} environments."
         )
+        note(f"Building the world of {worlds.name}")
         world = worlds.world(split, num_envs)
         found[name] = meta_evaluate(
             load(), world, shots, rollouts=rollouts, episodes_per_task=episodes, tasks=tasks, trials=trials,

@@ -14,7 +14,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.leaderboard import class_rows, estimate, iqm, read_entry
-from bidex_meta.evaluation.play import EVALUATION_SEED, Watched
+from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
@@ -107,7 +107,6 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     for where, what in ((worlds, "its own tasks"), (others, "others")):
         say(f"{folder.path}: playing {what}.")
         world = where.world("train")
-        watched = Watched(policy, int(world.max_episode_steps.max()), "Playing")
-        found.append(where.judge(watched, world, flags.episodes, EVALUATION_SEED))
+        found.append(where.judge(policy, world, flags.episodes, EVALUATION_SEED))
         world.close()
     return found[0], found[1], steps, conditions(worlds)
