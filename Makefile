@@ -11,7 +11,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	done)
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c constraints.txt
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
@@ -106,7 +106,7 @@ docs: .venv-docs/.installed
 	@test -n "$(PYTHON)" || { echo "Expected Python 3.11, 3.12 or 3.13, found none. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	test -x .venv-docs/bin/python || $(PYTHON) -m venv .venv-docs
 	.venv-docs/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' > .venv-docs/needed.txt
-	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -r .venv-docs/needed.txt
+	.venv-docs/bin/python -m pip install --disable-pip-version-check -c constraints.txt -r .venv-docs/needed.txt
 	@touch $@
 
 # The wheel is made from the sdist, as an index would make it. Then it is installed alone, and used outside the checkout.
@@ -115,8 +115,8 @@ dist: .venv-dist/.installed
 	.venv-dist/bin/python -m build --no-isolation --outdir dist
 	.venv-dist/bin/python -m twine check --strict dist/*
 	rm -rf .venv-dist/tried && $(PYTHON) -m venv .venv-dist/tried && mkdir .venv-dist/tried/outside
-	.venv-dist/tried/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	.venv-dist/tried/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	.venv-dist/tried/bin/python -m pip install --disable-pip-version-check -c constraints.txt torch
+	.venv-dist/tried/bin/python -m pip install --disable-pip-version-check -c constraints.txt dist/*.whl
 	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta list suites
 	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta run --suite MT4 --device cpu --num-envs 8 --steps 400 \
 		--learner.hidden 16 --learner.rollout-steps 8 --episodes 1 --run-dir run
@@ -125,7 +125,7 @@ dist: .venv-dist/.installed
 	@test -n "$(PYTHON)" || { echo "Expected Python 3.11, 3.12 or 3.13, found none. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	test -x .venv-dist/bin/python || $(PYTHON) -m venv .venv-dist
 	.venv-dist/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["dist"], sep="\n")' > .venv-dist/needed.txt
-	.venv-dist/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -r .venv-dist/needed.txt
+	.venv-dist/bin/python -m pip install --disable-pip-version-check -c constraints.txt -r .venv-dist/needed.txt
 	@touch $@
 
 clean:
@@ -135,6 +135,7 @@ clean:
 # torch goes first and alone: the other packages then meet the build that fits this machine instead of choosing one.
 .venv/.installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Expected Python 3.11, 3.12 or 3.13, found none. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@echo "Installing PyTorch and the other packages, 2 GB, into .venv: two minutes or more. pip prints each package."
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(PIP) torch
 	$(PIP) -e .

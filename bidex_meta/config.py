@@ -96,8 +96,9 @@ class RunConfig(Generic[LearnerSettings]):
     """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
-    """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
-    whichever is up first, these or --steps. None: as long as --steps take."""
+    """Minutes to train for, over all resumes, at the end of an iteration; whichever is up first, these or --steps, ends
+    the training. Building the world before and evaluations, also the last one, are not counted: of short runs they can
+    take longer. None: as long as --steps take."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Evaluate every so many iterations, one episode for up to ten tasks of each class (at least ten overall; learners
     that adapt: one shot on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect training.

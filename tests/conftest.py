@@ -6,6 +6,8 @@ import hypothesis
 import pytest
 import torch
 
+from bidex_meta.utils import waiting
+
 hypothesis.settings.register_profile("bidex", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("bidex")
 
@@ -16,6 +18,13 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def no_signs_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However slow the machine, a command prints no more lines than it does on a fast one."""
+    monkeypatch.setattr(waiting, "_FIRST_SECONDS", float("inf"))
+    monkeypatch.setattr(waiting, "_SECONDS", float("inf"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -20,6 +20,7 @@ from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, 
 from bidex_meta.train.launch import launch, notices
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
+from bidex_meta.utils.waiting import watched
 
 _MEANT = {"train": "run", "test": "evaluate", "learn": "run", "fit": "run", "view": "play", "watch": "play"}
 _MEANT |= {"show": "render", "film": "render", "video": "render", "download": "pull", "upload": "push"}
@@ -171,7 +172,8 @@ def _dispatch(arguments: list[str]) -> int:
         if not word or re.fullmatch(r"--[\w.-]+=", word):
             flag = word.rstrip("=") or (rest[place - 1] if place else "a word")
             raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
-    importlib.import_module(COMMANDS[name].module).main(rest)
+    with watched(f"bidex-meta {name}, starting") if launch().rank == 0 else contextlib.nullcontext():
+        importlib.import_module(COMMANDS[name].module).main(rest)
     return 0
 
 

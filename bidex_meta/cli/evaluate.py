@@ -15,11 +15,12 @@ from bidex_meta.cli.policies import load_policy, policy_loader
 from bidex_meta.cli.tables import Json, Sheet, evaluation_table, print_table, result_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import RandomAgent, Watched
+from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
 from bidex_meta.utils.files import portable
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
@@ -123,14 +124,13 @@ def judged(
 
     ``brief`` ones, always beside random, have a table for a terminal.
     """
+    note(f"Building the world of {worlds.name}")
     world = worlds.world(split, options.num_envs)
-    longest = int(world.max_episode_steps.max())
     protocol = worlds.protocol(split, options.episodes, options.seed)
-    found = worlds.judge(Watched(policy, longest, "Evaluating"), world, protocol)
+    found = worlds.judge(policy, world, protocol)
     result, other = {"steps": step, "split": split, "seed": protocol.seed, "policy": found.to_json()}, None
     if random:
-        uniform = Watched(RandomAgent(world.action_space), longest, "A random policy")
-        other = worlds.judge(uniform, world, protocol)
+        other = worlds.judge(RandomAgent(world.action_space), world, protocol)
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
         result |= {"random": other.to_json(), "return_above_random": differences}
     world.close()

@@ -12,6 +12,7 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.suite import OTHERS
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
+from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
@@ -63,6 +64,7 @@ def meta_test(
             f"{max(counts)} tasks of each{often}, {protocol.shots} shot{'s' * (protocol.shots != 1)} of {rollouts} "
             f"episodes, {protocol.episodes_per_task} evaluation episodes, {num_envs} environments."
         )
+        note(f"Building the world of {source.name}")
         world = source.world(part, num_envs)
         found[split] = meta_evaluate(load(), world, protocol=protocol, references=source.references())
         world.close()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from bidex_meta.cli.parsing import LookFlags, Switch, parse
 from bidex_meta.utils import gl_backend, paths
 from bidex_meta.utils.validation import NonNegative, Port, Positive
+from bidex_meta.utils.waiting import note
 
 if TYPE_CHECKING:
     from bidex_meta.viewer.playback import Screen, Stage
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str]) -> None:
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     stage = Stage(world, agent, slots.index(task), flags.seed, tour)
     screen = _screen(flags, stage)
+    note("")  # what is on the screen moves
     with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
         play(stage, screen, flags.seconds)
     world.close()

@@ -29,6 +29,7 @@ from bidex_meta.train import distributed, runner
 from bidex_meta.train.distributed import together
 from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.utils.files import portable
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
@@ -72,9 +73,11 @@ def run(plan: RunPlan) -> None:
         say(f"{config.algo} on {plan.source.name}, {rows} environments on {config.device}, seed {config.seed}")
         say(f"Preset {config.preset}: {plan.preset_reason}.")
         autoreset = plan.kind.autoreset(config.learner_values)
+        note(f"Building the world of {plan.source.name}")
         world: Any = together(lambda: plan.source.world("train", config.num_envs, autoreset))
         if config.record:
             world = together(lambda: run_recording.recorded(plan, world))
+        note("Making the learner")
         learner = together(lambda: _make_learner(plan, world, fresh=loaded is None))
         own = together(lambda: plan.folder or (_new_folder(plan, held) if launch().rank == 0 else None))
         path = distributed.share(own and own.path)[0]  # process 0's
@@ -206,9 +209,27 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
             watch = watching.Watch(plan, folder, learner, record, len(rows))
             stack.callback(watch.close)
         stopped = train(record=record, watch=watch, last=last, spent_seconds=training_seconds(rows))
-    if not stopped and learner.env_steps < config.steps and config.minutes is not None:
+    if not stopped and plan.folder is not None and learner.env_steps == resume_step:
+        say(_nothing_left(config, learner.env_steps, training_seconds(rows) / 60.0))
+    elif not stopped and learner.env_steps < config.steps and config.minutes is not None:
         say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
     return stopped
+
+
+def _nothing_left(config: RunConfig, steps: int, minutes: float) -> str:
+    """Say why a resumed run has nothing to train, and which flag lets it go on."""
+    if steps >= config.steps:
+        return (
+            f"Nothing to train: the run has made {steps:,} steps, and --steps {config.steps} counts them too. For as "
+            f"many more: --steps {steps + config.steps}."
+        )
+    if config.minutes is not None and minutes >= config.minutes:
+        more = math.ceil(minutes) + config.minutes
+        return (
+            f"Nothing to train: the run has trained for {minutes:.1f} minutes, and --minutes {config.minutes:g} counts "
+            f"them too. For {config.minutes:g} more: --minutes {more:g}."
+        )
+    return "Nothing to train: the last iteration was enough. Raise --stop-at-success, -return or -score to go on."
 
 
 def _early_end(config: RunConfig) -> Any:

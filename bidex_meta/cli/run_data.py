@@ -1,6 +1,5 @@
 """Data sets of ``bidex-meta run``: what it learns from (--dataset) or imitates (--demonstrations), and metadata."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
@@ -16,6 +15,7 @@ from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.files import absolute, expanded
+from bidex_meta.utils.waiting import tell
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
@@ -141,7 +141,7 @@ def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
     """Open data sets, after a line of what they are for and one for each that was recorded by other rules."""
     datasets = open_datasets(names)
     steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
-    print(f"{what} {steps:,} transitions of {episodes:,} episodes.", file=sys.stderr, flush=True)
+    tell(f"{what} {steps:,} transitions of {episodes:,} episodes.")
     for dataset in datasets:
         recorded = dataset.metadata.get("rules")
         if isinstance(recorded, Mapping) and source.rules and (apart := rules_apart(recorded, source.rules)):

@@ -13,7 +13,6 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, estimate, iqm, read_entry
-from bidex_meta.evaluation.play import Watched
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
@@ -135,7 +134,6 @@ def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Eva
     for where, what in ((worlds, "its own tasks"), (others, "others")):
         say(f"{folder.path}: playing {what}.")
         world = where.world("train")
-        watched = Watched(policy, int(world.max_episode_steps.max()), "Playing")
-        found.append(where.judge(watched, world, where.protocol("train", flags.episodes)))
+        found.append(where.judge(policy, world, where.protocol("train", flags.episodes)))
         world.close()
     return found[0], found[1], steps, conditions(worlds)

@@ -32,6 +32,7 @@ from bidex_meta.runs.metrics import last_rows
 from bidex_meta.train.launch import BATCH_SIGNALS
 from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
+from bidex_meta.utils.waiting import note
 
 COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # what a run's words are given to
 _STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
@@ -229,6 +230,7 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
     After Ctrl-C or SIGTERM of the sweep each run saves and stops.
     """
     waiting, failed, free = list(runs), dict[Path | None, str](), list(cores)
+    note("")  # runs take hours, and each begins and ends with a line
     own: dict[Future[bool], Job] = {}
     jobs: list[Job] = []
 

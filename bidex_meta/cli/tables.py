@@ -17,6 +17,7 @@ from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.streams import output_width
+from bidex_meta.utils.waiting import tell
 
 Json = dict[str, Any]  # what JSON holds, or goes into it
 NONE = "–"
@@ -29,7 +30,7 @@ _BROKEN = (
 def say(text: str) -> None:
     """To stderr, of several processes from the first alone."""
     if launch().rank == 0:
-        print(text, file=sys.stderr, flush=True)
+        tell(text)
 
 
 @dataclass

@@ -24,6 +24,7 @@ from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import TaskWorld
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
@@ -168,6 +169,7 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
         agent.reset(playing)
         steps += _explore(agent, world, obs, playing, max_steps)
         remaining, first = remaining - playing.long(), False
+    note("Adapting")
     with torch.enable_grad():  # whatever the caller is in: to adapt is to learn
         agent.adapt()
     return steps
@@ -178,7 +180,9 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
     """One exploring episode in each environment of ``playing``, given to the agent; returns its valid transitions."""
     limit = world.max_episode_steps.clamp(max=max_steps)
     running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
-    for step in range(1, int(limit[playing].max()) + 1):
+    longest = int(limit[playing].max())
+    for step in range(1, longest + 1):
+        note("Playing episodes to adapt to", f"step {step} of {longest}")
         action, outputs = checked_outputs(agent, agent.adapt_action(obs))
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)

@@ -6,8 +6,6 @@ unscaled reward. An episode of broken physics is no success and counts with the 
 that is lower.
 """
 
-import sys
-import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -24,10 +22,10 @@ from bidex_meta.suite import HELD_STEPS
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import Seed
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import TaskWorld
 
 DEFAULT = Protocol()
-_SECONDS = 15.0  # from one sign of life of ``Watched`` to the next
 
 
 @checked_arguments
@@ -118,7 +116,9 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
     success, once, unstable = torch.zeros(3, world.num_envs, dtype=torch.bool, device=running.device).unbind()
     held = torch.zeros_like(lengths)
-    for _ in range(int(world.max_episode_steps.max())):
+    longest = int(world.max_episode_steps.max())
+    for step in range(longest):
+        note("Playing episodes to evaluate", f"step {step} of {longest}")
         obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
         gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))
@@ -181,24 +181,3 @@ class HeldAgent(RandomAgent):
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
         """The action ``(num_envs, action)``, on the device of ``obs``."""
         return self._held.to(obs.device)
-
-
-class Watched:
-    """An agent that says on stderr, every 15 seconds, how many steps of ``longest`` its episodes have come to."""
-
-    def __init__(self, agent: Agent, longest: int, what: str):
-        self._agent, self._longest, self._what = agent, longest, what
-        self._steps, self._said = 0, time.monotonic()
-
-    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """The agent's."""
-        self._steps += 1
-        if time.monotonic() - self._said >= _SECONDS:
-            self._said = time.monotonic()
-            print(f"{self._what}: step {self._steps} of {self._longest}", file=sys.stderr, flush=True)
-        return self._agent.eval_action(obs)
-
-    def reset(self, env_mask: torch.Tensor) -> None:
-        """The agent's: a round of episodes begins."""
-        self._steps = 0
-        self._agent.reset(env_mask)

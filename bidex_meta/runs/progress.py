@@ -18,6 +18,7 @@ from typing_extensions import override
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.streams import silence
 from bidex_meta.utils.validation import Seconds, Whole
+from bidex_meta.utils.waiting import note, told
 
 Item = TypeVar("Item")
 
@@ -73,6 +74,7 @@ class Progress:
         self._step = step
         try:
             if self._live is not None:
+                told()
                 self._live.update(self._table(step), refresh=True)
             elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
                 self._last_line = time.monotonic()
@@ -96,6 +98,7 @@ class Progress:
         return [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
 
     def _print(self, parts: Iterable[str]) -> None:
+        told()
         self._console.print(" | ".join(parts), soft_wrap=True, highlight=False, markup=False)
 
     def _table(self, step: int) -> Group:
@@ -137,6 +140,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
     """The items; how many of ``total`` ``what`` there were is a bar in a terminal, plain lines elsewhere, on stderr."""
     console = PlainConsole(file=stream or sys.stderr)
     if console.is_terminal:
+        note("")  # the bar moves by itself
         yield from track(items, description=what, total=total, console=console, transient=True)
         return
     reported = time.monotonic()
@@ -144,6 +148,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
         yield item
         if time.monotonic() - reported >= _COUNTED_SECONDS:
             reported = time.monotonic()
+            told()
             console.print(f"{number} of {total} {what}", highlight=False, markup=False)
 
 

@@ -20,6 +20,7 @@ from bidex_meta.runs.recorder import Recorder
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
 from bidex_meta.train.launch import notices
 from bidex_meta.train.learner import Learner, State
+from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
@@ -80,12 +81,16 @@ def train(
         late = any_process(is_main() and time.monotonic() - began_at >= total_seconds)
         return late or learner.env_steps >= total_steps
 
+    iterations = 0
     with _stop_requests() as stop:
         while not over() and not (stopped := any_process(stop.is_set())):
+            iterations += 1
+            note(f"Iteration {iterations} of this start")
             metrics = learner.iterate()
             metrics["Perf/training_time"] = time.monotonic() - began_at
             reached = False
             try:
+                note("Logging and evaluating")
                 if watch is not None:
                     paused_at = time.monotonic()
                     metrics |= watch()
@@ -109,6 +114,7 @@ def train(
 
 
 def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None:
+    note("Saving")
     state = checkpoint(learner, world)
     if record is not None and state is not None:
         record.save(state, learner.env_steps)

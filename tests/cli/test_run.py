@@ -13,6 +13,7 @@ import torch
 
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.runs import RunFolder, read_metrics
+from bidex_meta.utils import waiting
 from bidex_meta.worlds import Worlds
 from tests.algos.ranks import same
 from tests.pages import ROOT
@@ -254,7 +255,9 @@ def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path
     assert (RunFolder.open(path).config().minutes, final(path)[1]) == (1e-6, line["step"])
     # They are up: there is only the evaluation left.
     assert main(["run", "--resume", str(path)]) == 0
-    assert "random return" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "random return" in captured.out
+    assert "--minutes 1e-06 counts them too. For 1e-06 more: --minutes 1." in captured.err
     assert len(read_metrics(path / "metrics.jsonl")) == 1
     # Steps come first, and the time goes on from where it was.
     goal = str(3 * line["step"])
@@ -269,6 +272,26 @@ def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path
     more = ["--steps", str(10 * line["step"]), "--no-evaluate"]
     assert main(["run", "--resume", str(path), "--minutes", "119", *more]) == 0
     assert len(read_metrics(path / "metrics.jsonl")) == 3
+
+
+def test_a_resume_with_all_steps_made_says_what_to_add(toy_worlds, tmp_path, capsys):
+    assert run("--steps", 48, "--run-dir", tmp_path / "r", "--no-evaluate") == 0
+    assert main(["run", "--resume", str(tmp_path / "r"), "--no-evaluate"]) == 0
+    told = capsys.readouterr().err
+    assert "Nothing to train: the run has made 48 steps, and --steps 48 counts them too." in told
+    assert "For as many more: --steps 96." in told
+
+
+def test_whatever_takes_long_is_noted(toy_worlds, tmp_path, monkeypatch):
+    noted = []
+    monkeypatch.setattr(
+        waiting._Watch, "what", property(lambda self: "x", lambda self, what: noted.append(what)), False
+    )
+    assert run("--steps", 48, "--run-dir", tmp_path / "r", "--episodes", 1) == 0
+    expected = ["run, starting", "Building the world of MT4", "Making the learner", "Iteration 1", "Saving"]
+    expected += ["Playing episodes to evaluate"]
+    places = [next(i for i, what in enumerate(noted) if part in what) for part in expected]
+    assert places == sorted(places)
 
 
 def test_resume_refuses_a_changed_config_and_takes_the_same_one(toy_worlds, tmp_path, refused):

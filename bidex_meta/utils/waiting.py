@@ -1,0 +1,77 @@
+"""Signs of life of a command: a line on stderr whenever it has printed none for a while.
+
+``watched`` keeps a thread that looks at the clock; whatever takes long notes what it is at. Nothing is printed outside.
+"""
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+_LOOK_SECONDS = 1.0
+# With the time between two looks no more than 5 and 15 seconds.
+_FIRST_SECONDS = 4.0
+_SECONDS = 14.0
+
+
+class _Watch:
+    """What the command is at, since when, and when its last line was printed."""
+
+    def __init__(self, what: str, clock: Callable[[], float]):
+        self.clock = clock
+        self.what, self.detail, self.since = what, "", clock()
+        self.told_at, self.patience = clock(), _FIRST_SECONDS
+
+    def look(self) -> None:
+        """Print a line if the last one is too old."""
+        now = self.clock()
+        if self.what and now - self.told_at >= self.patience:
+            detail = f", {self.detail}" if self.detail else ""
+            tell(f"{self.what}{detail}: {now - self.since:.0f} s so far.")
+
+
+_watch: _Watch | None = None
+
+
+def note(what: str, detail: str = "") -> None:
+    """Say what the command is at, for the next sign of life; nothing (``""``) stops them until the next note."""
+    if _watch is None:
+        return
+    if what != _watch.what:
+        _watch.what, _watch.since = what, _watch.clock()
+    _watch.detail = detail
+
+
+def told() -> None:
+    """Report that something was printed elsewhere."""
+    if _watch is not None:
+        _watch.told_at, _watch.patience = _watch.clock(), _SECONDS
+
+
+def tell(text: str) -> None:
+    """Print a line on stderr."""
+    print(text, file=sys.stderr, flush=True)
+    told()
+
+
+@contextlib.contextmanager
+def watched(what: str) -> Iterator[None]:
+    """Print signs of life while the block runs, at first of ``what``."""
+    global _watch
+    outer, _watch = _watch, _Watch(what, time.monotonic)
+    ended = threading.Event()
+    thread = threading.Thread(target=_look, args=(_watch, ended), name="signs of life", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        _watch = outer
+
+
+def _look(watch: _Watch, ended: threading.Event) -> None:
+    with contextlib.suppress(OSError, ValueError):  # nobody reads stderr any more: the command finds out by itself
+        while not ended.wait(_LOOK_SECONDS):
+            watch.look()
