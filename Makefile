@@ -1,9 +1,10 @@
 # The three things a person does here: make run, make test, make format.
 # Needs Python 3.11 to 3.13 and nothing else; everything goes into .venv.
 
-# Of so short a run half the default's rows make more: at 1.14 M steps 10 % success in training instead of 4 %.
+# One class of version 2 that PPO learns within minutes. The discount sees a whole episode of 250 steps, and small noise
+# lets the policy hold still; four door classes at once had 2 % success after as many steps.
 MINUTES ?= 4.6
-RUN_ROWS ?= 512
+RUN_FLAGS ?= --task DoorOpenOutward-v2 --algo ppo --num-envs 256 --learner.gamma 0.99 --learner.init-std 0.3
 
 # The first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` chooses one by hand.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -19,7 +20,7 @@ SOURCES := bidex_meta algos tools examples tests docs/site
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make run       train MT-PPO on MT4 for MINUTES=$(MINUTES) and evaluate it beside a random policy"
+	@echo "make run       train PPO on a door of version 2 for MINUTES=$(MINUTES) and compare it with a random policy"
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
@@ -35,7 +36,7 @@ help:
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
 run: .venv/.installed
-	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --num-envs $(RUN_ROWS) --minutes $(MINUTES) --episodes 1
+	$(BIN)/bidex-meta run $(RUN_FLAGS) --minutes $(MINUTES) --episodes 1
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
