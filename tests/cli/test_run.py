@@ -243,7 +243,8 @@ def test_a_resumed_run_equals_an_unbroken_one(toy_worlds, tmp_path):
 
 
 @pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac"])
-def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path, capsys):
+def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # narrower tables leave columns out
     path = tmp_path / "r"
     flags = ["--suite", "MT4", "--num-envs", 6, "--threads", 1, "--device", "cpu", "--learner.hidden", 8]
     flags += ["--algo", algo, "--run-dir", path, "--episodes", 1]

@@ -84,7 +84,8 @@ def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(file: Path, tm
     assert state(run, config).state == "left" and state(run, config).goal == 4
 
 
-def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
+def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # narrower tables leave columns out
     file.write_text(FILE.replace("[0, 1]", "[13, 1]"))
     with pytest.raises(SystemExit, match="1"):
         main(["sweep", str(file)])
