@@ -11,7 +11,7 @@ EVALUATION_SEED = 1_000_000
 _LEAST = {
     "seed": 0, "tasks": 1, "episodes_per_task": 1, "shots": 0, "rollouts": 1, "trials": 1, "max_adapt_steps": 1
 }  # fmt: skip
-_MOST_EPISODES = 1_000_000
+_MOST = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Protocol:
         for name, least in _LEAST.items():
             value = getattr(self, name)
             if value is not None or name not in ("tasks", "rollouts", "max_adapt_steps"):
-                whole_number(name, value, least, _MOST_EPISODES if name == "episodes_per_task" else None)
+                whole_number(name, value, least, None if name in ("seed", "shots", "max_adapt_steps") else _MOST)
 
     def changed(self, **given: str | int | None) -> "Protocol":
         """Return the protocol with the entries that are given; None leaves an entry as it is."""

@@ -15,9 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from typing_extensions import override
 
-from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.streams import silence
-from bidex_meta.utils.validation import Seconds, Whole
 from bidex_meta.utils.waiting import note, told
 
 Item = TypeVar("Item")
@@ -43,9 +41,8 @@ class Progress:
     there is a time, that is what is said to be done. Speed counts from ``start_step`` on, where this process began.
     """
 
-    @checked_arguments
     def __init__(
-        self, total_steps: Whole, total_seconds: Seconds = math.inf, start_step: Whole = 0, stream: TextIO | None = None
+        self, total_steps: int, total_seconds: float = math.inf, start_step: int = 0, stream: TextIO | None = None
     ):
         self._console = PlainConsole(file=stream or sys.stderr)
         self._total, self._total_seconds = total_steps, total_seconds
@@ -64,8 +61,7 @@ class Progress:
         if self._live is not None:
             self._live.start()
 
-    @checked_arguments
-    def update(self, metrics: Mapping[str, Any], step: Whole) -> None:
+    def update(self, metrics: Mapping[str, Any], step: int) -> None:
         """Show the metrics of an iteration; those of earlier ones stay, since it may end no episode.
 
         Raises BrokenPipeError where the reader has ended or the terminal is gone; later output goes nowhere.

@@ -4,8 +4,10 @@ import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from bidex_meta.runs.checkpoints import State
 from bidex_meta.runs.folder import RunFolder
@@ -25,7 +27,7 @@ class Recorder:
 
     @checked_arguments
     def __init__(
-        self, folder: RunFolder, total_steps: Whole, total_seconds: Seconds = math.inf,
+        self, folder: RunFolder, total_steps: Annotated[int, Meta(ge=0, le=10**15)], total_seconds: Seconds = math.inf,
         resume_step: Whole | None = None, logger: str = "tensorboard"
     ):  # fmt: skip
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path

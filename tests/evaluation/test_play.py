@@ -91,7 +91,7 @@ def test_python_and_the_commands_play_the_same_starts():
         ({"split": "tests"}, "split: expected one of train, test, others, got 'tests'."),
         ({"seed": -1}, "seed: expected a whole number from 0 on, got -1."),
         ({"shots": 1.0}, "shots: expected a whole number from 0 on, got 1.0."),
-        ({"trials": None}, "trials: expected a whole number from 1 on, got None."),
+        ({"trials": None}, "trials: expected a whole number from 1 to 1000000, got None."),
         ({"episodes_per_task": 0}, "episodes_per_task: expected a whole number from 1 to 1000000, got 0."),
     ],
 )

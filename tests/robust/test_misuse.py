@@ -29,7 +29,6 @@ from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorld
 from bidex_meta.runs import (
     Checkpoints,
     MetricsWriter,
-    Progress,
     Recorder,
     RunFolder,
     mend,
@@ -92,7 +91,8 @@ class Shop:
         self.numpy = make_task_world("HandOver", **options).to_numpy()
         self.rsl = RslRlVecEnv(make_task_world("HandOver", **options))
         self.sb3 = SB3VecEnv(make_task_world("HandOver", **options))
-        self.skrl = SkrlEnv(make_task_world("HandOver", **options))
+        self.next_step = make_task_world("HandOver", autoreset_mode="NEXT_STEP", **options)
+        self.skrl = SkrlEnv(self.next_step)
         self.metaworld = MetaWorldEnvs(make_task_world("HandOver", autoreset_mode="DISABLED", **options))
         for world in (self.world, self.training, self.masked, self.few):
             world.reset(seed=0)
@@ -235,12 +235,13 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "on": (False, "true"),
     }),
     "TaskEnv": lambda s: (made(TaskEnv), {
-        "task_name": ("HandOver", ""), "render_mode": (None, "None"), "seed": (0, SEED), "device": ("cpu", ""),
+        "task_name": ("HandOver", ""), "render_mode": (None, "None"),
+        "seed": (0, SEED + " None"), "device": ("cpu", ""),
     }),
     "TaskEnv.reset": lambda s: (s.task_env.reset, {"seed": (0, SEED + " None"), "options": (None, "None dict")}),
     "TaskEnv.step": lambda s: (s.task_env.step, {"action": (np.zeros(40), "")}),
     "HandsEnv": lambda s: (made(HandsEnv), {
-        "task": ("HandOver", ""), "agents": ("hands", ""), "render_mode": (None, "None"), "seed": (0, SEED),
+        "task": ("HandOver", ""), "agents": ("hands", ""), "render_mode": (None, "None"), "seed": (0, SEED + " None"),
     }),
     "HandsEnv.reset": lambda s: (s.hands.reset, {"seed": (0, SEED + " None"), "options": (None, "None dict")}),
     "HandsEnv.step": lambda s: (s.hands.step, {"actions": ({"right": np.zeros(20), "left": np.zeros(20)}, "")}),
@@ -253,7 +254,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "num_envs": (5, "-None"), "benchmark_seed": (0, SEED + " None"), "render_mode": (None, "None"),
     }),
     "gymnasium.make": lambda s: (made(lambda **a: gymnasium.make("bidex-meta/HandOver-v1", **a)), {
-        "seed": (0, SEED), "device": ("cpu", ""),
+        "seed": (0, SEED + " None"), "device": ("cpu", ""),
     }),
     "RslRlVecEnv": lambda s: (RslRlVecEnv, {
         "world": (s.training, ""), "policy": ((), "list"), "stagger": (False, "true"),
@@ -266,7 +267,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "SB3VecEnv": lambda s: (SB3VecEnv, {"world": (s.training, ""), "stagger": (False, "true")}),
     "SB3VecEnv.step": lambda s: (s.sb3.step, {"actions": (s.actions.numpy(), "")}),
     "SkrlEnv": lambda s: (SkrlEnv, {
-        "world": (s.training, ""), "seed": (0, "zero one None"), "stagger": (False, "true"),
+        "world": (s.next_step, ""), "seed": (0, "zero one None"), "stagger": (False, "true"),
     }),
     "SkrlEnv.step": lambda s: (s.skrl.step, {"actions": (s.actions, "")}),
     "TorchRLEnv": lambda s: (TorchRLEnv, {"world": (s.training, ""), "stagger": (False, "true")}),
@@ -274,15 +275,16 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "RandomAgent": lambda s: (RandomAgent, {"action_space": (s.few.action_space, ""), "seed": (0, "zero one")}),
     "HeldAgent": lambda s: (HeldAgent, {"action_space": (s.few.action_space, ""), "seed": (0, "zero one")}),
     "evaluate": lambda s: (evaluate, {
-        "agent": (s.zero, ""), "world": (s.few, ""), "episodes_per_task": (1, "one"), "seed": (0, SEED + " None"),
+        "agent": (s.zero, ""), "world": (s.few, ""), "episodes_per_task": (1, "one None"), "seed": (0, SEED + " None"),
         "references": (None, "None dict"),
     }),
     "meta_evaluate": lambda s: (meta_evaluate, {
         "agent": (s.zero, ""), "world": (s.few, ""), "shots": (0, "zero"), "rollouts": (None, "None one"),
-        "episodes_per_task": (1, "one"), "tasks": (None, "None one"),
-        "trials": (1, "one"), "max_adapt_steps": (5, "one huge"), "seed": (0, SEED), "references": (None, "None dict"),
+        "episodes_per_task": (1, "one None"), "tasks": (None, "None one"),
+        "trials": (1, "one None"), "max_adapt_steps": (5, "one huge None"),
+        "seed": (0, SEED + " None"), "references": (None, "None dict"),
         "adapt_world": (None, "None"),
-        "evaluated": (None, "None"), "split": ("", "empty word"),
+        "evaluated": (None, "None"),
     }),
     "compare": lambda s: (compare, {"a": (s.evaluation, ""), "b": (s.evaluation, "")}),
     "open_dataset": lambda s: (open_dataset, {"name_or_path": ("nope", "")}),
@@ -309,10 +311,6 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "read_metrics": lambda s: (read_metrics, {"path": (s.run.metrics_path, "")}),
     "mend": lambda s: (mend, {"path": (s.run.metrics_path, "nowhere"), "step": (5, "zero one")}),
     "training_seconds": lambda s: (training_seconds, {"rows": ([], "list")}),
-    "Progress": lambda s: (made(Progress), {
-        "total_steps": (5, "zero one"), "total_seconds": (1.0, "zero one half inf huge"), "start_step": (0, "zero one"),
-    }),
-    "Progress.update": lambda s: (Progress(5).update, {"metrics": ({}, "dict"), "step": (5, "zero one")}),
     "Recorder": lambda s: (Recorder, {
         "folder": (s.run, ""), "total_steps": (5, "zero one"), "total_seconds": (1.0, "zero one half inf huge"),
         "resume_step": (None, "None zero one"), "logger": ("none", ""),
