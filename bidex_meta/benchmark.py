@@ -192,7 +192,7 @@ class Benchmark:
 
     @property
     def others(self) -> "Benchmark":
-        """The suite with as many other tasks, whose train tasks no run trained on."""
+        """Return the same suite with unseen tasks: the same number, drawn by another seed, that no run trained on."""
         return Benchmark(self.suite, self.seed + OTHER_SEED)
 
     @property
@@ -219,8 +219,8 @@ class Benchmark:
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo their number.
 
         Args:
-            split: `"train"`, `"test"`, or `"others"`: as many tasks of the train classes that no run trained on, drawn
-                by another seed.
+            split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
+                another seed, that no run trained on.
             num_envs: Environments over all classes, divided evenly; left out, 1024 on the CPU, 8192 on an accelerator.
             device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
             seed: Seed of starts and task draws; left out, the benchmark's.
@@ -274,7 +274,8 @@ class Benchmark:
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        points, classes = (self.suite.points, self.suite.point_kinds), dict[str, type[SuiteEnv]]()
+        points = (self.suite.points, self.suite.point_kinds)
+        classes = dict[str, type[SuiteEnv]]()
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
             own = entry.reward_scale, entry.class_name, self.suite.rules, points, bool(entry.tasks)

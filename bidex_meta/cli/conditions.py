@@ -1,4 +1,4 @@
-"""What an evaluation's numbers depend on, and whether a run was made with what is here: said, or refused."""
+"""Conditions of an evaluation, and checks that a run was made with this installation and suite."""
 
 from collections.abc import Sequence
 
@@ -13,11 +13,12 @@ _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
 def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:
-    """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
+    """Return what an evaluation's numbers depend on besides the policy: ``conditions`` of ``evaluation.json``.
 
-    Of the worlds that were played, and the environments that were asked for (None: the default).
+    ``num_envs`` is the number of environments that was asked for; None: the default.
     """
-    wanted, identity = [*_PACKAGES], worlds.identity()
+    wanted = [*_PACKAGES]
+    identity = worlds.identity()
     if worlds.device.startswith("cuda") or worlds.engine == "warp":
         wanted.append("mujoco-warp")
     if identity["physics"] is None:
@@ -33,7 +34,7 @@ def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Diff
     return differences(folder.versions(), conditions(worlds or Worlds.open(folder.config().to_json())))
 
 
-def note(folder: RunFolder) -> None:
+def say_differences(folder: RunFolder) -> None:
     """Say in one line how a run's record differs from this installation and its suite, if it does."""
     try:
         found = differences_of(folder)

@@ -128,7 +128,8 @@ def judged(
     world = worlds.world(split, options.num_envs)
     protocol = worlds.protocol(split, options.episodes, options.seed)
     found = worlds.judge(policy, world, protocol)
-    result, other = {"steps": step, "split": split, "seed": protocol.seed, "policy": found.to_json()}, None
+    result = {"steps": step, "split": split, "seed": protocol.seed, "policy": found.to_json()}
+    other = None
     if random:
         other = worlds.judge(RandomAgent(world.action_space), world, protocol)
         differences = {name: asdict(difference) for name, difference in compare(found, other).items()}

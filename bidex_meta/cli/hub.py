@@ -1,4 +1,4 @@
-"""What ``bidex-meta push`` and ``pull`` share: names, the files of a folder, their checks, and the hub's library."""
+"""Helpers of ``bidex-meta push`` and ``pull``: names, the files of a folder, their checks, and the hub's library."""
 
 import contextlib
 import json
@@ -22,11 +22,11 @@ DATASETS = "datasets/"
 OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "metrics.jsonl", "policy.onnx", "checkpoints/*.pt")
 OF_DATA = ("data/metadata.json", "data/*.hdf5")
 SUITES = "*.toml"
-"""Files of suites of one's own, beside the run that was trained on one."""
+"""Suite files of the user's own; the file is published with the run that was trained on the suite."""
 CARD = "README.md"
 _METADATA = f"data/{part_files.METADATA}"
 Files = Mapping[str, Path | bytes]
-"""What is published, by the path within the folder: a file, or its content."""
+"""Published files by their path within the folder: a file, or its content."""
 
 
 def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) -> dict[str, Path]:

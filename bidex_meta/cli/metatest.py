@@ -51,7 +51,8 @@ def meta_test(
     check_worlds(worlds, config.algo)
     found = {}
     for split in splits:
-        source, part = (worlds.others, "train") if split == OTHERS else (worlds, split)
+        source = worlds.others if split == OTHERS else worlds
+        part = "train" if split == OTHERS else split
         counts = [len(pool) for pool in source.tasks(part).values()]
         limit = options.num_envs or _ENVIRONMENTS
         protocol = _protocol(worlds, config, options, split, counts, limit)
@@ -74,7 +75,7 @@ def meta_test(
 def _protocol(
     worlds: Worlds, config: RunConfig, options: Options, split: str, counts: list[int], limit: int
 ) -> Protocol:
-    """What is played of a split whose classes have ``counts`` tasks, in ``limit`` environments at most."""
+    """Return the protocol for a split whose classes have ``counts`` tasks, with at most ``limit`` environments."""
     rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
     tasks = min(options.tasks or TASKS, max(counts))
     return Protocol(

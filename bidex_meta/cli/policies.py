@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli.conditions import note
+from bidex_meta.cli.conditions import say_differences
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.cli.tables import Json, say
@@ -36,7 +36,7 @@ def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> t
     """
     loaded = _loaded(folder, which)
     if not noted:
-        note(folder)
+        say_differences(folder)
     return loaded
 
 

@@ -196,13 +196,13 @@ class QueuedJob(Job):
         """Begin or resume the run, as ``Job`` does; if a batch system stops it, queue the job again and exit."""
         asked: list[int] = []
 
-        def note(number: int, frame: FrameType | None) -> None:
+        def remember(number: int, frame: FrameType | None) -> None:
             asked.append(number)
             self.stop()
 
         requeueing = signal.Signals[f"SIG{os.environ.get('SUBMITIT_PREEMPT_SIGNAL', 'USR2')}"]  # read by submitit too
         numbers = {*BATCH_SIGNALS, signal.SIGTERM, requeueing}
-        handlers = {number: signal.signal(number, note) for number in numbers}
+        handlers = {number: signal.signal(number, remember) for number in numbers}
         try:
             done = super().__call__()
             if not asked and self.process is not None:  # the signal reached the run alone, or before it reached us

@@ -55,7 +55,7 @@ class Sheet:
         self.styles.append(style)
 
     def printed(self, width: int) -> str:
-        """Lay the table out in ``width`` columns, or in as many more as its first two columns need."""
+        """Lay the table out in ``width`` columns; in more, if its first two columns need more."""
         shown = self._columns()
         left_out: list[str] = []
         for column in sorted(shown[2:], key=self._first_to_go):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bidex_meta.cli.conditions import note
+from bidex_meta.cli.conditions import say_differences
 from bidex_meta.cli.parsing import RunPath, parse
 from bidex_meta.cli.policies import say_other_rules
 from bidex_meta.cli.run_config import plan_run
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(TransferFlags, arguments[:at], "transfer")
     arms = arms_of([flags.run, *flags.start_from])
     for run in (flags.run, *flags.start_from):
-        note(RunFolder.open(run))
+        say_differences(RunFolder.open(run))
     config = RunFolder.open(flags.run).config()
     worlds = Worlds.open(config.to_json())
     for path in flags.start_from:

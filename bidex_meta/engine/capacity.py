@@ -13,7 +13,9 @@ from bidex_meta.utils.validation import Whole
 class Capacity:
     """Room per world, or the most of it in use."""
 
-    contacts: Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each
+    contacts: (
+        Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world
+    )
     convex: Whole  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
     rows: Whole  # constraint rows, a hard limit for each world
 

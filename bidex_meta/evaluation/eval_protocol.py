@@ -1,4 +1,4 @@
-"""What an evaluation plays: one object for Python and for the commands."""
+"""Protocol of an evaluation: seeds, tasks and episodes, the same object for Python and for the commands."""
 
 from dataclasses import dataclass, replace
 

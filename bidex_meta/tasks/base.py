@@ -19,6 +19,7 @@ from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
+from bidex_meta.tasks.scene import Point
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
@@ -58,9 +59,6 @@ class Solver:
                 f"{self.time_step}. Write 1 / 120, 1 / 180 or 1 / 240."
             )
 
-
-Point = tuple[Finite, Finite, Finite]
-"""A place in the world, metres."""
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
 """For eggs, held for a second: what creeps by a millimetre a second does no harm."""
