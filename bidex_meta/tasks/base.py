@@ -19,12 +19,11 @@ from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
-from bidex_meta.tasks.scene import Point
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant
-from bidex_meta.utils.validation import Count, Finite, NonNegative, Positive, Text, Whole, true_or_false
+from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Positive, Text, Whole, true_or_false
 
 CONTROL_RATE = 60
 """Control steps per second of every class (docs/figures.md, control)."""

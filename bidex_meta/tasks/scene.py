@@ -13,12 +13,11 @@ from bidex_meta.tasks.state import unknown_sensor
 from bidex_meta.utils import paths
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import quaternion_from_rpy
-from bidex_meta.utils.validation import Finite, Fraction, NonNegative, Text
+from bidex_meta.utils.validation import Fraction, NonNegative, Point, Text
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
-Point = tuple[Finite, Finite, Finite]
 Colour = tuple[Fraction, Fraction, Fraction, Fraction]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""

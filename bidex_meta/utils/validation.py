@@ -35,6 +35,7 @@ Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Width = Annotated[int, Meta(ge=1, le=65_536)]  # of a network's layer; so wide a one alone holds 17 GB
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, max_length=64)]
 Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
+Point = tuple[Finite, Finite, Finite]  # a place in the world, metres
 Positive = Annotated[float, Meta(gt=0.0, le=_LARGE)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
 Seconds = Annotated[float, Meta(ge=0.0)]  # may be infinite

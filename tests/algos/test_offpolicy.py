@@ -68,7 +68,12 @@ def test_lqr_comes_close_to_the_riccati_optimum(name: str, n_steps: int) -> None
     config = replace(config, n_steps=n_steps)
     if name == "mtsac":
         config = replace(config, target_entropy_per_action=-2.0, learning_rate=2e-3)
-    learner = trained(kind, LQR(), config, 20 if name in ("fasttd3", "brc") else 22)
+    iterations = 20 if name in ("fasttd3", "brc") else 22
+    if (name, n_steps) == ("brc", 3):
+        iterations = (
+            32  # after 20 it loses 1.36 times what the controller does on a processor without AVX-512, now 1.12
+        )
+    learner = trained(kind, LQR(), config, iterations)
     assert is_near_the_optimum(learner.eval_action, 0.8, 1.35)
 
 
