@@ -30,14 +30,17 @@ class EpisodeStatistics:
         self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new
 
     def metrics(self) -> dict[str, float]:
-        """Means of each task, and over tasks, of all processes; a task that has finished no episode is left out."""
+        """Return the means of each task that has finished an episode, over all processes.
+
+        Means over tasks are added once every task has finished one: before, they would be means of the fast tasks.
+        """
         returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
         out: dict[str, float] = {}
         for i in seen:
             out[f"Train/return/{self.task_names[i]}"] = returns[i] / counts[i]
             out[f"Train/success/{self.task_names[i]}"] = successes[i] / counts[i]
-        if seen:
+        if len(seen) == len(self.task_names):
             out["Train/mean_return"] = sum(returns[i] / counts[i] for i in seen) / len(seen)
             out["Train/success_rate"] = sum(successes[i] / counts[i] for i in seen) / len(seen)
             out["Train/mean_episode_length"] = sum(lengths[i] / counts[i] for i in seen) / len(seen)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
@@ -224,3 +225,13 @@ def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str
         config = replace(preset, **{name: value for name, value in small.items() if name in vars(preset)})
         learner = kind.make(opposite_bandits(), config, seed=0)
         assert learner.offline or learner.taught or any(name.startswith("Loss/") for name in learner.iterate())
+
+
+def test_means_over_tasks_wait_for_every_task():
+    """Of two tasks, the fast one ends first: its success alone is not the success of both."""
+    statistics = EpisodeStatistics(torch.tensor([0, 1]), ["fast", "slow"])
+    episode = {"r": torch.ones(2), "l": torch.ones(2), "success": torch.tensor([True, False])}
+    statistics.update({"so_far": episode, "counted": torch.tensor([True, False])})
+    assert set(statistics.metrics()) == {"Train/return/fast", "Train/success/fast"}
+    statistics.update({"so_far": episode, "counted": torch.tensor([False, True])})
+    assert statistics.metrics()["Train/success_rate"] == 0.5
