@@ -143,8 +143,8 @@ class FakeWorld(ABC):
             "reward_terms": {"all": unscaled},
             "final_obs": final_obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(self.success_at_end),
-            "counted": ended & episodes.counts,
+            "running": episodes.statistics(self.success_at_end),
+            "episode_mask": ended & episodes.counts,
         }
         if ended.any():
             info |= ended_info(info)

@@ -141,7 +141,7 @@ def test_each_rule_of_version_2_works_alone(rule: str, tmp_path: Path) -> None:
     assert torch.equal(obs, new) == np.array_equal(first, start) == same
     assert torch.equal(reward, paid) == (rule == "success") == (gain == got)
     assert (paid.max() < 1.0) == (rule == "reward")
-    assert info["so_far"]["success"].all() and told["so_far"]["success"].any() == (rule != "success")
+    assert info["running"]["success"].all() and told["running"]["success"].any() == (rule != "success")
 
 
 VERSION_2 = {'reward = "paper"\n': "".join(f'{name} = "{value}"\n' for name, value in RULES.items())}

@@ -28,7 +28,7 @@ from tests.points import PointWorld, ring
 from tests.world.play import class_world, flat, suite_world
 
 ROWS = 7  # two slots share them unevenly
-ROW_INFO = {"success": torch.bool, "unstable": torch.bool, "_final_obs": torch.bool, "counted": torch.bool}
+ROW_INFO = {"success": torch.bool, "unstable": torch.bool, "_final_obs": torch.bool, "episode_mask": torch.bool}
 ROW_INFO |= {"reward_unscaled": torch.float32}
 EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool, "unscaled": torch.float32}
 BOTH = ("SAME_STEP", "DISABLED")
@@ -201,7 +201,7 @@ def test_shapes_and_types(case: Case) -> None:
             assert each.shape == world.observation_space.shape and each.dtype == torch.float32 and each.isfinite().all()
             assert world.observation_space.contains(each.cpu().numpy())
         expected = {name: (info[name], kind) for name, kind in ROW_INFO.items()}
-        expected |= {f"so_far/{name}": (info["so_far"][name], kind) for name, kind in EPISODE.items()}
+        expected |= {f"running/{name}": (info["running"][name], kind) for name, kind in EPISODE.items()}
         expected |= {"reward": (reward, torch.float32), "terminated": (terminated, torch.bool)}
         expected |= {"truncated": (truncated, torch.bool)}
         for name, (value, kind) in expected.items():
@@ -228,13 +228,13 @@ def test_a_step_tells_its_transition(case: Case) -> None:
         assert not (terminated & truncated).any()
         assert torch.equal(ended, (terminated | truncated) & ~frozen)
         assert torch.equal(final[~ended], after[~ended])
-        assert not (info["counted"] & ~ended).any() and (same or torch.equal(info["counted"], ended))
+        assert not (info["episode_mask"] & ~ended).any() and (same or torch.equal(info["episode_mask"], ended))
         for value in (reward, info["reward_unscaled"]):
             assert (value[frozen] == 0).all()
         returns, lengths = returns + reward.cpu(), lengths + (~frozen).cpu()
         success |= (info["success"] & ~frozen).cpu()
-        assert torch.allclose(info["so_far"]["r"].cpu(), returns) and torch.equal(info["so_far"]["l"].cpu(), lengths)
-        assert torch.equal(info["so_far"]["success"].cpu(), success)
+        assert torch.allclose(info["running"]["r"].cpu(), returns) and torch.equal(info["running"]["l"].cpu(), lengths)
+        assert torch.equal(info["running"]["success"].cpu(), success)
         seen += int(ended.sum())
         if same:
             assert (after[ended] != final[ended]).any(1).all()
@@ -261,13 +261,13 @@ def test_a_reset_mask_starts_just_these(case: Case) -> None:
     assert told == {} and torch.equal(obs[~mask], before["obs"][~mask]) and (obs[mask] != before["obs"][mask]).any()
     after = flat(world.step(given[5]))
     # Nobody's last step was its episode's end in SAME_STEP mode, or they begin at 1 as well.
-    lengths = after["info/so_far/l"]
+    lengths = after["info/running/l"]
     assert (lengths[mask] == 1).all()
     if case.mode == "DISABLED":
         over = before["terminated"] | before["truncated"]
         still, woken = over & ~mask, over & mask
         assert still.any() and woken.any()
-        assert torch.equal(lengths[still], before["info/so_far/l"][still])
+        assert torch.equal(lengths[still], before["info/running/l"][still])
         assert (after["terminated"] | after["truncated"])[still].all()
         assert (lengths[~over & ~mask] == 6).all()
     with pytest.raises(BidexError, match="seed"):

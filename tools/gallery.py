@@ -105,7 +105,7 @@ def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
         agent.reset(solved)
         for _ in range(int(world.max_episode_steps[0])):
             obs, *_, info = world.step(agent.eval_action(obs))
-        rows = (~info["so_far"]["success"]).long().argsort(stable=True).tolist()[:3]  # solved ones first
+        rows = (~info["running"]["success"]).long().argsort(stable=True).tolist()[:3]  # solved ones first
     pictures = [world.render(row=row, width=width, height=height, camera=VIEWS[0]) for row in rows]
     world.close()
     return np.concatenate(pictures, axis=1)

@@ -23,8 +23,8 @@ class EpisodeStatistics:
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
     def update(self, info: Info) -> None:
-        """Takes in the episodes that ``info["counted"]`` says ended in this step."""
-        episode, ended = info["so_far"], info["counted"]
+        """Takes in the episodes that ``info["episode_mask"]`` says ended in this step."""
+        episode, ended = info["running"], info["episode_mask"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
         new = torch.zeros_like(self.sums).index_add_(1, self.task_id, values.masked_fill(~ended, 0.0))
         self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new

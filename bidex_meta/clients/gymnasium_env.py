@@ -64,7 +64,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
         self._over = bool(terminated[0] or truncated[0])
         if self._over:
-            info["is_success"] = bool(batch["so_far"]["success"][0])
+            info["is_success"] = bool(batch["running"]["success"][0])
         return obs[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

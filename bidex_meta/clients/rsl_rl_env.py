@@ -96,7 +96,7 @@ class EpisodeLog:
         as sums over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`,
         `unstable`.
         """
-        ended, counted, world = info["_final_obs"], info["counted"], self._world
+        ended, episode_mask, world = info["_final_obs"], info["episode_mask"], self._world
         for name, term in info.get("reward_terms", {}).items():
             self._terms[name] = self._terms.get(name, 0.0) + term
         if not bool(ended.any()):
@@ -104,11 +104,11 @@ class EpisodeLog:
         unstable = info["unstable"]
         ends = {"terminated": terminated, "time_out": truncated & ~unstable, "unstable": unstable}
         log = {f"Episode_Termination/{name}": value[ended].float() for name, value in ends.items()}
-        log |= {f"Episode_Reward/{name}": term[counted] for name, term in self._terms.items()}
-        success = info["so_far"]["success"].float()
-        log |= {"Metrics/success_rate": success[counted], "Metrics/return": info["so_far"]["r"][counted]}
-        log["Metrics/length"] = info["so_far"]["l"][counted].float()
-        for slot in world.task_id[counted].unique().tolist():
-            log[f"Metrics/success/{world.task_names[slot]}"] = success[counted & (world.task_id == slot)]
+        log |= {f"Episode_Reward/{name}": term[episode_mask] for name, term in self._terms.items()}
+        success = info["running"]["success"].float()
+        log |= {"Metrics/success_rate": success[episode_mask], "Metrics/return": info["running"]["r"][episode_mask]}
+        log["Metrics/length"] = info["running"]["l"][episode_mask].float()
+        for slot in world.task_id[episode_mask].unique().tolist():
+            log[f"Metrics/success/{world.task_names[slot]}"] = success[episode_mask & (world.task_id == slot)]
         self._terms = {name: term.masked_fill(ended, 0.0) for name, term in self._terms.items()}
         return {name: value for name, value in log.items() if len(value)}

@@ -53,11 +53,15 @@ class SB3VecEnv(vec_env.VecEnv):
         ended = info["_final_obs"]
         rows = ended.nonzero().squeeze(1).tolist()
         if rows:
-            values = {"truncated": truncated, "counted": info["counted"], **info.get("episode", info["so_far"])}
+            values = {
+                "truncated": truncated,
+                "episode_mask": info["episode_mask"],
+                **info.get("episode", info["running"]),
+            }
             columns = {name: value[ended].tolist() for name, value in values.items()}
             for i, (row, final) in enumerate(zip(rows, info["final_obs"][ended].cpu().numpy(), strict=True)):
                 infos[row] = {"terminal_observation": final, "TimeLimit.truncated": columns["truncated"][i]}
-                if columns["counted"][i]:
+                if columns["episode_mask"][i]:
                     episode = {name: columns[name][i] for name in ("r", "l", "t") if name in columns}
                     infos[row] |= {"episode": episode, "is_success": columns["success"][i], "task": self._names[row]}
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos

@@ -62,10 +62,10 @@ class SkrlEnv(Wrapper):
             self._obs, *results, info = self.world.step(actions)
         infos = {name: value for name, value in info.items() if name not in ("episode", "_episode")}
         self._ended = info["_final_obs"]
-        counted = info["counted"]
-        if bool(counted.any()):
+        episode_mask = info["episode_mask"]
+        if bool(episode_mask.any()):
             names = {"r": "Episode / Return", "l": "Episode / Length", "success": "Episode / Success"}
-            infos["episode"] = {names[name]: info["so_far"][name][counted].float().mean() for name in names}
+            infos["episode"] = {names[name]: info["running"][name][episode_mask].float().mean() for name in names}
         reward, terminated, truncated = (each[:, None] for each in results)
         return self._obs, reward, terminated, truncated, infos
 

@@ -62,12 +62,12 @@ class TorchRLEnv(envs.EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._obs, reward, terminated, truncated, info = self.world.step(tensordict.get("action"))
         self._begun = terminated | truncated
-        entries = self._entries(info["final_obs"], info["so_far"], info["success"])
+        entries = self._entries(info["final_obs"], info["running"], info["success"])
         ends = {"reward": reward, "done": self._begun, "terminated": terminated, "truncated": truncated}
         return entries.update({name: value[:, None] for name, value in ends.items()})
 
     def _entries(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
-        so_far = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
+        running = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
         success = torch.zeros_like(self._begun) if success is None else success
-        entries = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
+        entries = {"observation": obs.clone(), "success": success[:, None], "episode": running}
         return TensorDict(entries, self.batch_size, device=self.device)

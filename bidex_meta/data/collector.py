@@ -82,7 +82,7 @@ class EpisodeCollector(PooledWorldWrapper):
         if not self._running.any():
             self._begin_again(info, obs)
             return result
-        unstable, ended, counted = (self._own(info[name]) for name in ("unstable", "_final_obs", "counted"))
+        unstable, ended, episode_mask = (self._own(info[name]) for name in ("unstable", "_final_obs", "episode_mask"))
         good = np.flatnonzero(self._running & ~unstable)
         self._make_room(int(self._length.max()) + 1)
         at = self._length[good]
@@ -95,9 +95,9 @@ class EpisodeCollector(PooledWorldWrapper):
         over = np.flatnonzero(self._running & ended)
         if len(over):
             true_end = self._own(terminated)
-            success = self._own(info["so_far"]["success"])
+            success = self._own(info["running"]["success"])
             for row in over.tolist():
-                self._end(row, bool(true_end[row]), bool(unstable[row]), bool(counted[row]), bool(success[row]))
+                self._end(row, bool(true_end[row]), bool(unstable[row]), bool(episode_mask[row]), bool(success[row]))
             self._running[over] = False
         self._begin_again(info, obs)
         return result
@@ -121,12 +121,12 @@ class EpisodeCollector(PooledWorldWrapper):
         if isinstance(self.world, TaskWorld):
             self._task = np.where(mask, self._own(self.world.task_index), self._task)
 
-    def _end(self, row: int, terminated: bool, unstable: bool, counted: bool, success: bool) -> None:
+    def _end(self, row: int, terminated: bool, unstable: bool, episode_mask: bool, success: bool) -> None:
         """Hands an episode on, unless it was shortened or has no good transition."""
         length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
-        if not counted:
+        if not episode_mask:
             self.left_out[SHORTENED] += 1
-        if not counted or length == 0:
+        if not episode_mask or length == 0:
             return
         last = np.arange(length) == length - 1
         rewards, unscaled = self._rewards[:, row, :length]

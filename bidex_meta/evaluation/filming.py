@@ -65,7 +65,7 @@ def film_tiles(
         if step == steps:
             return
         obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
-        solved = info["so_far"]["success"]
+        solved = info["running"]["success"]
         ended = terminated | truncated
         if bool(ended.any()):
             obs, _ = world.reset(options={"reset_mask": ended})

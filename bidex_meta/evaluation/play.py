@@ -126,7 +126,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
         solved = info.get("solved", info["success"])
         once |= running & solved
         held = torch.where(running, (held + 1) * solved, held)
-        success = torch.where(running, info["so_far"]["success"], success)
+        success = torch.where(running, info["running"]["success"], success)
         unstable |= running & info["unstable"]
         running &= ~(terminated | truncated)
         if not bool(running.any()):

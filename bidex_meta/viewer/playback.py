@@ -42,7 +42,7 @@ class Stage:
         self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
-        self._success = info["so_far"]["success"].cpu().numpy().copy()
+        self._success = info["running"]["success"].cpu().numpy().copy()
         ended = terminated | truncated
         if bool(ended.any()):
             over = ended.cpu().numpy()

@@ -228,8 +228,8 @@ class BatchedWorld(VectorEnv, ABC):
             "reward_unscaled": unscaled,
             "final_obs": obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(self.success_at_end),
-            "counted": ended & episodes.counts,
+            "running": episodes.statistics(self.success_at_end),
+            "episode_mask": ended & episodes.counts,
         }
         if transition.terms:
             info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in transition.terms.items()}

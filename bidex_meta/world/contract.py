@@ -24,12 +24,12 @@ final_obs              (N, d), float32       the observation that the transition
                                              before it
 _final_obs             (N,), bool            rows that ended in this step: there ``final_obs`` is the last of the
                                              episode; elsewhere it is the observation that the step returns
-so_far                 dict of (N,)          r (return, float32), l (length, int64), success (by the suite's
+running                dict of (N,)          r (return, float32), l (length, int64), success (by the suite's
                                              rule, bool), unscaled (return, float32), of the episode so far
-counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
+episode_mask           (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
-The world decides what a successful episode is, by the suite's rule, and reports it in ``so_far["success"]``: the entry
+The world decides what a successful episode is, by the suite's rule, and reports it in ``running["success"]``: the entry
 of an episode's last step is the success of the episode, and the entry of any other step is its success if it is cut
 there. Nothing else decides: success at several steps must not be combined, because where success counts at the end an
 episode can lose it again.

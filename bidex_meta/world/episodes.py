@@ -75,7 +75,7 @@ class Episodes:
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
-        """Statistics of the running episodes, as ``info["so_far"]`` carries them; ``success`` at the end or once."""
+        """Statistics of the running episodes, as ``info["running"]`` carries them; ``success`` at the end or once."""
         success = self.solved_at_end if at_end else self.success
         values = {"r": self.reward, "l": self.length, "success": success, "unscaled": self.unscaled}
         return {name: value.clone() for name, value in values.items()}
@@ -96,11 +96,11 @@ def ended_info(info: Info) -> dict[str, Any]:
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last
     step's values, ``episode`` once more and a mask each; ``_final_info``: ended.
     """
-    ended, counted = info["_final_obs"], info["counted"]
-    episode = {name: value.masked_fill(~counted, 0) for name, value in info["so_far"].items()}
+    ended, episode_mask = info["_final_obs"], info["episode_mask"]
+    episode = {name: value.masked_fill(~episode_mask, 0) for name, value in info["running"].items()}
     final: Info = {name: info[name].masked_fill(~ended, 0) for name in _FINAL}
-    final |= {f"_{name}": ended for name in _FINAL} | {"episode": dict(episode), "_episode": counted}
-    return {"episode": episode, "_episode": counted, "final_info": final, "_final_info": ended}
+    final |= {f"_{name}": ended for name in _FINAL} | {"episode": dict(episode), "_episode": episode_mask}
+    return {"episode": episode, "_episode": episode_mask, "final_info": final, "_final_info": ended}
 
 
 class Clock:

@@ -23,7 +23,16 @@ from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
 from bidex_meta.world.episodes import ended_info, set_stagger
 
-_OF_THE_CONTRACT = ("so_far", "counted", "final_obs", "_final_obs", "episode", "_episode", "final_info", "_final_info")
+_OF_THE_CONTRACT = (
+    "running",
+    "episode_mask",
+    "final_obs",
+    "_final_obs",
+    "episode",
+    "_episode",
+    "final_info",
+    "_final_info",
+)
 
 
 class WorldWrapper(VectorWorld):

@@ -231,7 +231,7 @@ def test_means_over_tasks_wait_for_every_task():
     """Of two tasks, the fast one ends first: its success alone is not the success of both."""
     statistics = EpisodeStatistics(torch.tensor([0, 1]), ["fast", "slow"])
     episode = {"r": torch.ones(2), "l": torch.ones(2), "success": torch.tensor([True, False])}
-    statistics.update({"so_far": episode, "counted": torch.tensor([True, False])})
+    statistics.update({"running": episode, "episode_mask": torch.tensor([True, False])})
     assert set(statistics.metrics()) == {"Train/return/fast", "Train/success/fast"}
-    statistics.update({"so_far": episode, "counted": torch.tensor([False, True])})
+    statistics.update({"running": episode, "episode_mask": torch.tensor([False, True])})
     assert statistics.metrics()["Train/success_rate"] == 0.5

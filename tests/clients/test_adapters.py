@@ -68,9 +68,9 @@ def own(world: PooledWorld, actions: Tensor) -> Seen:
         for row in info["_final_obs"].nonzero().squeeze(1).tolist():
             seen.finals.append(info["final_obs"][row].numpy())
             seen.ends.append((row, bool(truncated[row])))
-            if info["counted"][row]:
-                so_far = info["so_far"]
-                seen.episodes.append((float(so_far["r"][row]), int(so_far["l"][row]), bool(so_far["success"][row])))
+            if info["episode_mask"][row]:
+                running = info["running"]
+                seen.episodes.append((float(running["r"][row]), int(running["l"][row]), bool(running["success"][row])))
     return seen
 
 
@@ -120,11 +120,11 @@ def of_skrl(world: PooledWorld, actions: Tensor) -> Seen:
         for row in (terminated | truncated).squeeze(1).nonzero().squeeze(1).tolist():
             seen.finals.append(infos["final_obs"][row].numpy())
             seen.ends.append((row, bool(truncated[row])))
-        counted, so_far = infos["counted"], infos["so_far"]
-        seen.episodes.extend(zip(*(so_far[name][counted].tolist() for name in ("r", "l", "success")), strict=True))
+        counted, running = infos["episode_mask"], infos["running"]
+        seen.episodes.extend(zip(*(running[name][counted].tolist() for name in ("r", "l", "success")), strict=True))
         assert ("episode" in infos) == bool(counted.any())
         if "episode" in infos:
-            assert infos["episode"]["Episode / Return"] == so_far["r"][counted].mean()
+            assert infos["episode"]["Episode / Return"] == running["r"][counted].mean()
     return seen
 
 

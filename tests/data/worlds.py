@@ -92,9 +92,9 @@ class Plain:
                 now["actions"].append(action[row].clamp(-1, 1).numpy().copy())
                 now["rewards"].append(float(reward[row]))
                 now["unscaled"].append(float(info["reward_unscaled"][row]))
-            now["success"] = bool(info["so_far"]["success"][row])
+            now["success"] = bool(info["running"]["success"][row])
             if terminated[row] or truncated[row]:
-                if info["counted"][row] and now["rewards"]:
+                if info["episode_mask"][row] and now["rewards"]:
                     self.whole.append(self._episode(row, now, bool(terminated[row]), bool(info["unstable"][row])))
                 self.running[row] = None
                 if self.world.metadata["autoreset_mode"].name == "SAME_STEP":

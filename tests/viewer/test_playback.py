@@ -33,8 +33,8 @@ def test_a_stage_plays_on_and_counts_episodes(stage, world, monkeypatch):
         """The first row ends at once, the others go on; row 1 counts as a success after the second and third step."""
         made = list(type(world).step(world, action))
         made[2] = torch.tensor([True, False, False, False])
-        so_far = {**made[4]["so_far"], "success": torch.tensor([False, len(steps) in (1, 2), False, False])}
-        made[4] = {**made[4], "so_far": so_far}
+        running = {**made[4]["running"], "success": torch.tensor([False, len(steps) in (1, 2), False, False])}
+        made[4] = {**made[4], "running": running}
         steps.append(world.episodes.number.tolist())
         return made
 

@@ -144,7 +144,7 @@ def test_a_script_of_version_2_brings_things_to_where_a_task_wants_them(
     agent.reset(rows)
     for _ in range(int(world.max_episode_steps.max())):
         *_, info = world.step(agent.eval_action(torch.zeros(50, 1)))
-    assert int(info["so_far"]["success"][rows].sum()) >= 2 and not bool(info["so_far"]["success"][~rows].any())
+    assert int(info["running"]["success"][rows].sum()) >= 2 and not bool(info["running"]["success"][~rows].any())
 
 
 def test_version_1_has_no_more_scripts_than_it_had() -> None:

@@ -72,8 +72,8 @@ def test_success_is_the_references(mode: str, scripts: list[list[int]], fails: l
         told = [rows[i].step(solved[step, i], failed[step, i], (step, i) in breaks) for i in range(ROWS)]
         ended, wanted = np.array([row.ended for row in rows]) & ~frozen, np.array([each["at_end"] for each in told])
         np.testing.assert_array_equal(info["success"], wanted)
-        np.testing.assert_array_equal(info["so_far"]["success"], wanted)
-        np.testing.assert_array_equal(info["so_far"]["l"], [each["length"] for each in told])
+        np.testing.assert_array_equal(info["running"]["success"], wanted)
+        np.testing.assert_array_equal(info["running"]["l"], [each["length"] for each in told])
         np.testing.assert_array_equal(info["_final_obs"], ended)
         np.testing.assert_array_equal(info["solved"][~frozen], np.array([row.history[-1] for row in rows])[~frozen])
         if any(ended):

@@ -81,13 +81,13 @@ def test_they_repeat_the_contracts_keys(kind: str) -> None:
         if "episode" not in info:
             continue
         seen += int(ended.sum())
-        assert torch.equal(info["_final_info"], ended) and torch.equal(info["_episode"], info["counted"])
+        assert torch.equal(info["_final_info"], ended) and torch.equal(info["_episode"], info["episode_mask"])
         final = info["final_info"]
         for name, mask, of in [("success", ended, info), ("unstable", ended, info), ("reward_unscaled", ended, info)]:
             assert torch.equal(final[name], of[name] * mask) and final[name].dtype == of[name].dtype
-        for name, value in info["so_far"].items():
+        for name, value in info["running"].items():
             for episode in (info["episode"], final["episode"]):
-                assert torch.equal(episode[name], value * info["counted"]) and episode[name].dtype == value.dtype
+                assert torch.equal(episode[name], value * info["episode_mask"]) and episode[name].dtype == value.dtype
     assert seen > 0
 
 
@@ -104,6 +104,6 @@ def test_without_stagger_first_episodes_are_whole() -> None:
     ended = torch.zeros(8, dtype=torch.bool)
     for action in random_actions(whole, 75):
         info = whole.step(action)[-1]
-        assert torch.equal(info["counted"], info["_final_obs"])
+        assert torch.equal(info["episode_mask"], info["_final_obs"])
         ended |= info["_final_obs"]
     assert ended.any()

@@ -170,7 +170,7 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
         one.reset(seed=0)
     a, b = play(plain, actions.cuda()), play(graphs, actions.cuda())
     for x, y in zip(a, b, strict=True):
-        for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/so_far/l"):
+        for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/running/l"):
             apart = (x[name].float() - y[name].float()).abs().flatten()
             assert apart.quantile(0.95) < 1e-2, name
     assert graphs._graphs is not None and len(graphs._graphs._recorded) == 4

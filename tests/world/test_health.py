@@ -56,21 +56,21 @@ def test_a_broken_row_ends_and_its_neighbours_do_not_notice(
     broken[BROKEN] = True
     assert not other["info/unstable"].any() and not other["info/_final_obs"][BROKEN].any()
     assert torch.equal(step["info/unstable"], broken)
-    for name in ("truncated", "info/_final_obs", "info/counted"):
+    for name in ("truncated", "info/_final_obs", "info/episode_mask"):
         assert step[name][BROKEN].all(), name
     for name in ("terminated", "info/success", "reward", "info/reward_unscaled"):
         assert not step[name][BROKEN].any(), name
     assert all(not v[BROKEN].any() for n, v in step.items() if n.startswith("info/reward_terms"))
     assert torch.equal(step["info/final_obs"][BROKEN], before["obs"][BROKEN])
-    assert torch.equal(step["info/so_far/r"][BROKEN], before["info/so_far/r"][BROKEN])
-    assert step["info/so_far/l"][BROKEN].tolist() == [5] * len(BROKEN)
+    assert torch.equal(step["info/running/r"][BROKEN], before["info/running/r"][BROKEN])
+    assert step["info/running/l"][BROKEN].tolist() == [5] * len(BROKEN)
     assert torch.equal(world.episodes.number[BROKEN], number[BROKEN] + 1)
 
     fresh = world_at(world)
     assert torch.equal(fresh.reset()[0][BROKEN], step["obs"][BROKEN])
     after = play(world, actions[5:])
     assert_same([step, *after], [other, *play(twin, actions[5:])], REST)
-    names = ("obs", "reward", "info/so_far/r", "info/success")
+    names = ("obs", "reward", "info/running/r", "info/success")
     mine, its = ([{n: s[n] for n in names} for s in steps] for steps in (after[:5], play(fresh, actions[5:10])))
     assert_same(mine, its, BROKEN)
     for found in [step, *after]:

@@ -27,10 +27,10 @@ def test_episode_statistics_are_those_of_a_count_by_hand() -> None:
     for step in steps:
         total, length, success = total + step["reward"], length + 1, success | step["info/success"]
         ended = step["info/_final_obs"]
-        assert torch.equal(step["info/so_far/r"], total)
-        assert torch.equal(step["info/so_far/l"], length)
-        assert torch.equal(step["info/so_far/success"], success)
-        assert torch.equal(step["info/counted"], ended & whole)
+        assert torch.equal(step["info/running/r"], total)
+        assert torch.equal(step["info/running/l"], length)
+        assert torch.equal(step["info/running/success"], success)
+        assert torch.equal(step["info/episode_mask"], ended & whole)
         late = torch.where(whole, length, length + elapsed) >= world.max_episode_steps
         assert torch.equal(step["truncated"], late & ~step["terminated"])
         counted, left_out = counted + int((ended & whole).sum()), left_out + int((ended & ~whole).sum())
@@ -87,6 +87,6 @@ def test_success_belongs_to_the_transition_also_in_a_reset_row() -> None:
     world.episodes.elapsed = world.max_episode_steps - 1
     step = flat(world.step(torch.zeros(3, 52)))
     assert step["info/_final_obs"].all()
-    assert step["info/success"].tolist() == step["info/so_far/success"].tolist() == [False, True, False]
+    assert step["info/success"].tolist() == step["info/running/success"].tolist() == [False, True, False]
     assert step["reward"][1] > 0.4 and torch.equal(step["reward"], step["info/reward_terms/pose"])
     assert not world.episodes.success.any() and (world.episodes.reward == 0).all()

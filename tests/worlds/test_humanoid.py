@@ -21,7 +21,7 @@ def test_as_gymnasiums() -> None:
     start = world.state_dict()["engine"]
     actions = 2 * torch.rand(steps, rows, 17, generator=torch.Generator().manual_seed(0)) - 1
     made = [world.step(action) for action in actions]
-    lengths = made[-1][-1]["so_far"]["l"].tolist()
+    lengths = made[-1][-1]["running"]["l"].tolist()
     assert made[-1][2].all() and min(lengths) > 5  # all have fallen
     for row, length in enumerate(lengths):
         env = gymnasium.make("Humanoid-v5").unwrapped

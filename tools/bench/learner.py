@@ -139,7 +139,7 @@ class Noise:
         ended, nobody = chance < _END, torch.zeros(self.num_envs, dtype=torch.bool)
         zeros, none = torch.zeros(self.num_envs), torch.zeros(self.num_envs, dtype=torch.int64)
         info = {"success": nobody, "unstable": nobody, "reward_unscaled": reward, "final_obs": obs, "_final_obs": ended}
-        info |= {"so_far": {"r": zeros, "l": none, "success": nobody, "unscaled": zeros}, "counted": nobody}
+        info |= {"running": {"r": zeros, "l": none, "success": nobody, "unscaled": zeros}, "episode_mask": nobody}
         return obs, reward, chance < _END / 2, (chance >= _END / 2) & ended, info
 
     def state_dict(self) -> dict[str, Any]:

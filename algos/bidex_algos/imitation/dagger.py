@@ -126,7 +126,7 @@ class DAgger(Learner):
             noise = torch.randn(actions.shape, generator=self.generator, device=self.device)
             actions = actions + self.config.noise_std * noise
         self.obs, _, terminated, truncated, info = self.world.step(actions)
-        self.episodes.update({**info, "counted": info["counted"] & ~self.teacher_plays})
+        self.episodes.update({**info, "episode_mask": info["episode_mask"] & ~self.teacher_plays})
         self._begin(terminated | truncated, share)
         self.policy.observations.update(self.obs)
         return info["unstable"].sum()

@@ -254,7 +254,7 @@ class MetaLearner(Learner):
                 ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
             )  # fmt: skip
             earned += info["reward_unscaled"].masked_fill(~valid, 0.0)
-            success = torch.where(running, info["so_far"]["success"], success)
+            success = torch.where(running, info["running"]["success"], success)
             ended_well |= success & over & running
             met |= info["success"] & valid
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)

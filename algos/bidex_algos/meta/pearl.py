@@ -115,7 +115,7 @@ class PEARL(MTSAC):
     def _note(self, reward: Tensor, info: Info) -> None:
         self.policy.rewards.update(self.policy.compressed(reward.masked_fill(info["unstable"], 0.0)))
         for episodes, number in ((self.firsts, 0), (self.lasts, self.config.episodes_per_trial - 1)):
-            episodes.update(info | {"counted": info["counted"] & (self.played == number)})
+            episodes.update(info | {"episode_mask": info["episode_mask"] & (self.played == number)})
         ended = info["_final_obs"]
         self.played.add_(ended)
         now = self.bounds[1].scatter(1, self.played[:, None], self.replay.added)

@@ -175,13 +175,13 @@ def play(
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
             earned, whole = earned + reward, whole & (valid | ~playing)
-            success = torch.where(playing, info["so_far"]["success"], success)
+            success = torch.where(playing, info["running"]["success"], success)
             playing = playing & ~ended
             if maths.may_look(device) and not playing.any():
                 break
         found = {"r": earned, "l": elapsed, "success": success}
         for each in statistics[episode]:
-            each.update({"so_far": found, "counted": whole})
+            each.update({"running": found, "episode_mask": whole})
     trials.obs[trials.lengths, rows] = obs
 
 
