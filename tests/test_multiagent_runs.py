@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.cli.learners import learner_kind
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.experiments.policies import load_policy
 from bidex_meta.runs import RunFolder
 from bidex_meta.world.agent_views import agent_views
 from tests.world.play import suite_world

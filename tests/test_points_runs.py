@@ -9,9 +9,9 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
-from bidex_meta.cli.policies import checkpoint
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import filming
+from bidex_meta.experiments.policies import checkpoint
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.suite import load_suite
 from tests.pages import ROOT

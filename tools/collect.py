@@ -15,9 +15,9 @@ from typing import Any
 import tyro
 from torch import nn
 
-from bidex_meta.cli.policies import load_policy
-from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.sweep_plan import read_sweep
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.provenance import differences

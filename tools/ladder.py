@@ -9,11 +9,11 @@ from torch import Tensor
 
 from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import spread
-from bidex_meta.cli.metatest import adapt_steps_of
-from bidex_meta.cli.policies import load_policy
-from bidex_meta.cli.run_teachers import teachers_of
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
+from bidex_meta.experiments.metatest import adapt_steps_of
+from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
 from bidex_meta.world.hidden_parts import HiddenParts

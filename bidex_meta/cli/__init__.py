@@ -6,6 +6,7 @@ imported when it is called.
 
 import contextlib
 import importlib
+import logging
 import os
 import re
 import signal
@@ -20,7 +21,7 @@ from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, 
 from bidex_meta.train.launch import launch, notices
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
-from bidex_meta.utils.waiting import watched
+from bidex_meta.utils.waiting import tell, watched
 
 _MEANT = {"train": "run", "test": "evaluate", "learn": "run", "fit": "run", "view": "play", "watch": "play"}
 _MEANT |= {"show": "render", "film": "render", "video": "render", "download": "pull", "upload": "push"}
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print_anything()
     bound_width()
     try:
-        with _signals_raise():
+        with _signals_raise(), _log_on_stderr():
             try:
                 return _dispatch(given)
             finally:
@@ -136,6 +137,32 @@ def _signals_raise() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class _OnStderr(logging.Handler):
+    """Prints what the library logs, a record a line."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record; raise BrokenPipeError if nobody reads stderr, where logging's own handler goes on."""
+        tell(record.getMessage())
+
+
+@contextlib.contextmanager
+def _log_on_stderr() -> Iterator[None]:
+    """Print the library's log while a command runs."""
+    log = logging.getLogger("bidex_meta")
+    level = log.level
+    propagates = log.propagate
+    handler = _OnStderr()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        log.propagate = propagates
 
 
 def _failed(reason: str, code: int, debug: bool) -> int:

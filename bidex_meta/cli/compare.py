@@ -9,10 +9,11 @@ import numpy as np
 
 from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
 from bidex_meta.cli.plot import named_runs
-from bidex_meta.cli.tables import NONE, Json, plain_table, print_table, say
+from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
 from bidex_meta.evaluation.comparison import Group, estimates, iqm, read_groups, score_over, success_over
 from bidex_meta.runs import plots
 from bidex_meta.runs.provenance import release_of
+from bidex_meta.train.launch import say
 
 
 @dataclass(frozen=True)

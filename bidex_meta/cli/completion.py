@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bidex_meta.cli.learners import ALGOS
 from bidex_meta.cli.parsing import flags_of, parse
+from bidex_meta.experiments.learners import ALGOS
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import suites_to_run
 

@@ -5,17 +5,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bidex_meta.cli import metatest
-from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
-from bidex_meta.cli.policies import policy_loader
-from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table, say
+from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.control_arms import Control, arms, control
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
+from bidex_meta.experiments import metatest
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.policies import policy_loader
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.provenance import check_alike
+from bidex_meta.train.launch import say
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds

@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Literal
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli.conditions import conditions
-from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
-from bidex_meta.cli.policies import load_policy, policy_loader
-from bidex_meta.cli.tables import Json, Sheet, evaluation_table, print_table, result_table, say
+from bidex_meta.cli.tables import Json, Sheet, evaluation_table, print_meta_test, print_table, result_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.evaluation.results import compare
+from bidex_meta.experiments.conditions import conditions
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.metatest import Options, check_worlds, meta_test, splits_of
+from bidex_meta.experiments.policies import load_policy, policy_loader
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
@@ -149,6 +150,6 @@ def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, world
     load, step = policy_loader(folder, config.device, flags.checkpoint)
     found = meta_test(worlds, config, load, flags, splits, say)
     if not flags.json:
-        print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
+        print_meta_test(f"{config.algo} on {worlds.name}, {step:,} steps", found)
     tests = {split: result.to_json() for split, result in found.items()}
     return {"steps": step, "seed": flags.seed, "splits": tests}

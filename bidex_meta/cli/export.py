@@ -9,12 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.cli.parsing import RunPath, parse
-from bidex_meta.cli.policies import checkpoint, policy_of
 from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_atomic
 from bidex_meta.utils.files import portable

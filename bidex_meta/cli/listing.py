@@ -11,10 +11,10 @@ from typing import Annotated
 
 import tyro
 
-from bidex_meta.cli.learners import ALGOS
 from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.experiments.learners import ALGOS
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import listed
 

@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> None:
     tour = not (flags.run or flags.task or flags.suite) and flags.policy == PlayFlags.policy
     if tour:
         flags = replace(flags, run=paths.assets_dir() / "policies" / "MT20")
-    from bidex_meta.cli.policies import acting, looked_at
+    from bidex_meta.cli.looking import acting, looked_at
     from bidex_meta.viewer.playback import Stage, play
 
     source, slots, task = looked_at(flags)

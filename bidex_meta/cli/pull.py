@@ -7,9 +7,20 @@ from typing import Annotated
 
 import tyro
 
-from bidex_meta.cli.hub import CARD, FOLDER, OF_A_RUN, OF_DATA, SUITES, called, checked, copied, files_of, new_folder
 from bidex_meta.cli.parsing import parse
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.hub import (
+    CARD,
+    FOLDER,
+    OF_A_RUN,
+    OF_DATA,
+    SUITES,
+    called,
+    checked,
+    copied,
+    files_of,
+    new_folder,
+)
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 

@@ -7,8 +7,10 @@ from typing import Annotated
 import tyro
 
 from bidex_meta import __version__
-from bidex_meta.cli.cards import data_card, run_card
-from bidex_meta.cli.hub import (
+from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.errors import BidexError
+from bidex_meta.experiments.cards import data_card, run_card
+from bidex_meta.experiments.hub import (
     CARD,
     DATASETS,
     FOLDER,
@@ -22,8 +24,6 @@ from bidex_meta.cli.hub import (
     new_folder,
     published,
 )
-from bidex_meta.cli.parsing import RunPath, Switch, parse
-from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from msgspec import Meta
 
-from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, Engine, Switch, parse
-from bidex_meta.cli.tables import Json, say
+from bidex_meta.cli.tables import Json
 from bidex_meta.config import Steps
 from bidex_meta.data import open_dataset, part_files, writer
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.runs import RunFolder
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
@@ -126,8 +127,8 @@ def _check(flags: RecordFlags, kind: str) -> None:
 
 def _record(flags: RecordFlags, collection: _Collection) -> None:
     """Collects a data set, or goes on with it."""
-    from bidex_meta.cli.run_data import dataset_metadata
     from bidex_meta.data.collect import bytes_held, resumed_writer
+    from bidex_meta.experiments.run_data import dataset_metadata
 
     plan, size = collection.plan, collection.plan["size"]
     folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
@@ -229,8 +230,8 @@ def _config(flags: RecordFlags) -> Json:
 
 def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
     """A run's policy, and its metadata."""
-    from bidex_meta.cli.policies import load_policy
     from bidex_meta.data.collect import Actor, SamplingAgent
+    from bidex_meta.experiments.policies import load_policy
 
     folder = RunFolder.open(path)
     algo = folder.config().algo

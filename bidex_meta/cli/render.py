@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> None:
             raise BidexError(f"A film needs an even width and height, not {width} x {height}.")
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
-    from bidex_meta.cli.policies import acting, looked_at
+    from bidex_meta.cli.looking import acting, looked_at
     from bidex_meta.evaluation.filming import film_row, film_tiles
     from bidex_meta.tasks.base import CONTROL_RATE
 

@@ -13,21 +13,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.cli import metatest, run_data, run_recording, run_teachers, watching
-from bidex_meta.cli.conditions import conditions
+from bidex_meta.cli import run_recording, watching
 from bidex_meta.cli.evaluate import judged, judged_on_others
-from bidex_meta.cli.policies import checkpoint, fitting, say_other_rules
 from bidex_meta.cli.run_config import RunPlan, plan_run
-from bidex_meta.cli.tables import Json, print_table, say
+from bidex_meta.cli.tables import Json, print_meta_test, print_table
 from bidex_meta.config import RunConfig, printed
 from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import metatest, run_data, run_teachers
+from bidex_meta.experiments.conditions import conditions
+from bidex_meta.experiments.policies import checkpoint, fitting, say_other_rules
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.runs.folder import check_new, new_folder_name
 from bidex_meta.train import distributed, runner
 from bidex_meta.train.distributed import together
-from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.train.launch import launch, resume_command, say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
@@ -290,5 +291,5 @@ def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     report = {"steps": learner.env_steps, "seed": options.seed}
     report["splits"] = {split: each.to_json() for split, each in result.items()}
     write_json(folder.evaluation_path, report | {"conditions": conditions(source)})
-    metatest.print_tables(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)
+    print_meta_test(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)
     say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

@@ -9,14 +9,14 @@ from typing import Annotated, Generic, Literal
 
 import tyro
 
-from bidex_meta.cli import run_data, run_teachers
-from bidex_meta.cli.conditions import check_worlds_of
-from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.cli.tables import Json
 from bidex_meta.config import LearnerSettings, RunConfig
 from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments import run_data, run_teachers
+from bidex_meta.experiments.conditions import check_worlds_of
+from bidex_meta.experiments.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.utils.files import absolute

@@ -3,13 +3,12 @@
 from pathlib import Path
 
 from bidex_meta.cli.run_config import RunPlan
-from bidex_meta.cli.run_data import dataset_metadata
-from bidex_meta.cli.tables import say
 from bidex_meta.data import part_files, writer
 from bidex_meta.data.collect import bytes_held
 from bidex_meta.data.collector import RunCollector, spread_environments
+from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.runs.folder import new_folder_name
-from bidex_meta.train.launch import launch
+from bidex_meta.train.launch import launch, say
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import PooledWorld
 

@@ -4,20 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidex_meta.cli.conditions import check_worlds_of, conditions
-from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.policies import checkpoint, fitting, policy_of
-from bidex_meta.cli.tables import Json, say
+from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, estimate, iqm, read_entry
 from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.experiments.conditions import check_worlds_of, conditions
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.policies import checkpoint, fitting, policy_of
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.runs.provenance import check_alike
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few

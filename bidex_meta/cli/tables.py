@@ -13,11 +13,10 @@ from rich.text import Text
 
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
+from bidex_meta.evaluation.meta_test import MetaEvaluation
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
-from bidex_meta.train.launch import launch
 from bidex_meta.utils.streams import output_width
-from bidex_meta.utils.waiting import tell
 
 Json = dict[str, Any]  # what JSON holds, or goes into it
 NONE = "–"
@@ -25,12 +24,6 @@ _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
     "unknown: of the worst finished episode)"
 )
-
-
-def say(text: str) -> None:
-    """To stderr, of several processes from the first alone."""
-    if launch().rank == 0:
-        tell(text)
 
 
 @dataclass
@@ -242,6 +235,16 @@ def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]], spare:
 def print_table(table: Sheet) -> None:
     """To stdout, as wide as the terminal or COLUMNS says; wide enough for most where it is a file or a pipe."""
     sys.stdout.write(table.printed(output_width(180)))
+
+
+def print_meta_test(subject: str, found: Mapping[str, MetaEvaluation]) -> None:
+    """For each split a table before adaptation and one after, the latter with the gains."""
+    for split, result in found.items():
+        shots = len(result.adapt_steps)
+        print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))
+        if shots:
+            title = f"{subject}, {split} tasks, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
+            print_table(evaluation_table(title, result.after, gains=result.gains()))
 
 
 def percent(value: float) -> str:

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bidex_meta.cli.conditions import say_differences
 from bidex_meta.cli.parsing import RunPath, parse
-from bidex_meta.cli.policies import say_other_rules
 from bidex_meta.cli.run_config import plan_run
 from bidex_meta.cli.sweep import choose_cores, state_of, work
-from bidex_meta.cli.tables import NONE, Json, plain_table, print_table, say
+from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
 from bidex_meta.cli.transfer_plan import (
     Arm,
     Cell,
@@ -28,10 +26,13 @@ from bidex_meta.data import part_files
 from bidex_meta.errors import EXIT_FAILED
 from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.evaluation.transfer_measures import TAG, add_over_nothing, at_the_end, by_reinforcement
+from bidex_meta.experiments.conditions import say_differences
+from bidex_meta.experiments.policies import say_other_rules
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Whole
 from bidex_meta.worlds import Worlds

@@ -10,17 +10,17 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bidex_meta.cli.run_config import plan_run
-from bidex_meta.cli.run_data import dataset_metadata
-from bidex_meta.cli.sweep_plan import PlannedRun, words_of
-from bidex_meta.cli.tables import say
 from bidex_meta.config import RunConfig
 from bidex_meta.data import Dataset, open_dataset, part_files, writer
 from bidex_meta.data.collect import collect_successes, progress, resumed_writer
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.transfer_measures import NOTHING
+from bidex_meta.experiments.run_data import dataset_metadata
+from bidex_meta.experiments.sweep_plan import PlannedRun, words_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.suite import V1, Suite, SuiteClass, plain_name
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted

@@ -11,16 +11,17 @@ import tyro
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.parsing import JsonSwitch, parse
-from bidex_meta.cli.policies import load_policy, say_other_rules
-from bidex_meta.cli.tables import Json, plain_table, print_table, say
+from bidex_meta.cli.tables import Json, plain_table, print_table
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability
+from bidex_meta.experiments.policies import load_policy, say_other_rules
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import plain_name
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted

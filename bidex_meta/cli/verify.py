@@ -7,18 +7,19 @@ from functools import partial
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
-from bidex_meta.cli.conditions import conditions
-from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.metatest import TASKS, Options, meta_test
 from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
-from bidex_meta.cli.policies import checkpoint, policy_of
-from bidex_meta.cli.tables import Json, Sheet, percent, print_table, ranged, say
+from bidex_meta.cli.tables import Json, Sheet, percent, print_table, ranged
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
+from bidex_meta.experiments.conditions import conditions
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.metatest import TASKS, Options, meta_test
+from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder, schemas
 from bidex_meta.runs.provenance import differences
 from bidex_meta.suite import OTHERS
+from bidex_meta.train.launch import say
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
 from bidex_meta.utils.validation import parse as parse_content

@@ -10,19 +10,18 @@ import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli import metatest
-from bidex_meta.cli.policies import slots_of
 from bidex_meta.cli.run_config import RunPlan
-from bidex_meta.cli.tables import say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.filming import film_tiles
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.experiments import metatest
+from bidex_meta.experiments.policies import slots_of
 from bidex_meta.runs import Recorder, RunFolder
 from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
 from bidex_meta.tasks.base import CONTROL_RATE
-from bidex_meta.train.launch import launch
+from bidex_meta.train.launch import launch, say
 from bidex_meta.train.learner import Learner
 from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld

@@ -1,9 +1,18 @@
 """How this process was started: alone, or by torchrun as one of several that share a run."""
 
+import logging
 import os
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+
+_LOG = logging.getLogger("bidex_meta")
+
+
+def say(text: str) -> None:
+    """Log a line at level INFO; of several processes, the first alone does."""
+    if launch().rank == 0:
+        _LOG.info(text)
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.learners import ALGOS, learner_kind
 
 WRONG: dict[str, dict[str, Any]] = {
     "mtppo": {

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.experiments.learners import ALGOS, learner_kind
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import Passing, PointClass, PointGoals

@@ -27,9 +27,9 @@ from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_algos.rollout import collect
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.train import attendance, distributed
 from bidex_meta.train.runner import checkpoint, resume, train
 from bidex_meta.witness.teachers import Teachers, Tutor

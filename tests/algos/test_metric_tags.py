@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness

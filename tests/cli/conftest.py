@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import learners, main
+from bidex_meta.cli import main
+from bidex_meta.experiments import learners
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 from tests.points import PointWorld, ring

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli.policies import load_policy
+from bidex_meta.experiments.policies import load_policy
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.provenance import differences
 from tests.fakes import evaluated_run

@@ -11,8 +11,8 @@ import torch
 from bidex_algos.nets.shape import Shape
 from bidex_meta.cli import export
 from bidex_meta.cli.export import exported
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.world.contract import ObservationGroup
 from tests.pages import ROOT
 

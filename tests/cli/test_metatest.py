@@ -5,8 +5,8 @@ import json
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli.metatest import rollouts_of
 from bidex_meta.evaluation.comparison import read_groups
+from bidex_meta.experiments.metatest import rollouts_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import waiting
 from bidex_meta.worlds import Worlds

@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from bidex_meta.cli import run_data
+from bidex_meta.cli.looking import looked_at
 from bidex_meta.cli.parsing import LookFlags
-from bidex_meta.cli.policies import checkpoint, looked_at, policy_of
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import run_data
+from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V1, V2
 from bidex_meta.utils import paths
@@ -38,7 +39,8 @@ def test_a_checkpoint_that_asks_for_more_than_its_weights_takes_no_memory(
         policy_of(folder, state, "cpu")
 
 
-def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "bidex_meta")
     run = RUNS / "mtppo"
     own = RunFolder.open(run).config()
     assert own.suite == "MT4"
@@ -47,11 +49,13 @@ def test_a_policy_in_worlds_of_other_rules_is_noted(tmp_path: Path, capsys: pyte
     own_file.write_text(text.replace('reward = "paper"', 'reward = "paper"\nstarts = "jittered"'))
     told = {None: "", "MT4": "", "MT4-v2": "reward paper, not v2, ", str(own_file): ": starts plain, not jittered."}
     for suite, expected in told.items():
+        caplog.clear()
         looked_at(LookFlags(run=run, suite=suite))
-        shown = capsys.readouterr().err
-        assert expected in shown and shown.count("Note: ") == shown.count("\n") == bool(expected)
+        assert all(expected in note and note.startswith("Note: ") for note in caplog.messages)
+        assert len(caplog.messages) == bool(expected)
+    caplog.clear()
     looked_at(LookFlags(policy="zero", suite="MT4-v2"))
-    assert not capsys.readouterr().err
+    assert not caplog.messages
 
 
 def test_a_class_may_be_named_with_the_version_of_its_suite() -> None:
@@ -60,13 +64,15 @@ def test_a_class_may_be_named_with_the_version_of_its_suite() -> None:
         looked_at(LookFlags(policy="zero", suite="MT4", task="HandOver-v2"))
 
 
-def test_data_of_other_rules_are_noted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_of_other_rules_are_noted(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "bidex_meta")
     shown = []
     for recorded in ({}, {"rules": vars(V1)}, {"rules": vars(V2)}, {"rules": {"reward": 3}}, {"rules": 3}):
         dataset = SimpleNamespace(name="some/data-v0", metadata=recorded, num_steps=1, num_episodes=1)
+        caplog.clear()
         monkeypatch.setattr(run_data, "open_datasets", lambda names, dataset=dataset: [dataset])
         run_data.announced(["some/data-v0"], "Reading", Worlds.open({"task": "HandOver-v2"}))
-        shown.append(capsys.readouterr().err.splitlines()[1:])
+        shown.append(caplog.messages[1:])
     assert shown[0] == shown[2] == shown[4] == [] and len(shown[1]) == len(shown[3]) == 1
     note = "Note: some/data-v0 was recorded by other rules than those of HandOver-v2: reward"
     assert shown[1][0].startswith(f"{note} paper,") and shown[3][0].startswith(f"{note} 3,")

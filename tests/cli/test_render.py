@@ -4,7 +4,8 @@ import imageio.v3 as imageio
 import pytest
 from PIL import Image
 
-from bidex_meta.cli import main, policies
+from bidex_meta.cli import main
+from bidex_meta.experiments import policies
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.cli.conftest import toy

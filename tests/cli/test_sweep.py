@@ -17,9 +17,9 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.cli import sweep as queue
 from bidex_meta.cli.sweep import State, state_of
-from bidex_meta.cli.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.runs import RunFolder
 from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config

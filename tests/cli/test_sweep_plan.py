@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli.parsing import peek_all
-from bidex_meta.cli.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.sweep_plan import PlannedRun, read_sweep
 from tests.pages import ROOT
 
 FILE = """
@@ -137,8 +137,8 @@ def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "results").symlink_to(ROOT / "results")  # teachers
     # Data sets are recorded before; which, the files say.
-    monkeypatch.setattr("bidex_meta.cli.run_data.open_datasets", lambda names: [])
-    monkeypatch.setattr("bidex_meta.cli.run_data.check_offline", lambda *_: None)
+    monkeypatch.setattr("bidex_meta.experiments.run_data.open_datasets", lambda names: [])
+    monkeypatch.setattr("bidex_meta.experiments.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
         if "seeds" in path.read_text():
             assert f"--run-dir=runs/{path.stem}/" in shown("sweep", path, "--dry-run")

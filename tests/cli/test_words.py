@@ -12,7 +12,7 @@ import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS
 from bidex_meta.cli import COMMANDS, listing, main
-from bidex_meta.cli.learners import ALGOS, learner_kind
+from bidex_meta.experiments.learners import ALGOS, learner_kind
 from bidex_meta.tasks import registry
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from bidex_meta.cli import main, run_recording
-from bidex_meta.cli.run_data import dataset_metadata
 from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
 from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import memory
 from bidex_meta.worlds import Worlds

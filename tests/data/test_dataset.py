@@ -14,12 +14,12 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from bidex_meta.cli.run_data import implied
 from bidex_meta.data import Dataset, open_dataset, part_files
 from bidex_meta.data.checking import coverage, summary, verify
 from bidex_meta.data.joined import gathered, join
 from bidex_meta.data.writer import begin, stored_plan
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.run_data import implied
 from tests.algos.problems import one_step_bandit
 from tests.data.test_collect import record
 from tests.data.worlds import ABOUT, changed, rough, same, small_set, without_digests

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli.metatest import Options
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
 from bidex_meta.evaluation.statistics import bootstrap_interval, mean
+from bidex_meta.experiments.metatest import Options
 from bidex_meta.worlds import Worlds
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 

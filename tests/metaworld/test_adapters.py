@@ -10,10 +10,10 @@ from metaworld import evaluation as theirs
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
 from bidex_meta import Benchmark
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import ZeroAgent, evaluate
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
 from bidex_meta.metaworld.evaluation import known_to_metaworld
 from tests.algos.families import Passing

@@ -21,10 +21,10 @@ import scipy.stats
 import torch
 from torch import Tensor
 
-from bidex_meta.cli.learners import learner_kind
-from bidex_meta.cli.run_data import implied, task_seed
 from bidex_meta.data import open_dataset
 from bidex_meta.data.joined import Joined, join
+from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.experiments.run_data import implied, task_seed
 from bidex_meta.worlds import Worlds
 
 ALGOS = ("td3bc", "iql")

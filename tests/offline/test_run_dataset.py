@@ -11,12 +11,12 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from bidex_meta.cli.run_data import implied
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.run_data import implied
 from bidex_meta.runs import RunFolder
 from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World

@@ -11,7 +11,7 @@ import pytest
 if sys.platform != "linux":
     pytest.skip("forks, and reads /proc", allow_module_level=True)
 
-from bidex_meta.cli.learners import ALGOS
+from bidex_meta.experiments.learners import ALGOS
 from tests.robust.kills import KILLED, Victim, outcome, quick_folder, server, unequal
 from tests.robust.victims import FLAGS, OFFLINE, TAUGHT, arguments
 

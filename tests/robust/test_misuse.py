@@ -11,7 +11,6 @@ import torch
 
 import bidex_meta.metaworld as metaworld
 from bidex_meta import Benchmark, BidexError, Task, load_suite, make_task_world
-from bidex_meta.cli.policies import load_policy
 from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.clients.pettingzoo import HandsEnv
 from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
@@ -24,6 +23,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import compare
+from bidex_meta.experiments.policies import load_policy
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
 from bidex_meta.runs import (

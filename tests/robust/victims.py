@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.cli import main
-from bidex_meta.cli.learners import learner_kind
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.train import runner
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite

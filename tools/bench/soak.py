@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.learners import LearnerKind, choose_preset, learner_kind
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world.contract import PooledWorld

@@ -21,7 +21,7 @@ def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str
     metrics = {}
     for which, statistics in (("first", firsts), ("last", lasts)):
         found = statistics.metrics()
-        if found:
+        if "Train/mean_return" in found:  # every task has ended an episode
             metrics[f"Train/return_{which}_episode"] = found["Train/mean_return"]
             metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
     return metrics

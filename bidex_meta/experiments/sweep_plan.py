@@ -9,9 +9,9 @@ from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
-from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError, shortened
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.utils.files import absolute, expanded, read_toml
 from bidex_meta.utils.plugins import short_name

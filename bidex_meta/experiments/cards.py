@@ -2,10 +2,10 @@
 
 import json
 
-from bidex_meta.cli.tables import Json
 from bidex_meta.data import Dataset
 from bidex_meta.errors import one_line
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.schemas import check_versions
 from bidex_meta.utils.files import portable
 

@@ -5,17 +5,16 @@ from dataclasses import asdict
 
 import gymnasium
 
-from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.cli.tables import Json, say
 from bidex_meta.clients.gymnasium_ids import task_id
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
-from bidex_meta.train.launch import launch
+from bidex_meta.train.launch import launch, say
 from bidex_meta.utils.files import absolute, expanded
-from bidex_meta.utils.waiting import tell
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
@@ -141,7 +140,7 @@ def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
     """Open data sets, after a line of what they are for and one for each that was recorded by other rules."""
     datasets = open_datasets(names)
     steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
-    tell(f"{what} {steps:,} transitions of {episodes:,} episodes.")
+    say(f"{what} {steps:,} transitions of {episodes:,} episodes.")
     for dataset in datasets:
         recorded = dataset.metadata.get("rules")
         if isinstance(recorded, Mapping) and source.rules and (apart := rules_apart(recorded, source.rules)):

@@ -7,14 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.cli import run_data
-from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.cli.policies import load_policy, slots_of
-from bidex_meta.cli.tables import say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import run_data
+from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.experiments.policies import load_policy, slots_of
 from bidex_meta.runs import RunFolder
-from bidex_meta.train.launch import launch
+from bidex_meta.train.launch import launch, say
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor

@@ -1,15 +1,14 @@
 """The meta-test of a run whose learner adapts: its size, its worlds, its tables."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli.learners import learner_kind
-from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
+from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.suite import OTHERS
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
@@ -135,13 +134,3 @@ def splits_of(worlds: Worlds, asked: str) -> list[str]:
     if asked in ("train", "test") and asked not in worlds.splits:
         raise BidexError(f"{worlds.name} has no {asked} tasks. Leave --split out.")
     return [name for name in worlds.splits if asked in ("auto", "both", name)]
-
-
-def print_tables(subject: str, found: Mapping[str, MetaEvaluation]) -> None:
-    """For each split a table before adaptation and one after, the latter with the gains."""
-    for split, result in found.items():
-        shots = len(result.adapt_steps)
-        print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))
-        if shots:
-            title = f"{subject}, {split} tasks, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
-            print_table(evaluation_table(title, result.after, gains=result.gains()))

@@ -1,0 +1,61 @@
+"""Worlds and policies that commands look at: pictures, films, the viewers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from bidex_meta.agents import Agent
+from bidex_meta.cli.parsing import LookFlags
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
+from bidex_meta.experiments.policies import checkpoint, fitting, policy_of, say_other_rules, slots_of
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json
+from bidex_meta.tasks.registry import name_among
+from bidex_meta.utils.plugins import name_with_object
+from bidex_meta.world.contract import TaskWorld
+from bidex_meta.worlds import WorldConfig, Worlds
+
+
+def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
+    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder, which must fit it."""
+    if policy == "zero":
+        return ZeroAgent(world.action_space)
+    if policy == "random":
+        return RandomAgent(world.action_space, seed)
+    folder = RunFolder.open(Path(policy))
+    state, _ = checkpoint(folder, which)
+    with fitting(folder.path):
+        shape: Json = state["learner"]["policy"].get("shape", {})
+    spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
+    given = {name: space.shape[0] for name, space in spaces.items()}
+    if any(shape.get(name, size) != size for name, size in given.items()):
+        raise BidexError(
+            f"The policy of {policy} takes {shape['observations']} observations and gives {shape['actions']} "
+            f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
+            "policy's own."
+        )
+    return policy_of(folder, state, "cpu")
+
+
+def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
+    """The worlds in which a policy is looked at, the class of each slot, and the class to look at.
+
+    Those of its run, or of the suite or the task that is named.
+    """
+    if flags.object is not None and (flags.suite is not None or flags.task is None):
+        raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
+    config = WorldConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
+    if flags.actor not in ("zero", "random"):
+        run = RunFolder.open(Path(flags.actor)).config()
+        config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
+        config = replace(config, base=run.base, points=run.points)
+        if not flags.task and not flags.object:
+            config = replace(config, object=run.object)
+    if config.suite is None and config.task is None:
+        raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
+    worlds = Worlds.open(config)
+    slots, classes = slots_of(worlds), worlds.task_classes()  # which refuses what is not of ours
+    if flags.actor not in ("zero", "random"):
+        say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
+    task = name_among(name_with_object(flags.task, flags.object), classes) if flags.task else slots[0]
+    return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)

@@ -1,0 +1,1 @@
+"""What a person does, as functions: train, evaluate, verify, meta-test, transfer, sweep, record."""
