@@ -5,7 +5,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import msgspec
 import tyro
@@ -29,6 +29,13 @@ from bidex_meta.utils.validation import (
 )
 
 LearnerSettings = TypeVar("LearnerSettings")
+
+UNRESOLVED: Any = None
+"""Default of a field that ``bidex_meta.experiments.run_config.resolve`` fills in."""
+
+_UNRESOLVED = ("num_envs", "steps", "threads")
+_WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
+"""Fields that no ``config.json`` may lack."""
 
 MAY_CHANGE = {"may_change": True}
 """Metadata of a field that a resumed run may be given anew: it changes nothing of what is learned."""
@@ -63,14 +70,15 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Generic[LearnerSettings]):
-    """Everything that decides what a run does. ``learner`` is the learner's own config, or as a file holds it.
+    """Everything that decides what a run does, for example ``RunConfig(suite="MT4-v2", learner={"gamma": 0.99})``.
 
-    Raises BidexError for a field that is out of its bounds.
+    ``learner`` is the learner's own config, or a dict of the values that differ from its preset. Raises BidexError for
+    a field that is out of its bounds.
     """
 
-    suite: Text | None
+    suite: Text | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
-    task: Text | None
+    task: Text | None = None
     """Train on this task class alone, instead of a suite; or on package.module:Class of your own (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
@@ -84,15 +92,15 @@ class RunConfig(Generic[LearnerSettings]):
     start_from: Text | None = None
     """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
     one."""
-    algo: Text
+    algo: Text = "mtppo"
     """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
     preset: Text = "auto"
     """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, v2 for one
     of version 2 if the learner has it, else laptop on a CPU, on a GPU paper (of maml and promp laptop there too)."""
-    learner: LearnerSettings
-    num_envs: Environments
+    learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    num_envs: Environments = UNRESOLVED
     """Environments stepped together by each process, over all tasks."""
-    steps: Steps = field(metadata=MAY_CHANGE)
+    steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
     """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
@@ -134,18 +142,18 @@ class RunConfig(Generic[LearnerSettings]):
     --evaluate-every."""
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
-    seed: Seed
+    seed: Seed = 0
     """Seed of tasks, starts and learner."""
     device: Text = "auto"
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
     """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
-    threads: Threads = 1
+    threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default one per core, shared by the processes of a
     machine. A resumed run keeps its own."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "run", as_flags=True)
+        check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)
 
     @property
     def learner_values(self) -> JsonObject:
@@ -204,10 +212,14 @@ def config_of(content: object, where: str) -> RunConfig[JsonObject]:
     if isinstance(content, dict):  # what a run of 0.2.0 or before wrote, as this version writes it
         given = content.get("demonstrations")
         content = {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
+    missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
+    if missing:
+        raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")
     config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
         raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
-    return dataclasses.replace(config)  # msgspec leaves defaults to the class, and does not write those
+    # A copy, because msgspec leaves defaults to the class and does not write those.
+    return dataclasses.replace(config, threads=config.threads or 1)
 
 
 def printed(config: RunConfig) -> str:

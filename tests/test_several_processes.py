@@ -14,11 +14,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bidex_meta.cli import main, run, run_config
-from bidex_meta.cli.run_config import RunPlan, plan_run
+from bidex_meta.cli import main
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import run_config, training
 from bidex_meta.runs import RunFolder, read_metrics
+from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.train.distributed import TIMEOUT
 from bidex_meta.train.launch import launch, resume_command
 from tests.algos.ranks import same
@@ -33,8 +35,7 @@ _SCRIPT = """
 import os, sys
 import torch
 import bidex_meta.train.runner as runner
-from bidex_meta.cli import main, run, run_config
-from bidex_meta.cli.run_config import RunPlan, plan_run
+from bidex_meta.cli import main
 train = runner.train
 def often(learner, world, **keywords):
     stopped = train(learner, world, checkpoint_seconds=0.0, **keywords)
@@ -184,7 +185,7 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
     for name, value in places.items():
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(run_config, "usable_cores", lambda: 10)
-    config = plan_run(["--suite", "MT4", "--device", "cpu"]).config
+    config = config_of_words(["--suite", "MT4", "--device", "cpu"])
     assert (config.threads, config.processes, config.device) == (2, 8, "cpu")
     assert launch().own_device("cuda") == "cuda:1"
     assert resume_command(Path("r"), 8).startswith("torchrun --nnodes 2 --nproc-per-node 4 -m bidex_meta.cli")
@@ -193,22 +194,22 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
 
 
 def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = RunFolder.create(plan_run(SMALL).config, tmp_path / "r")
+    folder = RunFolder.create(config_of_words(SMALL), tmp_path / "r")
     config = folder.config().to_json()
     del config["processes"]
     folder.config_path.write_text(json.dumps(config))
-    assert plan_run(["--resume", str(tmp_path / "r")]).config.processes == 1
+    assert config_of_words(["--resume", str(tmp_path / "r")]).processes == 1
 
 
 def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = plan_run(SMALL)
+    config = config_of_words(SMALL)
 
-    def agree(step: int | None = None, **other: object) -> RunPlan:
-        everyone = SimpleNamespace(share=lambda mine: [mine, (replace(plan.config, **other), step)])
-        monkeypatch.setattr(run, "distributed", everyone)
-        return run._agree(plan, None)
+    def agree(step: int | None = None, **other: object) -> AnyConfig:
+        everyone = SimpleNamespace(share=lambda mine: [mine, (replace(config, **other), step)])
+        monkeypatch.setattr(training, "distributed", everyone)
+        return training._agree(config, None)
 
-    assert agree(threads=99).config.threads == 1
+    assert agree(threads=99).threads == 1
     with pytest.raises(BidexError, match=r"Process 1 has steps = 5, not .* Start all with the same flags"):
         agree(steps=5)
     with pytest.raises(BidexError, match="Process 1 finds a checkpoint at 64 steps, process 0 at None"):

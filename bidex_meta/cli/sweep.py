@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.cli.run_config import plan_run
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.cli.tables import Json, plain_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line, shortened
@@ -99,7 +99,7 @@ def _configs(sweep: Sweep, file: Path) -> dict[tuple[str, ...], RunConfig]:
     configs: dict[tuple[str, ...], RunConfig] = {}
     for run in sweep.runs:
         try:
-            configs[run.words] = configs.get(run.words) or plan_run(run.begin[1:]).config
+            configs[run.words] = configs.get(run.words) or config_of_words(run.begin[1:])
         except BidexError as error:
             raise BidexError(f"{file}: {run.arm} on {run.subject}: {error}") from None
     return configs

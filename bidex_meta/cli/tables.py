@@ -13,9 +13,9 @@ from rich.text import Text
 
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
-from bidex_meta.evaluation.meta_test import MetaEvaluation
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
+from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 from bidex_meta.utils.streams import output_width
 
 Json = dict[str, Any]  # what JSON holds, or goes into it
@@ -237,13 +237,34 @@ def print_table(table: Sheet) -> None:
     sys.stdout.write(table.printed(output_width(180)))
 
 
-def print_meta_test(subject: str, found: Mapping[str, MetaEvaluation]) -> None:
-    """For each split a table before adaptation and one after, the latter with the gains."""
-    for split, result in found.items():
-        shots = len(result.adapt_steps)
-        print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))
-        if shots:
-            title = f"{subject}, {split} tasks, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
+def print_evaluation(found: RunEvaluation, brief: bool = False) -> None:
+    """Print the tables of an evaluation; ``brief`` ones, of an evaluation with a random policy, fit a terminal."""
+    title = f"{found.algo} on {found.worlds.name}"
+    if not brief:
+        title += f", {found.own.split} tasks"
+    title += f", {found.steps:,} steps"
+    if found.worlds.config.randomisation:
+        title += f", randomised by {found.worlds.config.randomisation}"
+    _print_played(title, found.own, brief)
+    if found.others is not None:
+        others = found.others.worlds
+        _print_played(f"{found.algo} on {others.name}, other tasks (seed {others.seed})", found.others, brief)
+
+
+def _print_played(title: str, played: PlayedTasks, brief: bool) -> None:
+    if brief and played.random is not None:
+        print_table(result_table(title, played.policy, played.random))
+    else:
+        print_table(evaluation_table(title, played.policy, played.random))
+
+
+def print_meta_test(found: RunMetaTest) -> None:
+    """Print for each split a table before adaptation and one after, the latter with the gains."""
+    for split, result in found.splits.items():
+        subject = f"{found.algo} on {found.worlds.name}, {found.steps:,} steps, {split} tasks"
+        print_table(evaluation_table(f"{subject}, before adaptation", result.before))
+        if shots := len(result.adapt_steps):
+            title = f"{subject}, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
             print_table(evaluation_table(title, result.after, gains=result.gains()))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bidex_meta.cli.parsing import RunPath, parse
-from bidex_meta.cli.run_config import plan_run
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.cli.sweep import choose_cores, state_of, work
 from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
 from bidex_meta.cli.transfer_plan import (
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> None:
         say_other_rules(RunFolder.open(path), worlds)
     classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
     words = shared_words(flags.num_envs, arguments[at + 1 :])
-    planned = plan_run([f"--suite={config.suite}", *words]).config  # refuses what follows -- before anything is written
+    planned = config_of_words([f"--suite={config.suite}", *words])  # refuses what follows -- before anything is written
     if any(flags.demonstrations):
         part_files.hdf5()
     check_writable(flags.out / "transfer.json")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.spaces import Box
 
-from bidex_meta.cli.run_config import plan_run
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.config import RunConfig
 from bidex_meta.data import Dataset, open_dataset, part_files, writer
 from bidex_meta.data.collect import collect_successes, progress, resumed_writer
@@ -230,4 +230,4 @@ def _cell(file: Path, name: str, arm: Arm, seed: int, words: list[str], out: Pat
     how = _ALGO if count is None else f"{count}-demonstrations"
     path = out / "runs" / f"{short_name(name)}-{arm.name}-{how}-seed{seed}".replace(" ", "-")
     run = PlannedRun(path, arm.name, name, seed, (f"--suite={file}", *words, *arm.network, *start))
-    return Cell(replace(run, config=plan_run(run.begin[1:]).config), name, arm.name, count)
+    return Cell(replace(run, config=config_of_words(run.begin[1:])), name, arm.name, count)

@@ -10,6 +10,7 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.suite import OTHERS
+from bidex_meta.train.launch import say
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
@@ -39,13 +40,12 @@ class Options:
 
 
 def meta_test(
-    worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str],
-    say: Callable[[str], None] = lambda text: None
+    worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str]
 ) -> dict[str, MetaEvaluation]:  # fmt: skip
-    """The meta-test on some splits of a run's worlds.
+    """Play the meta-test on some splits of a run's worlds.
 
-    ``load`` makes a MetaLearningAgent, anew for each split, so that neither depends on the other; of the config
-    ``algo``, ``num_envs`` and ``learner`` are read; ``say`` is called with what begins.
+    ``load`` makes a new MetaLearningAgent for each split, so that neither depends on the other. Of the config,
+    ``algo``, ``num_envs`` and ``learner`` are read.
     """
     check_worlds(worlds, config.algo)
     found = {}

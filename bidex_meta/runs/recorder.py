@@ -1,7 +1,7 @@
 """The object that a training loop writes to: metrics, checkpoints, films and progress."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated
@@ -22,24 +22,31 @@ from bidex_meta.utils.validation import Seconds, Whole
 class Recorder:
     """Records a training run. Use as a context manager, so that files are closed and the terminal is restored.
 
-    Steps and seconds in all are for the progress display; ``resume_step`` is of the checkpoint the run continues from.
+    ``total_steps`` and ``total_seconds`` are for the progress display, which ``show_progress`` turns on;
+    ``resume_step`` is of the checkpoint that the run continues from.
     """
+
+    on_log: Callable[[Mapping[str, float], int], None] | None = None
+    """Called with metrics and environment steps after they were written."""
 
     @checked_arguments
     def __init__(
         self, folder: RunFolder, total_steps: Annotated[int, Meta(ge=0, le=10**15)], total_seconds: Seconds = math.inf,
-        resume_step: Whole | None = None, logger: str = "tensorboard"
+        resume_step: Whole | None = None, logger: str = "tensorboard", show_progress: bool = True
     ):  # fmt: skip
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:
             self._metrics.writer.config(portable(folder.config().to_json()))
-        self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
+        self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0) if show_progress else None
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Write metrics by tag after ``step`` environment steps, and renew the progress display."""
         self._metrics.log(metrics, step)
-        self._progress.update(metrics, step)
+        if self._progress is not None:
+            self._progress.update(metrics, step)
+        if self.on_log is not None:
+            self.on_log(metrics, step)
 
     def save(self, state: State, step: int) -> None:
         """Write a checkpoint, atomically; see ``Checkpoints.save``."""
@@ -54,11 +61,13 @@ class Recorder:
         return path
 
     def __enter__(self) -> "Recorder":
-        self._progress.start()
+        if self._progress is not None:
+            self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._progress.close()
+        if self._progress is not None:
+            self._progress.close()
         self._metrics.close()

@@ -10,6 +10,7 @@ import math
 import operator
 import re
 import types
+from collections.abc import Collection
 from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import msgspec
@@ -55,14 +56,16 @@ class Checked:
         check_fields(self, getattr(self, "algo", type(self).__name__))
 
 
-def check_fields(settings: object, name: str, as_flags: bool = False) -> None:
-    """Raises BidexError for the first field of a dataclass's instance that does not fit its annotation.
+def check_fields(settings: object, name: str, as_flags: bool = False, unresolved: Collection[str] = ()) -> None:
+    """Raise BidexError for the first field of a dataclass's instance that does not fit its annotation.
 
     Fields whose annotation is no plain type (a path, a function) are left alone. ``name`` is the instance in messages,
-    which name the field as a flag of the command line if ``as_flags``.
+    which name the field as a flag of the command line if ``as_flags``. Fields named in ``unresolved`` may be None.
     """
     for field, hint in _hints(type(settings)).items():
         value = getattr(settings, field)
+        if value is None and field in unresolved:
+            continue
         try:
             msgspec.convert(value, hint)
         except msgspec.ValidationError as error:

@@ -14,7 +14,7 @@ from gymnasium.spaces import Box
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.cli import main, transfer
-from bidex_meta.cli.run_config import plan_run
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.cli.sweep import state_of
 from bidex_meta.cli.transfer_plan import (
     Arm,
@@ -186,7 +186,7 @@ def test_scripts_demonstrate_where_no_data_are_given(pair: Path, tmp_path: Path)
 
 @pytest.mark.parametrize(("steps", "words", "every"), [(250_000, [], 4), (250_000, ["--learner.rollout-steps=128"], 1)])
 def test_a_run_by_reinforcement_is_evaluated_a_hundred_times_or_after_each_iteration(steps, words, every) -> None:
-    planned = plan_run(["--task=HandOver-v2", *shared_words(64, words)]).config
+    planned = config_of_words(["--task=HandOver-v2", *shared_words(64, words)])
     assert reinforced(steps, planned) == [f"--steps={steps}", f"--evaluate-every={every}"]
     assert reinforced(0, planned) == []
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main, watching
+from bidex_meta.cli import main
+from bidex_meta.experiments import watching
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bidex_meta.cli import main, run_recording
+from bidex_meta.cli import main
 from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
 from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import run_recording
 from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import memory
@@ -182,22 +183,21 @@ def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path
 
 def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(folder, monkeypatch):
     """Of a share of the rows, with a checkpoint's copy; of a resumed run less the parts that are there."""
-    plan: Any = SimpleNamespace(config=SimpleNamespace(record=100, record_share=0.5), folder=None)
-    plan.flags = SimpleNamespace(run_dir=folder / "run")
+    config: Any = SimpleNamespace(record=100, record_share=0.5)
     asked: list[int] = []
     monkeypatch.setattr(writer, "check_room", lambda where, needed, what: asked.append(needed))
     # Two rows of five steps, two of eight, of three observations, two actions and two rewards; and once more.
     needed = 2 * 4 * (3 + 2 + 2) * (2 * 5 + 2 * 8)
     monkeypatch.setattr(memory, "available", lambda: needed)
-    assert len(run_recording.recorded(plan, rough(6)).rows) == 4
+    assert len(run_recording.recorded(config, folder / "run", rough(6)).rows) == 4
     monkeypatch.setattr(memory, "available", lambda: needed - 1)
     with pytest.raises(BidexError, match=r"running episodes of 4 recorded rows .* Lower --record or --num-envs"):
-        run_recording.recorded(plan, rough(6))
+        run_recording.recorded(config, folder / "run", rough(6))
     part = part_files.part_path(folder / "run" / "replay" / "data", 0, 0)
     part.parent.mkdir(parents=True)
     part.write_bytes(bytes(1000))
     with pytest.raises(BidexError, match="running episodes"):
-        run_recording.recorded(plan, rough(6))
+        run_recording.recorded(config, folder / "run", rough(6))
     assert asked[0] == asked[1] == asked[2] + 1000
 
 

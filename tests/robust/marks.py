@@ -93,8 +93,9 @@ class Torn:
 def instrument(marks: Marks) -> None:
     """Puts the marks into the commands of this process, for good; what else a run learns to do gets a line here."""
     from bidex_algos.offline.base import Offline
-    from bidex_meta.cli import run, run_recording, watching
+    from bidex_meta.cli import run
     from bidex_meta.data.writer import DatasetWriter
+    from bidex_meta.experiments import run_recording, watching
     from bidex_meta.runs import atomic, checkpoints, metrics
     from bidex_meta.train import runner
 

@@ -13,10 +13,10 @@ import torch
 from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.cli.verify import others, recorded_conditions, recorded_evaluation
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.references import load_from
+from bidex_meta.experiments.verifying import others, recorded_conditions, recorded_evaluation
 from bidex_meta.runs import Checkpoints, RunFolder, mend
 from bidex_meta.runs.schemas import read_evaluation, read_versions
 from bidex_meta.utils.paths import assets_dir, suites_dir

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main, watching
+from bidex_meta.cli import main
+from bidex_meta.experiments import watching
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.humanoid import NAME, HumanoidWorld

@@ -1,29 +1,29 @@
-"""What ``bidex-meta run --record`` adds: a collector around its world."""
+"""Recording of a training's transitions (``RunConfig.record``): a collector around its world."""
 
 from pathlib import Path
 
-from bidex_meta.cli.run_config import RunPlan
 from bidex_meta.data import part_files, writer
 from bidex_meta.data.collect import bytes_held
 from bidex_meta.data.collector import RunCollector, spread_environments
 from bidex_meta.experiments.run_data import dataset_metadata
-from bidex_meta.runs.folder import new_folder_name
+from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.train.launch import launch, say
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import PooledWorld
+from bidex_meta.worlds import Worlds
 
 
-def recorded(plan: RunPlan, world: PooledWorld) -> RunCollector:
-    """The world with a collector around it, of as many environments as give the transitions that were asked for.
+def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollector:
+    """Return the world with a collector around it, of as many environments as give ``config.record`` transitions.
 
-    Raises BidexError where there is no room for them on the disk, or in memory for the running episodes.
+    ``folder`` is the run's. Raises BidexError if there is no room for the transitions on the disk, or in memory for
+    the running episodes.
     """
-    rows = spread_environments(world, plan.config.record_share)
+    rows = spread_environments(world, config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
-    needed = writer.estimated_bytes(plan.config.record, *sizes, 20.0)
-    folder = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
+    needed = writer.estimated_bytes(config.record, *sizes, 20.0)
     there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))  # of a resumed run
-    writer.check_room(folder, max(0, needed - there), f"{plan.config.record:,} transitions")
+    writer.check_room(folder, max(0, needed - there), f"{config.record:,} transitions")
     # A checkpoint copies the running episodes; each process of this machine has its own.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
@@ -32,16 +32,16 @@ def recorded(plan: RunPlan, world: PooledWorld) -> RunCollector:
 
 
 def begin(collector: RunCollector, folder: Path, fresh: bool) -> None:
-    """Sets the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
+    """Set the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
     collector.folder = folder / "replay"
     if fresh:
         collector.open(collector.folder)
 
 
-def complete(plan: RunPlan, collector: RunCollector) -> None:
-    """Makes a data set of what all processes collected."""
-    policy = {"algo": plan.config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
-    about = dataset_metadata(plan.source, collector, "replay", [policy])
-    name = writer.default_name(plan.source.name, "replay")
+def complete(config: AnyConfig, worlds: Worlds, collector: RunCollector) -> None:
+    """Make a data set of what all processes collected."""
+    policy = {"algo": config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
+    about = dataset_metadata(worlds, collector, "replay", [policy])
+    name = writer.default_name(worlds.name, "replay")
     writer.finish(collector.folder, name, collector.single_observation_space, collector.single_action_space, about)
     say(f"Recorded: {collector.folder}")

@@ -10,14 +10,15 @@ import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli.run_config import RunPlan
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.filming import film_tiles
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments import metatest
+from bidex_meta.experiments.learners import LearnerKind
 from bidex_meta.experiments.policies import slots_of
 from bidex_meta.runs import Recorder, RunFolder
+from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
 from bidex_meta.tasks.base import CONTROL_RATE
@@ -33,11 +34,11 @@ _FILM = {"width": 240, "height": 180}
 _FILM_EVERY, _MOST_FILM_STEPS = 2, 300
 
 
-def check(plan: RunPlan) -> None:
+def check(config: AnyConfig, worlds: Worlds) -> None:
     """Refuse what would fail in the middle of the training: films of what has none or cannot be drawn, a logger."""
-    check_logger(plan.config.logger)
-    if plan.config.video_every is not None:
-        plan.source.task_classes()
+    check_logger(config.logger)
+    if config.video_every is not None:
+        worlds.task_classes()
         check_films()
         gl_backend.prepare()
 
@@ -45,10 +46,18 @@ def check(plan: RunPlan) -> None:
 class Watch:
     """Called after each iteration, of which a resumed run has made some before; every so many it evaluates or films."""
 
-    def __init__(self, plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int) -> None:
-        self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
+    def __init__(
+        self, config: AnyConfig, kind: LearnerKind, worlds: Worlds, folder: RunFolder, learner: Learner,
+        record: Recorder, iterations: int
+    ) -> None:  # fmt: skip
+        self._config = config
+        self._kind = kind
+        self._source = worlds
+        self._folder = folder
+        self._learner = learner
+        self._record = record
         self._iterations = iterations
-        self._device = launch().own_device(plan.config.device)
+        self._device = launch().own_device(config.device)
         self._worlds: dict[str, PooledWorld] = {}
         self._best = folder.checkpoints.found_of_best()
 
@@ -57,9 +66,9 @@ class Watch:
         self._iterations += 1
         metrics: dict[str, float] = {}
         with undisturbed(torch.device(self._device)):
-            if self._is_due(self._plan.config.evaluate_every):
+            if self._is_due(self._config.evaluate_every):
                 metrics = self._evaluate()
-            if self._is_due(self._plan.config.video_every):
+            if self._is_due(self._config.video_every):
                 self._film()
         return metrics
 
@@ -73,10 +82,10 @@ class Watch:
 
     def _policy(self, device: str) -> Agent:
         """A copy: recurrent ones remember what they saw, adapting ones learn."""
-        return self._plan.kind.make.load_policy(self._learner.policy_state_dict(), device)
+        return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        metrics = self._meta_test() if self._plan.kind.make.adapts else _metrics(self._judge())
+        metrics = self._meta_test() if self._kind.make.adapts else _metrics(self._judge())
         ranks = ("Eval/success_rate", "Eval/score", "Eval/mean_return")
         found = {name: metrics[name] for name in ranks if name in metrics}
         if self._best is None or _better(found, self._best):
@@ -85,7 +94,7 @@ class Watch:
         return metrics
 
     def _judge(self) -> Evaluation:
-        source = self._plan.source
+        source = self._source
         pools = source.tasks("train")
         tasks, episodes = played(pools)
         if "evaluation" not in self._worlds:
@@ -99,7 +108,7 @@ class Watch:
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
         load, options = partial(self._policy, self._device), metatest.Options()
-        found = metatest.meta_test(self._plan.source, self._plan.config, load, options, ["train"])["train"]
+        found = metatest.meta_test(self._source, self._config, load, options, ["train"])["train"]
         before = _metrics(found.before)["Eval/success_rate"]
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
 
@@ -107,11 +116,11 @@ class Watch:
         """A film of an environment of each class beside each other; its failure is reported and ends nothing."""
         try:
             if "film" not in self._worlds:
-                worlds = Worlds.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
+                worlds = Worlds.open({**self._config.to_json(), "device": "cpu", "engine": "auto"})
                 self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
-            rows, seed = range(world.num_envs), self._plan.config.seed
+            rows, seed = range(world.num_envs), self._config.seed
             frames = film_tiles(self._policy("cpu"), world, rows, steps, seed, _FILM_EVERY, large=False, **_FILM)
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:

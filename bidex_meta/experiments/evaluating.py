@@ -1,0 +1,227 @@
+"""Evaluations of a run: its policy on tasks of its suite, or what its adaptation gains there."""
+
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.meta_test import MetaEvaluation
+from bidex_meta.evaluation.play import RandomAgent
+from bidex_meta.evaluation.results import Evaluation, compare
+from bidex_meta.experiments import metatest
+from bidex_meta.experiments.conditions import conditions
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.metatest import Options
+from bidex_meta.experiments.policies import checkpoint as load_checkpoint
+from bidex_meta.experiments.policies import policy_of
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json, write_json
+from bidex_meta.runs.folder import AnyConfig
+from bidex_meta.train.launch import say
+from bidex_meta.utils.files import portable
+from bidex_meta.utils.waiting import note
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+
+@dataclass(frozen=True)
+class PlayedTasks:
+    """A policy's evaluation on the tasks of one split."""
+
+    worlds: Worlds
+    split: str
+    seed: int
+    """Seed of the episodes' starts."""
+    policy: Evaluation
+    random: Evaluation | None
+    """A random policy on the same tasks, if that was asked for."""
+
+    @property
+    def success(self) -> float:
+        """Return the mean over classes of the success rate, in [0, 1]."""
+        rates = [result.success for result in self.policy.classes.values()]
+        return sum(rates) / len(rates)
+
+    def to_json(self, steps: int) -> Json:
+        """Return the numbers, ready for JSON."""
+        found: Json = {"steps": steps, "split": self.split, "seed": self.seed, "policy": self.policy.to_json()}
+        if self.random is not None:
+            differences = {name: asdict(each) for name, each in compare(self.policy, self.random).items()}
+            found |= {"random": self.random.to_json(), "return_above_random": differences}
+        return found
+
+
+@dataclass(frozen=True)
+class RunEvaluation:
+    """What :func:`evaluate` found."""
+
+    run: RunFolder
+    algo: str
+    worlds: Worlds
+    steps: int
+    """Environment steps that the policy was trained for."""
+    own: PlayedTasks
+    others: PlayedTasks | None
+    """The evaluation on tasks that the run was not trained on, if that was asked for."""
+    conditions: Json
+
+    @property
+    def success(self) -> float:
+        """Return the mean over classes of the success rate, in [0, 1]."""
+        return self.own.success
+
+    def to_json(self) -> Json:
+        """Return the content of ``evaluation.json``."""
+        found = {"run": portable(str(self.run.path)), **self.own.to_json(self.steps)}
+        if self.others is not None:
+            found["other_tasks"] = {"task_seed": self.others.worlds.seed, **self.others.to_json(self.steps)}
+        return found | _closing(self.conditions, self.worlds)
+
+
+@dataclass(frozen=True)
+class RunMetaTest:
+    """What :func:`meta_test` found."""
+
+    run: RunFolder
+    algo: str
+    worlds: Worlds
+    steps: int
+    """Environment steps that the learner was meta-trained for."""
+    seed: int
+    splits: dict[str, MetaEvaluation]
+    """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
+    conditions: Json
+
+    def to_json(self) -> Json:
+        """Return the content of ``evaluation.json``."""
+        splits = {split: found.to_json() for split, found in self.splits.items()}
+        found = {"run": portable(str(self.run.path)), "steps": self.steps, "seed": self.seed}
+        return {**found, "splits": splits, **_closing(self.conditions, self.worlds)}
+
+
+def evaluate(
+    run: RunFolder | str | Path,
+    *,
+    split: str = "train",
+    checkpoint: str = "last",
+    random: bool = False,
+    other_tasks: bool = False,
+    episodes: int | None = None,
+    num_envs: int | None = None,
+    seed: int = Options.seed,
+    randomisation: str | Path | None = None,
+    device: str = "auto",
+    engine: str = "auto",
+    save: bool = False,
+) -> RunEvaluation:
+    """Evaluate a run's policy, by its mean action, with the same number of episodes of every task.
+
+    Args:
+        run: The run's folder.
+        split: ``train``, the tasks that it was trained on, or a meta suite's ``test`` tasks.
+        checkpoint: ``last``, ``best`` or a file.
+        random: Whether a random policy plays the same tasks.
+        other_tasks: Whether the policy also plays as many tasks that no run was trained on.
+        episodes: Episodes of each task; None: 4, or 1 where a task fixes its start.
+        num_envs: Environments stepped together, a multiple of the number of tasks; None: one per task.
+        seed: Seed of the episodes' starts; training does not use the default.
+        randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        engine: ``auto``, ``c`` or ``warp``.
+        save: Whether the result is written to the run's ``evaluation.json``.
+
+    Raises BidexError for a run without such a checkpoint or split, and for learners that adapt (:func:`meta_test`).
+    """
+    folder = _opened(run)
+    config, worlds = _set_up(folder, device, engine, randomisation)
+    if learner_kind(config.algo, config.task).make.adapts:
+        raise BidexError(f"{config.algo} adapts to tasks: its policy alone says little. Use meta_test(run).")
+    state, steps = load_checkpoint(folder, checkpoint)
+    policy = policy_of(folder, state, config.device)
+    size = Options(episodes=episodes, num_envs=num_envs, seed=seed)
+    count = episodes or worlds.default_episodes
+    beside = ", and the same of a random policy" if random else ""
+    say(f"Evaluating: {count} episode{'s' * (count > 1)} of each task{beside}.")
+    own = _played(worlds, policy, split, size, random)
+    others = _played(worlds.others, policy, split, size, random) if other_tasks else None
+    found = RunEvaluation(folder, config.algo, worlds, steps, own, others, conditions(worlds, num_envs))
+    if save:
+        write_json(folder.evaluation_path, found.to_json())
+    return found
+
+
+def meta_test(
+    run: RunFolder | str | Path,
+    *,
+    split: str = "auto",
+    checkpoint: str = "last",
+    options: Options | None = None,
+    randomisation: str | Path | None = None,
+    device: str = "auto",
+    engine: str = "auto",
+    save: bool = False,
+    **size: Any,
+) -> RunMetaTest:
+    """Evaluate a run's learner before and after it adapts to tasks.
+
+    Args:
+        run: The run's folder, of a learner that adapts.
+        split: ``train``, ``test``, ``others`` (tasks of the train classes that the run was not trained on), or
+            ``auto`` for train and test.
+        checkpoint: ``last``, ``best`` or a file.
+        options: How much is played; None: the defaults of ``bidex_meta.experiments.metatest.Options``.
+        randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        engine: ``auto``, ``c`` or ``warp``.
+        save: Whether the result is written to the run's ``evaluation.json``.
+        size: Fields of ``options`` to replace: ``shots``, ``rollouts``, ``episodes``, ``tasks``, ``trials``, ...
+
+    Raises BidexError for a run without such a checkpoint or split, and for learners that do not adapt.
+    """
+    folder = _opened(run)
+    config, worlds = _set_up(folder, device, engine, randomisation)
+    if not learner_kind(config.algo, config.task).make.adapts:
+        raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
+    metatest.check_worlds(worlds, config.algo)
+    splits = metatest.splits_of(worlds, split)
+    options = replace(options or Options(), **size)
+    state, steps = load_checkpoint(folder, checkpoint)
+    load = partial(policy_of, folder, state, config.device)
+    found = metatest.meta_test(worlds, config, load, options, splits)
+    result = RunMetaTest(folder, config.algo, worlds, steps, options.seed, found, conditions(worlds, options.num_envs))
+    if save:
+        write_json(folder.evaluation_path, result.to_json())
+    return result
+
+
+def _closing(conditions: Json, worlds: Worlds) -> Json:
+    """Return the last entries of ``evaluation.json``."""
+    randomised = {} if worlds.randomisation is None else {"randomisation": asdict(worlds.randomisation)}
+    return {"conditions": conditions, **randomised}
+
+
+def _opened(run: RunFolder | str | Path) -> RunFolder:
+    return RunFolder.open(run.path if isinstance(run, RunFolder) else run)
+
+
+def _set_up(folder: RunFolder, device: str, engine: str, randomisation: str | Path | None) -> tuple[AnyConfig, Worlds]:
+    """Return the run's config with the device and engine to evaluate with, and its worlds."""
+    stored = folder.config()
+    device = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
+    config = replace(stored, device=device, engine=engine)
+    file = None if randomisation is None else str(randomisation)
+    worlds = Worlds.open({**config.to_json(), "randomisation": file})
+    set_up_torch(config.threads)
+    return config, worlds
+
+
+def _played(worlds: Worlds, policy: Agent, split: str, size: Options, random: bool) -> PlayedTasks:
+    note(f"Building the world of {worlds.name}")
+    world = worlds.world(split, size.num_envs)
+    protocol = worlds.protocol(split, size.episodes, size.seed)
+    found = worlds.judge(policy, world, protocol)
+    other = worlds.judge(RandomAgent(world.action_space), world, protocol) if random else None
+    world.close()
+    return PlayedTasks(worlds, split, protocol.seed, found, other)

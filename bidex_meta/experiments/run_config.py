@@ -1,0 +1,141 @@
+"""A run's config, resolved and checked: names as they are written, the preset's values, sizes that suit the device."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.data import part_files
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments import run_data, run_teachers
+from bidex_meta.experiments.conditions import check_worlds_of
+from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
+from bidex_meta.runs.folder import AnyConfig, RunFolder
+from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.utils.files import absolute
+from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
+from bidex_meta.worlds import Worlds
+
+_WIDTH = 1200  # numbers that a step of one environment holds at most: two observations, actions, what is computed
+
+
+def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
+    """Return a config with every value filled in, as ``config.json`` holds it.
+
+    A value that is None, ``"auto"`` or left out of ``learner`` gets what suits the suite, the learner and the device.
+    Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes nothing.
+    ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
+    """
+    dataset = run_data.whole_paths(config.dataset)
+    datasets = run_data.open_datasets(dataset)
+    if config.suite is None and config.task is None:
+        config = replace(config, **run_data.implied(datasets))
+    _check_names(config)
+    source = Worlds.open({"suite": config.suite, "task": config.task, "object": config.object})
+    kind = learner_kind(config.algo, source.class_name)
+    device = resolve_device(config.device, source.on_gpu)
+    preset, _ = choose_preset(kind, config.preset, device, source.preset)
+    num_envs, steps = source.rows_and_steps(device, kind.make.adapts)
+    if kind.make.offline:
+        num_envs = max(1, len(source.tasks("train")))  # it takes sizes and names from its world
+        steps = run_data.UPDATES
+    config = replace(
+        config,
+        suite=None if config.suite is None else _written(source.name),
+        task=None if config.task is None else source.class_name or source.name,
+        object=_written(config.object),
+        start_from=None if config.start_from is None else str(absolute(config.start_from)),
+        dataset=dataset,
+        demonstrations=run_data.whole_paths(config.demonstrations),
+        teacher=run_teachers.whole_paths(config.teacher),
+        task_seed=run_data.task_seed(datasets) if config.task_seed is None else config.task_seed,
+        algo=kind.name,
+        preset=preset,
+        learner=_learner_config(kind.presets[preset], config, where),
+        num_envs=num_envs if config.num_envs is None else config.num_envs,
+        steps=steps if config.steps is None else config.steps,
+        threads=max(1, usable_cores() // launch().local_count) if config.threads is None else config.threads,
+        processes=launch().count,
+        device=device,
+    )
+    share = config.record / max(config.steps, 1)
+    return replace(config, record_share=config.record_share or share)
+
+
+def check(config: AnyConfig, with_memory: bool = True) -> None:
+    """Raise BidexError if entries of a resolved config do not go together, or need more memory than there is."""
+    kind = learner_kind(config.algo, config.task)
+    worlds = Worlds.open(config.to_json())
+    if config.stop_at_score is not None and config.evaluate_every is None:
+        raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
+    if config.record:
+        part_files.hdf5()  # refuses it where it is not installed
+    run_data.check_offline(kind, config.record, run_data.open_datasets(config.dataset), worlds)
+    run_data.check_demonstrations(kind, config.demonstrations, worlds)
+    run_teachers.check_teachers(kind, config, worlds)
+    if with_memory and config.device.startswith("cpu"):
+        of_learner = kind.make.bytes_held(config.learner, config.num_envs, _WIDTH + 3 * config.points)
+        needed = launch().local_count * (of_learner + config.num_envs * (ROW_BYTES + config.points * POINT_BYTES))
+        what = f"--num-envs {config.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
+        check_memory(needed, what, "Lower it, or the learner's layers, steps or replay.")
+
+
+def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
+    """Raise BidexError if a run cannot go on with a resolved config, or its worlds are no longer the same."""
+    stored = resolve(folder.config(), str(folder.config_path))
+    processes = folder.config().processes
+    if processes != config.processes:
+        raise BidexError(
+            f"{folder.path} has worlds of {processes} process(es), not {config.processes}. "
+            f"Continue: {resume_command(folder.path, processes)}"
+        )
+    for name, before, after in stored.differences(config, ignored=("record_share",)):
+        flag = "--" + name.replace("_", "-")
+        raise BidexError(
+            f"{flag} is {before} in {folder.path}, not {after}: a resumed run keeps its config. Leave {flag} out, or "
+            "start a new run."
+        )
+    mend = "Resume with the versions in versions.json, or start a new run from it: --start-from RUN."
+    check_worlds_of(folder, Worlds.open(config.to_json()), mend)
+
+
+def preset_reason(config: AnyConfig) -> str:
+    """Return in words why a resolved config has its preset."""
+    source = Worlds.open({"suite": config.suite, "task": config.task, "object": config.object})
+    kind = learner_kind(config.algo, source.class_name)
+    name, reason = choose_preset(kind, "auto", config.device, source.preset)
+    return reason if name == config.preset else "as asked"
+
+
+def _check_names(config: AnyConfig) -> None:
+    if (config.suite is None) == (config.task is None):
+        raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
+    if config.base != "own" and config.task is None:
+        raise BidexError(f"--base {config.base} goes with --task; a suite's file says whether bases move.")
+    if config.object is not None and config.task is None:
+        raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
+
+
+def _written(name: str | None) -> str | None:
+    """Return a name as a config holds it: the whole path of a file."""
+    return str(absolute(name)) if name is not None and Path(name).suffix in (".toml", ".xml") else name
+
+
+def _learner_config(preset: Any, config: AnyConfig, where: str) -> Any:
+    """Return the learner's settings: as they are, or a preset with the given values in the place of its own."""
+    if not isinstance(config.learner, Mapping):
+        return config.learner
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in config.learner.items()}
+    unknown = set(values) - {entry.name for entry in dataclasses.fields(preset)}
+    if unknown:
+        raise BidexError(
+            f"{where} sets {', '.join(sorted(unknown))}, which this version of {config.algo} does not have. "
+            "Resume with the version in versions.json, or leave it out."
+        )
+    try:
+        return replace(preset, **values)
+    except BidexError as error:
+        raise BidexError(f"{where}: {error}") from None
+    except (TypeError, ValueError) as error:  # of a learner from elsewhere
+        raise BidexError(f"{where}: learner: {one_line(error)}.") from None

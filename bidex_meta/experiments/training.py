@@ -1,0 +1,333 @@
+"""Training from a config to a run folder: config, folder, world, learner, training, in this order.
+
+Of several processes (torchrun) each has a world and a learner. Process 0 alone writes, logs and calls back.
+"""
+
+import contextlib
+import logging
+import math
+import signal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from bidex_meta.data.joined import join
+from bidex_meta.errors import BidexError
+from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
+from bidex_meta.experiments.learners import LearnerKind, learner_kind
+from bidex_meta.experiments.policies import checkpoint, fitting, say_other_rules
+from bidex_meta.experiments.run_config import check, check_resumed, preset_reason, resolve
+from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
+from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
+from bidex_meta.train import distributed, runner
+from bidex_meta.train.distributed import together
+from bidex_meta.train.launch import launch, resume_command, say
+from bidex_meta.utils.waiting import note
+from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+_LOG = logging.getLogger("bidex_meta")
+
+Checkpoint = tuple[Json, int]  # state and environment steps
+
+
+@dataclass(frozen=True)
+class Event:
+    """What :func:`train` calls back with, in process 0."""
+
+    kind: Literal["started", "iteration", "ended"]
+    folder: RunFolder
+    step: int
+    """Environment steps so far, over all environments of all processes."""
+    metrics: Mapping[str, float]
+    """Metrics of an iteration by tag (docs/metrics.md); empty of the other events."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal ended the training early. The run has saved and can be resumed."""
+
+    def __init__(self, folder: RunFolder, step: int, number: int) -> None:
+        super().__init__(f"{signal.Signals(number).name} after {step:,} steps")
+        self.folder = folder
+        self.step = step
+        self.number = number
+
+
+def train(
+    config: AnyConfig | None = None,
+    *,
+    run_dir: str | Path | None = None,
+    resume: RunFolder | str | Path | None = None,
+    on_event: Callable[[Event], None] | None = None,
+    show_progress: bool = False,
+) -> RunFolder:
+    """Train a learner, from the last checkpoint of ``resume`` if that is given, and return the run's folder.
+
+    Lines about what happens are logged by the logger ``bidex_meta`` at level INFO. Several processes must call this
+    with equal arguments.
+
+    Args:
+        config: What to train; values that are left out are resolved (``bidex_meta.experiments.run_config``). None: the
+            config of ``resume``.
+        run_dir: A new folder for the run; None: runs/SUITE/ALGO/DATE_seedSEED.
+        resume: A run to continue. Of its config, only the entries that the fields' help names may change.
+        on_event: Called when training starts, after each iteration, and when training has ended.
+        show_progress: Whether a table, or a line every few seconds, is printed on stderr.
+
+    Raises BidexError for bad input, before anything is written; Stopped if a signal ended the training, which has saved
+    then; FloatingPointError if the training diverged; LostProcess if another process is gone.
+    """
+    distributed.init_from_environment()
+    folder = None
+    try:
+        with contextlib.ExitStack() as held:  # the lock of the run's folder
+            old = together(lambda: None if resume is None else _opened(resume, run_dir))
+            resolved = together(lambda: _checked(config, old))
+            new = None if run_dir is None else Path(run_dir)
+            together(lambda: _lock(resolved, old, new, held))
+            loaded = together(lambda: old.checkpoints.load() if old else None)
+            agreed = _agree(resolved, loaded)
+            run = _begin(agreed, old, new, loaded, held)
+            folder = run.folder
+            stopped = _train(run, agreed, loaded, on_event, show_progress)
+            distributed.shut_down()
+            run.world.close()
+    except distributed.LostProcess as loss:
+        _report_loss(loss, folder)
+        raise
+    if stopped:
+        raise Stopped(folder, run.learner.env_steps, stopped)
+    return folder
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What trains in this process."""
+
+    folder: RunFolder
+    kind: LearnerKind
+    worlds: Worlds
+    world: Any
+    learner: Any
+    is_resumed: bool
+
+
+def _opened(resume: RunFolder | str | Path, run_dir: object) -> RunFolder:
+    if run_dir is not None:
+        raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
+    return RunFolder.open(resume.path if isinstance(resume, RunFolder) else resume)
+
+
+def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
+    if config is None and old is None:
+        raise BidexError('Expected a config or a run to resume, got neither. Pass RunConfig(suite="MT4-v2").')
+    config = resolve(old.config() if config is None and old else config)  # pyright: ignore[reportArgumentType]
+    check(config)
+    if old is not None:
+        check_resumed(old, config)
+    return config
+
+
+def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: contextlib.ExitStack) -> None:
+    """Lock the run's folder, and refuse what would fail in the middle of the training, before anything is built."""
+    kind = learner_kind(config.algo, config.task)
+    worlds = Worlds.open(config.to_json())
+    if launch().rank == 0:
+        if old is not None:
+            old.check_own()
+            held.enter_context(old.locked())
+        else:
+            # Of a name that no other run has, should one begin in this second too.
+            name = new_folder_name(config)
+            check_new(new or name.with_name(f"{name.name}_0"))
+        watching.check(config, worlds)
+    if kind.make.adapts:
+        metatest.check_worlds(worlds, config.algo)
+    if old is None and config.start_from is not None:
+        start = RunFolder.open(Path(config.start_from))
+        if start.checkpoints.newest_step() is None:
+            checkpoint(start)  # refuses it
+
+
+def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
+    """Return process 0's config; refuse processes that have another config, or see other checkpoints."""
+    everyone = distributed.share((config, loaded and loaded[1]))
+    first, step = everyone[0]
+
+    def refuse_others() -> None:
+        here = first.flat()
+        for number, (other, other_step) in enumerate(everyone):
+            there = other.flat()
+            # Machines may differ in cores; the run keeps the threads of process 0.
+            for name in here.keys() - {"threads"}:
+                if here[name] != there.get(name):
+                    raise BidexError(
+                        f"Process {number} has {name} = {there.get(name)}, not {here[name]} as process 0. Start all "
+                        "with the same flags."
+                    )
+            if other_step != step:
+                raise BidexError(
+                    f"Process {number} finds a checkpoint at {other_step} steps, process 0 at {step}. The run folder "
+                    "must be one that all machines see."
+                )
+
+    together(refuse_others)
+    return first
+
+
+def _begin(
+    config: AnyConfig, old: RunFolder | None, new: Path | None, loaded: Checkpoint | None, held: contextlib.ExitStack
+) -> _Run:
+    """Make the world, the learner and the folder; process 0's folder is that of all processes."""
+    # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
+    set_up_torch(config.threads)
+    kind = learner_kind(config.algo, config.task)
+    worlds = Worlds.open({**config.to_json(), "device": launch().own_device(config.device)})
+    rows = f"{launch().count} x {config.num_envs}" if launch().count > 1 else f"{config.num_envs}"
+    say(f"{config.algo} on {worlds.name}, {rows} environments on {config.device}, seed {config.seed}")
+    say(f"Preset {config.preset}: {preset_reason(config)}.")
+    note(f"Building the world of {worlds.name}")
+    autoreset = kind.autoreset(config.learner_values)
+    world: Any = together(lambda: worlds.world("train", config.num_envs, autoreset))
+    if config.record:
+        place = old.path if old else new or new_folder_name(config)
+        world = together(lambda: run_recording.recorded(config, place, world))
+    note("Making the learner")
+    learner = together(lambda: _make_learner(config, kind, worlds, world, fresh=loaded is None))
+    own = together(lambda: old or (_new_folder(config, new, worlds, held) if launch().rank == 0 else None))
+    path = distributed.share(own and own.path)[0]
+    assert path is not None
+    folder = RunFolder(path)
+    say(f"Run folder: {folder.path}")
+    if config.record:
+        together(lambda: run_recording.begin(world, folder.path, fresh=loaded is None))
+    return _Run(folder, kind, worlds, world, learner, is_resumed=old is not None)
+
+
+def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
+    """Return the learner with its data and teachers; a fresh one with the weights that it shall start from."""
+    learner = kind.make(world, config.learner, config.seed)
+    if kind.make.offline:
+        learner.learn_from(join(run_data.announced(config.dataset, "Reading", worlds), world))
+    if config.demonstrations:
+        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:", worlds)
+        learner.learn_from_demonstrations(join(demonstrations, world, every=False))
+    if config.teacher:
+        learner.learn_from_teachers(run_teachers.teachers_of(config, worlds, world))
+    if fresh and config.start_from is not None:
+        start = RunFolder.open(Path(config.start_from))
+        state, step = checkpoint(start)
+        with fitting(start.path):
+            learner.start_from(state["learner"]["policy"])
+        say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
+        say_other_rules(start, worlds)
+    return learner
+
+
+def _new_folder(config: AnyConfig, path: Path | None, worlds: Worlds, held: contextlib.ExitStack) -> RunFolder:
+    folder = RunFolder.create(config, path, identity=worlds.identity())
+    held.enter_context(folder.locked())
+    return folder
+
+
+def _train(
+    run: _Run, config: AnyConfig, loaded: Checkpoint | None, on_event: Callable[[Event], None] | None, progress: bool
+) -> int:
+    """Train to the end; return the signal that ended the training early, or 0."""
+    folder = run.folder
+    learner = run.learner
+    waits = distributed.LostProcess("this one was asked to stop and waits for it")
+    distributed.on_loss(lambda: _report_loss(waits, folder))
+    resume_step = None
+    if loaded is not None:
+        state, resume_step = loaded
+        with fitting(folder.path):
+            together(lambda: runner.resume(learner, run.world, state))
+        say(f"Continuing at {resume_step:,} steps.")
+    elif run.is_resumed:
+        resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
+        say("No checkpoint yet: starting from the beginning.")
+    seconds = math.inf if config.minutes is None else 60.0 * config.minutes
+    iterate = partial(
+        runner.train, learner, run.world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
+    )
+    if launch().rank > 0:
+        return iterate(record=None)  # process 0's clock decides
+    folder.finish(resume_step)
+    if run.is_resumed:
+        folder.change_config(config)  # more steps, say; not before it is known that the run goes on
+    rows = mend(folder.metrics_path, resume_step or 0)
+    last = rows[-1] if rows and rows[-1]["step"] == resume_step else None
+    with contextlib.ExitStack() as stack:
+        size = runner.checkpoint_bytes(learner, run.world, config.learner, config.steps)
+        stack.enter_context(folder.checkpoints.room(size))
+        recorder = Recorder(folder, config.steps, seconds, resume_step, config.logger, progress)
+        record = stack.enter_context(recorder)
+        watch = None
+        if config.evaluate_every is not None or config.video_every is not None:
+            watch = watching.Watch(config, run.kind, run.worlds, folder, learner, record, len(rows))
+            stack.callback(watch.close)
+        if on_event is not None:
+            call = on_event
+            record.on_log = lambda metrics, step: call(Event("iteration", folder, step, metrics))
+            on_event(Event("started", folder, learner.env_steps, {}))
+        stopped = iterate(record=record, watch=watch, last=last, spent_seconds=training_seconds(rows))
+    if config.record:
+        run_recording.complete(config, run.worlds, run.world)
+    if on_event is not None:
+        on_event(Event("ended", folder, learner.env_steps, {}))
+    if not stopped and run.is_resumed and learner.env_steps == resume_step:
+        say(_nothing_left(config, learner.env_steps, training_seconds(rows) / 60.0))
+    elif not stopped and learner.env_steps < config.steps and config.minutes is not None:
+        say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
+    return stopped
+
+
+def _nothing_left(config: AnyConfig, steps: int, minutes: float) -> str:
+    """Say why a resumed run has nothing to train, and which flag lets it go on."""
+    if steps >= config.steps:
+        return (
+            f"Nothing to train: the run has made {steps:,} steps, and --steps {config.steps} counts them too. For as "
+            f"many more: --steps {steps + config.steps}."
+        )
+    if config.minutes is not None and minutes >= config.minutes:
+        more = math.ceil(minutes) + config.minutes
+        return (
+            f"Nothing to train: the run has trained for {minutes:.1f} minutes, and --minutes {config.minutes:g} counts "
+            f"them too. For {config.minutes:g} more: --minutes {more:g}."
+        )
+    return "Nothing to train: the last iteration was enough. Raise --stop-at-success, -return or -score to go on."
+
+
+def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | None:
+    """Return what says by the metrics whether the training ends early; None if nothing does."""
+    if config.stop_at_return is None and config.stop_at_success is None and config.stop_at_score is None:
+        return None
+
+    def reached(metrics: Mapping[str, float]) -> bool:
+        tag = config.early_end(metrics)
+        if tag is not None:
+            say(f"Enough: {tag} is {metrics[tag]:.4g}.")
+        return tag is not None
+
+    return reached
+
+
+def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
+    """Log that another process is gone, and what is left; only the first process that notices does so."""
+    missing = distributed.report_loss()
+    if missing is None:
+        return
+    count = launch().count
+    which = ", ".join(map(str, missing))
+    gone = f"process {which} of {count} is gone or stuck" if which else f"one of {count} processes has ended"
+    left = "Training had not begun."
+    if folder is not None:
+        step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
+        saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
+        left = f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, count)}"
+    _LOG.error("%s (%s). %s", gone, loss, left)
