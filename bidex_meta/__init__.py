@@ -1,7 +1,9 @@
 """Multi-task and meta reinforcement learning for two dexterous hands on MuJoCo.
 
-    from bidex_meta import Benchmark
-    world = Benchmark("MT4", seed=0).make_world("train", num_envs=1024)
+    from bidex_meta import Benchmark, RunConfig, evaluate, train
+    world = Benchmark("MT4-v2", seed=0).make_world("train", num_envs=1024)
+    run = train(RunConfig(suite="MT4-v2", algo="mtppo", minutes=5))
+    print(evaluate(run).success)
 
 Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...), shortens how long waiting OpenMP
 threads spin (docs/training.md#beside-other-work) and asks CUDA for 32 queues; torch and MuJoCo are loaded when a name
@@ -20,13 +22,34 @@ from bidex_meta.utils.gl_backend import set_aside_what_is_missing
 
 if TYPE_CHECKING:
     from bidex_meta.benchmark import Benchmark, Task, make_task_world
+    from bidex_meta.config import RunConfig
+    from bidex_meta.experiments.evaluating import evaluate, meta_test
+    from bidex_meta.experiments.learners import learner_class
+    from bidex_meta.experiments.policies import load_policy
+    from bidex_meta.experiments.training import train
+    from bidex_meta.experiments.verifying import verify
+    from bidex_meta.runs import RunFolder
     from bidex_meta.world import World
 
 __all__ = [
-    "Benchmark", "BidexError", "Suite", "Task", "World", "__version__", "load_suite", "make_task_world", "suite_names",
+    "Benchmark", "BidexError", "RunConfig", "RunFolder", "Suite", "Task", "World", "__version__", "evaluate",
+    "learner_class", "load_policy", "load_suite", "make_task_world", "meta_test", "suite_names", "train", "verify",
 ]  # fmt: skip
 
-_LAZY = dict.fromkeys(("Benchmark", "Task", "make_task_world"), "bidex_meta.benchmark") | {"World": "bidex_meta.world"}
+_LAZY = {
+    "Benchmark": "bidex_meta.benchmark",
+    "RunConfig": "bidex_meta.config",
+    "RunFolder": "bidex_meta.runs",
+    "Task": "bidex_meta.benchmark",
+    "World": "bidex_meta.world",
+    "evaluate": "bidex_meta.experiments.evaluating",
+    "learner_class": "bidex_meta.experiments.learners",
+    "load_policy": "bidex_meta.experiments.policies",
+    "make_task_world": "bidex_meta.benchmark",
+    "meta_test": "bidex_meta.experiments.evaluating",
+    "train": "bidex_meta.experiments.training",
+    "verify": "bidex_meta.experiments.verifying",
+}
 
 try:
     __version__ = version("bidex-meta")

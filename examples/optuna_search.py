@@ -10,8 +10,7 @@ from pathlib import Path
 import optuna
 import tyro
 
-from bidex_meta.cli import main as bidex_meta
-from bidex_meta.runs import RunFolder
+from bidex_meta import BidexError, RunConfig, evaluate, train
 
 
 def main(
@@ -35,16 +34,16 @@ def main(
 
     def success(trial: optuna.Trial) -> float:
         settings = {
-            "learning-rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
             "gamma": 1 - trial.suggest_float("one_minus_gamma", 0.01, 0.2, log=True),
             "epochs": trial.suggest_int("epochs", 2, 8),
         }
-        folder = out / str(trial.number)
-        flags = [f"--learner.{name}={value}" for name, value in settings.items()]
-        words = ["run", f"--suite={suite}", f"--algo={algo}", f"--steps={steps}", f"--run-dir={folder}", "--threads=1"]
-        if bidex_meta([*words, "--logger=none", *flags]):
-            raise optuna.TrialPruned  # what was wrong is printed
-        return RunFolder(folder).evaluation()["policy"]["aggregate"]["success"]["mean"]
+        config = RunConfig(suite=suite, algo=algo, steps=steps, learner=settings, threads=1, logger="none")
+        try:
+            run = train(config, run_dir=out / str(trial.number))
+        except (BidexError, FloatingPointError) as error:
+            raise optuna.TrialPruned(str(error)) from None
+        return evaluate(run, save=True).success
 
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(

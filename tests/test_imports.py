@@ -26,8 +26,9 @@ ORDER = (
     ("benchmark", "evaluation", "train", "viewer"),
     ("data", "metaworld", "witness", *(f"bidex_algos.{name}" for name in SHARED)),
     ("clients", "worlds", "bidex_algos.learner"),
-    ("bidex_meta", "bidex_algos.offpolicy", "bidex_algos.onpolicy"),  # bidex_meta: the package's own names
+    ("bidex_algos.offpolicy", "bidex_algos.onpolicy"),
     ("experiments",),
+    ("bidex_meta",),  # the package's own names
     ("cli", "bidex_algos.imitation", "bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),
 )
 """A package imports from earlier lines only, not from its own neighbours; a module at the top counts as one."""

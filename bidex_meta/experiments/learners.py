@@ -63,6 +63,11 @@ class LearnerKind:
         return self.make.autoreset_mode(config_type(**config))
 
 
+def learner_class(name: str) -> type[Learner]:
+    """Return the class of a learner by its name; names and errors as of :func:`learner_kind`."""
+    return learner_kind(name).make
+
+
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """The learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; BidexError where there is none.
 

@@ -71,8 +71,14 @@ def fitting(path: Path) -> Iterator[None]:
 
 
 @checked_arguments
-def load_policy(folder: RunFolder, device: str | torch.device, which: str = "last") -> tuple[Agent, int]:
-    """The policy of a run's checkpoint and the environment steps it was trained for; errors as of ``checkpoint``."""
+def load_policy(
+    run: RunFolder | str | Path, device: str | torch.device = "cpu", which: str = "last"
+) -> tuple[Agent, int]:
+    """Return the policy of a run's checkpoint and the environment steps that it was trained for.
+
+    ``which`` is ``last``, ``best`` or a file. Raises BidexError if there is no such run or checkpoint.
+    """
+    folder = run if isinstance(run, RunFolder) else RunFolder.open(run)
     load, step = policy_loader(folder, str(checked_device(device)), which)
     return load(), step
 

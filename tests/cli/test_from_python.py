@@ -1,0 +1,126 @@
+"""Runs from Python: what the commands do, as functions."""
+
+import json
+import logging
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import bidex_meta
+from bidex_meta.cli import main
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.experiments.evaluating import evaluate, meta_test
+from bidex_meta.experiments.run_config import resolve
+from bidex_meta.experiments.training import Event, Stopped, train
+from bidex_meta.experiments.verifying import verify
+from bidex_meta.runs import RunFolder
+from tests.algos.ranks import same
+
+CONFIG = RunConfig(
+    suite="MT4", algo="mtppo", learner={"hidden": [8], "rollout_steps": 4}, num_envs=6, steps=48, threads=1,
+    device="cpu", logger="none",
+)  # fmt: skip
+WORDS = "--suite MT4 --algo mtppo --learner.hidden 8 --learner.rollout-steps 4 --num-envs 6 --steps 48 --threads 1"
+
+
+def final(run: RunFolder) -> object:
+    loaded = run.checkpoints.load()
+    assert loaded is not None
+    return loaded
+
+
+def test_every_public_name_is_there() -> None:
+    for name in bidex_meta.__all__:
+        assert getattr(bidex_meta, name) is not None
+    assert callable(bidex_meta.train) and bidex_meta.learner_class("mtppo").__name__ == "MTPPO"
+
+
+def test_a_run_is_that_of_the_command(toy_worlds: None, tmp_path: Path) -> None:
+    run = train(CONFIG, run_dir=tmp_path / "python")
+    words = [*WORDS.split(), "--device", "cpu", "--logger", "none", "--run-dir", str(tmp_path / "command")]
+    assert main(["run", *words]) == 0
+    other = RunFolder.open(tmp_path / "command")
+    assert run.config() == other.config() and same(final(run), final(other))
+    found = evaluate(run, random=True, device="cpu", save=True)
+    assert {**run.evaluation(), "run": ""} == {**other.evaluation(), "run": ""}
+    assert 0.0 <= found.success <= 1.0 and verify(run).agrees
+
+
+def test_a_resumed_run_is_that_of_an_unbroken_one(toy_worlds: None, tmp_path: Path) -> None:
+    events: list[Event] = []
+    half = train(replace(CONFIG, steps=24), run_dir=tmp_path / "half", on_event=events.append)
+    assert [event.kind for event in events] == ["started", "iteration", "ended"]
+    assert events[1].step == 24 and "Perf/steps_per_second" in events[1].metrics
+    train(replace(half.config(), steps=48), resume=half)
+    assert same(final(half), final(train(CONFIG, run_dir=tmp_path / "whole")))
+    with pytest.raises(BidexError, match=r"--seed is 0 in .*half, not 1: a resumed run keeps its config"):
+        train(replace(half.config(), seed=1), resume=str(half.path))
+    with pytest.raises(BidexError, match="goes on in the run's own folder"):
+        train(CONFIG, run_dir=tmp_path / "other", resume=half)
+    with pytest.raises(BidexError, match="Expected a config or a run to resume"):
+        train()
+
+
+def test_a_resolved_config_is_complete_and_stays_as_it_is() -> None:
+    config = resolve(RunConfig(suite="mt4-v2", learner={"gamma": 0.9}, seed=3))
+    assert config.suite == "MT4-v2" and config.learner.gamma == 0.9 and config.num_envs > 0 < config.steps
+    assert None not in (config.num_envs, config.steps, config.threads) and resolve(config) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"suite": None}, "Name what to train on"),
+        ({"learner": {"gama": 0.9}}, "sets gama, which"),
+        ({"learner": {"gamma": 9.0}}, "gamma"),
+        ({"algo": "mtpp"}, "Did you mean 'mtppo'"),
+        ({"num_envs": 3}, "at least 4"),
+    ],
+)
+def test_bad_configs_are_refused_before_anything_is_written(
+    change: dict[str, object], expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(BidexError, match=expected):
+        train(replace(CONFIG, **change), run_dir=tmp_path / "r")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_meta_test_and_an_evaluation_each_know_their_learners(
+    adapted: Path, toy_worlds: None, tmp_path: Path
+) -> None:
+    with pytest.raises(BidexError, match=r"Use meta_test\(run\)"):
+        evaluate(adapted)
+    run = train(CONFIG, run_dir=tmp_path / "r2")
+    with pytest.raises(BidexError, match=r"Use evaluate\(run\)"):
+        meta_test(run)
+
+
+def test_a_meta_test_is_that_of_the_command(adapted: Path) -> None:
+    found = json.loads(json.dumps(meta_test(adapted, device="cpu").to_json()))
+    recorded = RunFolder.open(adapted).evaluation()
+    assert found["splits"] == recorded["splits"] and found["conditions"] == recorded["conditions"]
+
+
+def test_a_signal_saves_and_raises(toy_worlds: None, tmp_path: Path) -> None:
+    def interrupt(event: Event) -> None:
+        if event.kind == "iteration":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Stopped) as stopped:
+        train(CONFIG, run_dir=tmp_path / "r", on_event=interrupt)
+    assert stopped.value.number == signal.SIGINT and stopped.value.step == 24
+    assert stopped.value.folder.checkpoints.newest_step() == 24
+
+
+def test_nothing_is_printed_and_everything_is_logged(
+    toy_worlds: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "bidex_meta")
+    run = train(CONFIG, run_dir=tmp_path / "r")
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", "")
+    assert f"Run folder: {run.path}" in caplog.messages
