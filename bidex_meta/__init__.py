@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from bidex_meta.config import RunConfig
     from bidex_meta.experiments.evaluating import evaluate, meta_test
     from bidex_meta.experiments.learners import learner_class
+    from bidex_meta.experiments.plotting import plot
     from bidex_meta.experiments.policies import load_policy
     from bidex_meta.experiments.training import train
     from bidex_meta.experiments.verifying import verify
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Benchmark", "BidexError", "RunConfig", "RunFolder", "Suite", "Task", "World", "__version__", "evaluate",
-    "learner_class", "load_policy", "load_suite", "make_task_world", "meta_test", "suite_names", "train", "verify",
+    "learner_class", "load_policy", "load_suite", "make_task_world", "meta_test", "plot", "suite_names", "train",
+    "verify",
 ]  # fmt: skip
 
 _LAZY = {
@@ -47,6 +49,7 @@ _LAZY = {
     "load_policy": "bidex_meta.experiments.policies",
     "make_task_world": "bidex_meta.benchmark",
     "meta_test": "bidex_meta.experiments.evaluating",
+    "plot": "bidex_meta.experiments.plotting",
     "train": "bidex_meta.experiments.training",
     "verify": "bidex_meta.experiments.verifying",
 }

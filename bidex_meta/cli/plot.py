@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bidex_meta.cli.parsing import RunPaths, Switch, parse
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import read_histories
+from bidex_meta.experiments.plotting import plot
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, refuse_links
 from bidex_meta.runs.stored import StoredRun, open_run
@@ -34,17 +34,16 @@ def main(arguments: Sequence[str]) -> None:
     runs = named_runs(flags.runs, "plot")
     if not (flags.adaptation or flags.evaluation):
         out = output(flags.out, runs, "curves.png")
-        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])
+        plot(runs, out)
     elif len(runs) > 1:
         raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
     else:
         out = output(flags.out, runs, "adaptation.png")
         if isinstance(runs[0], StoredRun) and flags.evaluation is None:
-            figure = plots.draw_adaptation(runs[0].evaluation(), runs[0].path)
+            plots.save(plots.draw_adaptation(runs[0].evaluation(), runs[0].path), out)
         else:
             source = flags.evaluation or runs[0].path / "evaluation.json"
-            figure = plots.draw_adaptation(plots.read_evaluation(source), source)
-    plots.save(figure, out)
+            plots.save(plots.draw_adaptation(plots.read_evaluation(source), source), out)
     print(out)
 
 

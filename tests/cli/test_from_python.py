@@ -14,6 +14,7 @@ from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.evaluating import evaluate, meta_test
+from bidex_meta.experiments.plotting import plot
 from bidex_meta.experiments.run_config import resolve
 from bidex_meta.experiments.training import Event, Stopped, train
 from bidex_meta.experiments.verifying import verify
@@ -56,7 +57,9 @@ def test_a_resumed_run_is_that_of_an_unbroken_one(toy_worlds: None, tmp_path: Pa
     assert [event.kind for event in events] == ["started", "iteration", "ended"]
     assert events[1].step == 24 and "Perf/steps_per_second" in events[1].metrics
     train(replace(half.config(), steps=48), resume=half)
-    assert same(final(half), final(train(CONFIG, run_dir=tmp_path / "whole")))
+    whole = train(CONFIG, run_dir=tmp_path / "whole")
+    assert same(final(half), final(whole))
+    assert plot([half, whole.path], tmp_path / "curves.png").stat().st_size > 1000
     with pytest.raises(BidexError, match=r"--seed is 0 in .*half, not 1: a resumed run keeps its config"):
         train(replace(half.config(), seed=1), resume=str(half.path))
     with pytest.raises(BidexError, match="goes on in the run's own folder"):

@@ -1,0 +1,24 @@
+"""Learning curves of runs as a picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bidex_meta.evaluation.comparison import read_histories
+from bidex_meta.runs import RunFolder, plots
+from bidex_meta.runs.atomic import check_writable
+from bidex_meta.runs.stored import StoredRun, open_run
+
+
+def plot(runs: Sequence[RunFolder | StoredRun | str | Path], out: str | Path) -> Path:
+    """Draw return and success of every task against environment steps into ``out``, and return its path.
+
+    Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs. The ending of ``out``
+    decides the format (``.png``, ``.svg``, ``.pdf``). Raises BidexError if a run has no metrics or ``out`` cannot be
+    written.
+    """
+    opened = [run if isinstance(run, RunFolder | StoredRun) else open_run(Path(run)) for run in runs]
+    path = Path(out)
+    check_writable(path)
+    histories = read_histories(opened)
+    plots.save(plots.draw_learning([(history.label, history.curves) for history in histories]), path)
+    return path
