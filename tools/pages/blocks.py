@@ -63,7 +63,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
     Args:
         page: A file of Markdown.
-        data: Folder of the studies' folders.
+        data: Folder of the studies' files.
         check: Write nothing.
 
     Returns:
