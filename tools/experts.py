@@ -66,8 +66,8 @@ def _of_run(run: Run) -> list[tuple[str, dict[str, Any]]]:
     found = run.evaluation()
     if "policy" not in found:
         raise BidexError(
-            f"Expected the evaluation of a policy, but that of {run.path} is a meta-test, whose policies are many. Name "
-            "a run of mtppo, mttrpo or mtsac."
+            f"Expected the evaluation of one policy, but that of {run.path} is a meta-test. Name a run of "
+            "mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
     steps = found.get("steps", config.steps)  # of what time, a return or a score has ended fewer than were asked for

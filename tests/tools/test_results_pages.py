@@ -115,12 +115,12 @@ def test_a_block_shows_what_compare_computes(page: Path, capsys: pytest.CaptureF
 
 
 def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
-    page.write_text("".join(f"<!-- results: study=tiny show={s} -->\n<!-- end -->\n" for s in ("curves", "points", "classes")))  # fmt: skip  # noqa: E501
+    page.write_text("".join(f"<!-- results: study=tiny show={s} -->\n<!-- end -->\n" for s in ("curves", "classes")))  # fmt: skip  # noqa: E501
     written = fill(page, data(page))
-    assert [path.name for path in written] == ["tiny-curves.png", "tiny-points.png", "page.md"]
+    assert [path.name for path in written] == ["tiny-curves.png", "page.md"]
     assert "![Return and success over training: tiny, MT4](tiny-curves.png)" in page.read_text()
     assert "55 % (50 to 60)" in page.read_text()
     assert fill(page, data(page), check=True) == []
     changed = data(page) / "tiny.json"
     changed.write_text(changed.read_text().replace('"parameters": 12345', '"parameters": 12346', 1))
-    assert fill(page, data(page), check=True) == written[:2]
+    assert fill(page, data(page), check=True) == written[:1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, estimates, group_of, iqm
+from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, group_of, iqm
 from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun, read_study
 from bidex_meta.utils.plugins import short_name
@@ -85,12 +85,10 @@ class Study:
         kept = [i for i, name in enumerate(group.classes) if name.endswith(ending)]
         if not kept:
             raise BidexError(f"Study {self.name}: {group.paths[0]} has no {self.split} classes. Leave split out.")
+        classes = [group.classes[i].removesuffix(ending) for i in kept]
+        scores = None if group.scores is None else group.scores[:, kept]
         return replace(
-            group,
-            classes=[group.classes[i].removesuffix(ending) for i in kept],
-            success=group.success[:, kept],
-            returns=group.returns[:, kept],
-            scores=None if group.scores is None else group.scores[:, kept],
+            group, classes=classes, success=group.success[:, kept], returns=group.returns[:, kept], scores=scores
         )
 
     @property
@@ -149,11 +147,6 @@ def digest_of(studies: Sequence[Study]) -> str:
 def curves_figure(study: Study) -> Any:
     """Learning curves, one line per arm."""
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
-
-
-def points_figure(study: Study) -> Any:
-    """Final success and score per arm, with intervals."""
-    return plots.draw_comparison(estimates([arm.group for arm in study.arms]))
 
 
 def _subject(runs: Sequence[StoredRun]) -> str:
