@@ -140,18 +140,11 @@ def test_a_damaged_checkpoint_is_refused_or_the_same(tmp_path: Path, capsys: pyt
     assert refused > 200
 
 
-def test_an_unsealed_checkpoint_is_held_to_its_archives_checksums(tmp_path: Path) -> None:
-    checkpoints = Checkpoints(tmp_path)
-    state = {"w": torch.arange(3000.0)}
-    torch.save({"step": 7, "state": state}, tmp_path / "step_7.pt")
-    found = checkpoints.load()
-    assert found is not None and _same(found[0], state)
-    whole = (tmp_path / "step_7.pt").read_bytes()
-    first = whole.index(state["w"].numpy().tobytes()[400:800])
-    for place in range(first, first + 400, 7):
-        (tmp_path / "step_7.pt").write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        with pytest.raises(BidexError, match="None of the 1 checkpoints"):
-            checkpoints.load()
+def test_a_checkpoint_without_digest_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.save({"step": 7, "state": {"w": torch.arange(3.0)}}, tmp_path / "step_7.pt")
+    with pytest.raises(BidexError, match="None of the 1 checkpoints"):
+        Checkpoints(tmp_path).load()
+    assert "its format is None, not 2" in capsys.readouterr().err
 
 
 def test_suites(tmp_path: Path) -> None:
