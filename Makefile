@@ -31,7 +31,7 @@ help:
 	@echo "make witness ARGS=\"plan --task CLASS\"  search actions that solve a task (plan, steady, whole or script; ARGS=-h)"
 	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
 	@echo "make format    format the code and mend what ruff can mend"
-	@echo "make bench     measure the project itself: make bench ARGS=\"mixing --suite MT20\", ARGS=--help lists what"
+	@echo "make bench     measure the project itself: make bench ARGS=\"stability --task HandOver\", ARGS=--help lists what"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
@@ -67,7 +67,7 @@ bench: $(INSTALLED)
 	$(BENCH) $(ARGS)
 
 bench-gpu-compile: $(INSTALLED)
-	$(BENCH) kernels --suite MT20 --device $(DEVICE)
+	$(BENCH) gpu --suite MT20 --tasks --sizes 1024 --steps 1 --device $(DEVICE) --engine warp
 
 bench-gpu-sweep: $(INSTALLED)
 	mkdir -p $(OUT)

@@ -203,15 +203,12 @@ def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
 
 
 def read_config(path: Path) -> RunConfig[JsonObject]:
-    """A run's ``config.json``, of this version or an older one; BidexError where it is none, or cannot be read."""
+    """Return a run's ``config.json``. Raises BidexError if it is none, or cannot be read."""
     return config_of(read_json(path, "a run's config"), str(path))
 
 
 def config_of(content: object, where: str) -> RunConfig[JsonObject]:
-    """A run's config from what a file holds; ``where`` for messages. Raises BidexError where it is none."""
-    if isinstance(content, dict):  # what a run of 0.2.0 or before wrote, as this version writes it
-        given = content.get("demonstrations")
-        content = {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
+    """Return a run's config from what a file holds; ``where`` is for messages. Raises BidexError if it is none."""
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
         raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")

@@ -1,6 +1,8 @@
-"""A small world that keeps the contract of ``bidex_meta.world.World``, without physics."""
+"""A small world that keeps the contract of ``bidex_meta.world.World``, without physics; and small runs."""
 
+import functools
 import json
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.cli import main
 from bidex_meta.config import RunConfig, config_of
 from bidex_meta.runs import RunFolder
 from tests.fake_world import FakeWorld
@@ -15,12 +18,24 @@ from tests.fake_world import FakeWorld
 SLOT_TASKS = [3, 2]
 SLOT_NAMES = ["Near", "Far"]
 STEPS_OF_TASK = [4, 9, 6]
+_RUNS = tempfile.TemporaryDirectory()
 
 
 def run_config(**entries: Any) -> RunConfig[dict[str, Any]]:
     """A run's config; on MT4 where no suite or task is named."""
     usual = {"suite": None if entries.get("task") else "MT4", "task": None, "algo": "mtppo", "learner": {}}
     return config_of({**usual, "num_envs": 8, "steps": 1000, "seed": 0, **entries}, "a test's config")
+
+
+@functools.cache
+def trained_run(algo: str) -> Path:
+    """Return the folder of a run of one iteration on real worlds, made once per process. Copy it to change it."""
+    path = Path(_RUNS.name) / algo
+    suite = "MT4" if algo.startswith("mt") else "ML1"
+    words = ["--suite", suite, "--algo", algo, "--seed", "3", "--num-envs", "8", "--device", "cpu", "--threads", "1"]
+    words += ["--learner.hidden", "8", "--steps", "8", "--no-evaluate", "--run-dir", str(path)]
+    assert main(["run", *words]) == 0
+    return path
 
 
 def change(path: Path, **entries: Any) -> Path:

@@ -1,9 +1,8 @@
-"""``python -m tools.collect RUN... --into results/data/STUDY``: what the repository keeps of evaluated runs.
+"""``python -m tools.collect RUN... --into results/data/STUDY.json``: what the repository keeps of evaluated runs.
 
-One file of JSON for each run, without weights, as :mod:`bidex_meta.runs.stored` reads it.
+The file holds all runs of a study, without weights, as :mod:`bidex_meta.runs.stored` reads it.
 """
 
-import json
 import math
 import re
 import sys
@@ -21,7 +20,7 @@ from bidex_meta.experiments.sweep_plan import read_sweep
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.provenance import differences
-from bidex_meta.runs.stored import FORMAT, StoredRun
+from bidex_meta.runs.stored import FORMAT, read_study, study_text
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
@@ -40,31 +39,34 @@ _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval"
 def collect(
     runs: tyro.conf.Positional[tuple[Path, ...]], into: Path, out: Path = Path("runs"), arm: str | None = None
 ) -> None:
-    """Write a file of JSON for each run and print their names; all of them or none.
+    """Add runs to the file of a study, and print their names; all of them or none.
 
     Args:
         runs: Run folders, or the files of sweeps, of which the runs that have ended are taken.
-        into: Folder of the files; each has the name of its run folder.
+        into: The study's file of JSON, in which a run has the name of its folder.
         out: Where a sweep's folder lies (`--out` of `bidex-meta sweep`).
         arm: What tables call these runs; None: of a sweep its arms, else the folder's name without suite and seed.
 
     Raises:
-        BidexError: A run cannot be condensed, or its file would replace that of another run.
+        BidexError: A run cannot be condensed, or it would replace another run.
     """
-    files: dict[Path, dict[str, Any]] = {}
-    for path, name in [named for given in runs for named in _named(given, out)]:
+    contents = {run.content["name"]: run.content for run in read_study(into)} if into.exists() else {}
+    added: list[str] = []
+    for path, label in [named for given in runs for named in _named(given, out)]:
         folder = RunFolder.open(path)
-        file = into / f"{folder.path.resolve().name}.json"
-        content = condensed(folder, arm or name, _parameters(folder))
-        if file in files or (file.exists() and _is_another(StoredRun.open(file).content["config"], content["config"])):
-            raise BidexError(f"{file} is of another run than {path}. Rename the run's folder, or remove the file.")
-        files[file] = content
-    into.mkdir(parents=True, exist_ok=True)
-    for file, content in files.items():
-        file.write_text(text(content))
-        print(file)
-        if content["versions"]["git"].get("dirty"):
-            print(f"{file} was made by changed code: its commit alone does not make it again.", file=sys.stderr)
+        content = condensed(folder, arm or label, _parameters(folder))
+        name = content["name"]
+        known = contents.get(name)
+        if name in added or (known is not None and _is_another(known["config"], content["config"])):
+            raise BidexError(f"{into}:{name} is another run than {path}. Rename the run's folder, or remove the entry.")
+        contents[name] = content
+        added.append(name)
+    into.parent.mkdir(parents=True, exist_ok=True)
+    into.write_text(study_text(dict(sorted(contents.items()))))
+    for name in added:
+        print(f"{into}:{name}")
+        if contents[name]["versions"]["git"].get("dirty"):
+            print(f"{name} was made by changed code: its commit alone does not make it again.", file=sys.stderr)
 
 
 def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dict[str, Any]:
@@ -96,12 +98,6 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dic
         "curves": _curves(rows),
         "evaluation": _evaluation(evaluation),
     }
-
-
-def text(content: dict[str, Any]) -> str:
-    """The file: one entry a line."""
-    entries = (f"{json.dumps(key)}: {json.dumps(value, separators=(',', ':'))}" for key, value in content.items())
-    return "{\n" + ",\n".join(entries) + "\n}\n"
 
 
 def arm_of(path: Path, config: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Kind, load, store
-from bidex_meta.runs.stored import open_run
+from bidex_meta.runs.stored import Run, open_runs
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.worlds import Worlds
 
@@ -19,10 +19,10 @@ _SOLVES = 0.5
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:
     """Print, and store, per class the best of its replayed witness, its script and the given runs, if that solves it.
 
-    Example: python -m tools.experts results/data/experts/*.json --out assets/references/expert.json
+    Example: python -m tools.experts results/data/experts.json --out assets/references/expert.json
 
     Args:
-        runs: Runs of single classes, folders or files of results/data/: a suite's policy is judged by these scores.
+        runs: Runs of single classes, folders or files of results/data: a suite's policy is judged by these scores.
         suite: Suite whose train classes are looked up.
         out: File of references, written anew.
     """
@@ -44,7 +44,7 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[s
     Raises:
         BidexError: A run has no evaluation, or plays a class with fixed bases.
     """
-    candidates = [row for run in runs for row in _of_run(run)]
+    candidates = [row for path in runs for run in open_runs(path) for row in _of_run(run)]
     played: tuple[Kind, ...] = ("script", "witness")
     candidates += [(name, row | {"source": kind}) for kind in played for name, row in load(kind).items()]
     best: dict[str, dict[str, Any]] = {}
@@ -55,20 +55,19 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[s
     return best
 
 
-def _of_run(path: Path) -> list[tuple[str, dict[str, Any]]]:
+def _of_run(run: Run) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
-    run = open_run(path)
     config = run.config()
     source = Worlds.open(config.to_json())
     if not source.moving_bases:
         raise BidexError(
-            f"Expected a run with moving bases, as suites have them, but {path} plays {source.name} with fixed ones."
+            f"Expected a run with moving bases, as in suites, but {run.path} plays {source.name} with fixed ones."
         )
     found = run.evaluation()
     if "policy" not in found:
         raise BidexError(
-            f"Expected the evaluation of a policy, but that of {path} is a meta-test, whose policies are many. Name a "
-            "run of mtppo, mttrpo or mtsac."
+            f"Expected the evaluation of one policy, but that of {run.path} is a meta-test. Name a run of "
+            "mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
     steps = found.get("steps", config.steps)  # of what time, a return or a score has ended fewer than were asked for

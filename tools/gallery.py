@@ -1,10 +1,15 @@
 """``python -m tools.gallery`` (``make gallery``) generates the page of all task classes from their code."""
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 import tyro
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
@@ -13,7 +18,8 @@ from bidex_meta.runs import video
 from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.hidden import hidden
+from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import frames, replay
@@ -140,12 +146,61 @@ def _of_version_2(task: TaskClass) -> list[tuple[str, str]]:
 
 
 def _mask(task: TaskClass) -> str:
-    """What the mask of meta suites hides."""
-    found = hidden(task)
-    parts = [", ".join(found.reward)] if found.reward else []
-    if found.success:
-        parts.append(f"{', '.join(found.success)} (success only)")
-    return "; ".join(parts) if parts else "none"
+    reward, success = masked(task)
+    alone = f"{', '.join(success)} (success only)" if success else ""
+    return "; ".join(filter(None, (", ".join(reward), alone))) or "none"
+
+
+def masked(task: TaskClass) -> tuple[list[str], list[str]]:
+    """Return the components of a variation that only goal entries show, of the reward and of success alone.
+
+    What a component changes of a task is replaced by NaN: whatever becomes NaN depends on it. A fixture's place is
+    not among them, because other entries show it.
+    """
+    scene, space = compile_scene(task), task.variation_space
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.start_qpos[: scene.model.nq]
+    mujoco.mj_forward(scene.model, data)
+    sensors = torch.from_numpy(data.sensordata.copy())[None]
+    low, high = (torch.tensor(ends, dtype=torch.float64) for ends in (space.low, space.high))
+    base = low + 0.2 * (high - low)
+    frozen = task.freeze(torch.cat((base[None], base + 0.35 * torch.diag(high - low))))
+    starts = torch.from_numpy(np.tile(scene.start_qpos, (1 + space.size, 1)))
+    draws = torch.zeros(len(starts), task.start_draws, dtype=starts.dtype)
+    task.start(draws, frozen, {part: starts[:, where] for part, where in scene.qpos.items()})
+    fixtures = starts[:, scene.model.nq :]
+    goals = [block.name for block in task.layout.blocks if block.goal]
+    of_reward, of_success = [], []
+    for i, name in enumerate(space.names, 1):
+        nan = {key: values[:1].masked_fill(values[i] != values[0], torch.nan) for key, values in frozen.items()}
+        state = TaskState(sensors, scene.sensors, nan)
+        seen = task.observe(state)
+        if not _any_nan(seen[goal] for goal in goals) or not torch.equal(fixtures[i], fixtures[0]):
+            continue
+        with _Comparisons() as compared:
+            task.solved_in(state)
+        if _any_nan(task.rewards(state).values()):
+            of_reward.append(name)
+        elif _any_nan(compared.operands):
+            of_success.append(name)
+    return of_reward, of_success
+
+
+def _any_nan(values: Iterable[Tensor]) -> bool:
+    return any(bool(value.isnan().any()) for value in values)
+
+
+class _Comparisons(TorchFunctionMode):
+    """Collects all tensors that are compared: a comparison with NaN is False, and would not show it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operands: list[Tensor] = []
+
+    def __torch_function__(self, func: Any, types: object, args: tuple = (), kwargs: dict | None = None) -> object:
+        if getattr(func, "__name__", "").strip("_") in ("lt", "le", "gt", "ge"):
+            self.operands += [value for value in args if isinstance(value, Tensor)]
+        return func(*args, **(kwargs or {}))
 
 
 def _witness(name: str) -> str:

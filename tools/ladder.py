@@ -28,7 +28,7 @@ def ladder(
 ) -> None:
     """Success of each class on unseen tasks, of a run of icl and of the same actor with other knowledge of the goal.
 
-    Example: python -m tools.ladder runs/ml1-v2/ML1-v2-icl-seed0 --out results/data/ml1-v2/ladder/seed0.json
+    Example: python -m tools.ladder runs/ml1-v2/ML1-v2-icl-seed0 --out results/data/ml1-v2-ladder-seed0.json
 
     Args:
         run: Folder of a run of icl.

@@ -23,7 +23,7 @@ class CompareFlags:
     Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
     """
 
-    runs: RunPaths  # Run folders, or files of results/data/.
+    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
     json: JsonSwitch = False
     out: Path | None = None  # Also draw the groups' success and score, with intervals, into this .png, .svg or .pdf.
 

@@ -117,7 +117,7 @@ def _check(flags: DataFlags) -> None:
         for name, reason in findings.skipped.items():
             print(f"{name}: rewards not computed again: {reason}")
         if findings.unsealed:
-            print(f"Files without a digest, from elsewhere or older versions: {len(findings.unsealed):,}.")
+            print(f"Files without a digest, from elsewhere: {len(findings.unsealed):,}.")
         for line in findings.wrong:
             print(line)
     if findings.count:

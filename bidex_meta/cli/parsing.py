@@ -52,7 +52,7 @@ Engine = Annotated[
 ]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # A run folder, as the first word
 RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-"""Run folders, or files of ``results/data/``."""
+"""Run folders, or studies of ``results/data/``: ``FILE``, or ``FILE:RUN`` for one of its runs."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments.plotting import plot
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, refuse_links
-from bidex_meta.runs.stored import StoredRun, open_run
+from bidex_meta.runs.stored import StoredRun, open_runs
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PlotFlags:
     Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
     """
 
-    runs: RunPaths  # Run folders, or files of results/data/.
+    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
     adaptation: Switch = False  # Against shots of adaptation, from the meta-test in evaluation.json; of one run.
     evaluation: Path | None = None
     """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
@@ -48,10 +48,10 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRun]:
-    """The runs that a command was given; BidexError where there is none, or one is no run."""
+    """Open the runs that a command was given. Raises BidexError if there is none, or a path is no run."""
     if not paths:
         raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
-    return [open_run(path) for path in paths]
+    return [run for path in paths for run in open_runs(path)]
 
 
 def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:

@@ -38,7 +38,7 @@ class ReportFlags:
     The page needs no network and no other file. Runs that differ in the seed alone are one line, with intervals.
     """
 
-    runs: RunPaths  # Run folders, or files of results/data/.
+    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
     out: Path | None = None  # The page; None: report.html, in the run folder or, of several, here.
 
 

@@ -45,9 +45,6 @@ ALGOS: dict[str, str] = {
     "iql": "bidex_algos.offline.iql:IQL",
 }
 
-_RENAMED = {"autoreset": "autoreset_mode(config)", "adapts_by_row": "independent_adaptation"}
-"""Members of learners before version 0.3, and what they are now."""
-
 
 @dataclass(frozen=True)
 class LearnerKind:
@@ -91,9 +88,6 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 def _from_elsewhere(name: str) -> type[Learner]:
     """The learner ``package.module:Class``, with the defaults of :class:`Learner` and its module's ``PRESETS``."""
     make, module = outside_class(name, "--algo")
-    for old, new in _RENAMED.items():
-        if old in vars(make):
-            raise BidexError(f"--algo {name}: {old} is now {new}; see docs/own-learner.md.")
     bases = (make,) if issubclass(make, Learner) else (make, Learner)
     members = {"__module__": make.__module__, "__doc__": make.__doc__}
     learner: type[Learner] = type(make.__name__, bases, members)

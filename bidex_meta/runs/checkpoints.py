@@ -1,7 +1,7 @@
 """Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``; written atomically, read without any code.
 
 Each has a format number and a digest of every number and tensor in it: ``torch.load`` checks no checksum, so a flipped
-bit would be loaded as another weight. Files of format 1, without a digest, have the checksums of a zip archive.
+bit would be loaded as another weight.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from bidex_meta.utils.validation import Whole
 
 State = dict[str, Any]  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
-FORMAT = 2  # goes up when older code could not read a checkpoint; 1 had no digest
+FORMAT = 2  # goes up when older code could not read a checkpoint
 _DEEPEST = 100
 
 
@@ -176,10 +176,11 @@ def _opened(path: Path) -> State:
         raise ValueError("it holds no training's state")
     if type(content.get("step")) is not int or content["step"] < 0:
         raise ValueError(f"its step is {shortened(content.get('step'))}, no whole number")
-    version, digest = content.pop("format", 1), content.pop("digest", None)
-    if type(version) is not int or not 1 <= version <= FORMAT:
-        raise BidexError(f"format {shortened(version)} is none this version knows (1 to {FORMAT})")
-    if version > 1 and digest != _digest(content):
+    version = content.pop("format", None)
+    digest = content.pop("digest", None)
+    if type(version) is not int or version != FORMAT:
+        raise BidexError(f"its format is {shortened(version)}, not {FORMAT}")
+    if digest != _digest(content):
         raise ValueError("its content does not have the digest it was saved with")
     return content
 

@@ -120,9 +120,7 @@ def draw_adaptation(evaluation: Json, where: object) -> Figure:
     """
     splits = evaluation.get("splits") if isinstance(evaluation, dict) else None
     if not splits:
-        raise BidexError(
-            f"{where} holds no meta-test: its learner does not adapt, or it is older. {_AGAIN.format(where)}"
-        )
+        raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {_AGAIN.format(where)}")
     check_evaluation(evaluation, str(where))
     figure, blocks = _task_panels([list(part["before"]["classes"]) for part in splits.values()])
     for (split, part), axes in zip(splits.items(), blocks, strict=True):

@@ -1,34 +1,36 @@
-"""A run as one file of JSON, for tables and pictures when its folder, with the weights, is gone.
+"""The runs of a study in one file of JSON, for tables and pictures when their folders, with the weights, are gone.
 
 ::
 
-    {"format": 1, "name": ..., "arm": ..., "suite": {"name", "version"}, "config": {...}, "versions": {...},
-     "engine": "c", "steps": N, "seconds": S, "parameters": P,
-     "curves": {"step": [...], "Train/return/<class>": [...], ...},
-     "evaluation": {...}}
+    {"<run>": {"format": 1, "name": "<run>", "arm": ..., "suite": {"name", "version"}, "config": {...},
+               "versions": {...}, "engine": "c", "steps": N, "seconds": S, "parameters": P,
+               "curves": {"step": [...], "Train/return/<class>": [...], ...},
+               "evaluation": {...}},
+     ...}
 
-``python -m tools.collect`` of the repository writes such files. :func:`open_run` reads them and run folders alike.
+``python -m tools.collect`` of the repository writes such files. :func:`open_runs` reads them and run folders alike.
 """
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, TypedDict
 
 from msgspec import Meta
 
 from bidex_meta.config import RunConfig, config_of
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.schemas import check_evaluation, check_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
-FORMAT = 1  # of the files; raised where an older reader would misread them
+FORMAT = 1  # of a run in these files; raised where an older reader would misread it
 
 
-class _File(TypedDict):
+class _Content(TypedDict):
     format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
     name: Text
     arm: Text
@@ -45,41 +47,16 @@ class _File(TypedDict):
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as one file of JSON, created by ``open``; methods as those of :class:`RunFolder`."""
+    """A run of a study's file, created by :func:`read_study`; methods as those of :class:`RunFolder`."""
 
     path: Path
-
-    @classmethod
-    def open(cls, path: Path) -> "StoredRun":
-        """An existing file; raises BidexError where it cannot be read, or is no run."""
-        stored = cls(Path(path))
-        _ = stored.content
-        return stored
-
-    @cached_property
-    def content(self) -> Json:
-        """All of the file, checked; errors as of ``open``."""
-        found = read_json(self.path, "a run's data")
-        parse(found, _File, str(self.path))
-        config_of(found["config"], f"{self.path}: config")
-        check_versions(found["versions"], f"{self.path}: versions")
-        check_evaluation(found["evaluation"], f"{self.path}: evaluation")
-        curves = found["curves"]
-        steps = curves.get("step", [])
-        if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):
-            raise BidexError(f"{self.path}: curves.step: expected rising whole numbers. Collect the run again.")
-        for tag, column in curves.items():
-            if len(column) != len(steps):
-                raise BidexError(
-                    f"{self.path}: curves.{tag}: expected {len(steps)} values as in curves.step, got {len(column)}. "
-                    "Collect the run again."
-                )
-        return found
+    """``FILE:RUN``, which names it in messages and on the command line."""
+    content: Json
 
     @property
     def again(self) -> str:
         """The command that writes it anew, for messages."""
-        return f"python -m tools.collect RUN --into {self.path.parent}"
+        return f"python -m tools.collect RUN --into {str(self.path).rpartition(':')[0]}"
 
     @property
     def evaluated(self) -> bool:
@@ -89,7 +66,7 @@ class StoredRun:
     @property
     def videos_path(self) -> Path:
         """A folder that is not there."""
-        return self.path.with_suffix("") / "videos"
+        return self.path / "videos"
 
     @property
     def arm(self) -> str:
@@ -123,9 +100,54 @@ class StoredRun:
 Run = RunFolder | StoredRun
 
 
-def open_run(path: Path) -> Run:
-    """A run by its folder, or by its file of JSON; raises BidexError where it is neither."""
-    # A folder may be called so too.
-    if path.suffix == ".json" and not path.is_dir():
-        return StoredRun.open(path)
-    return RunFolder.open(path)
+def open_runs(path: Path) -> list[Run]:
+    """Open the run of a folder, all runs of a study's file, or one of them (``FILE:RUN``).
+
+    Raises BidexError if there is no such run, or its file is damaged.
+    """
+    file, _, name = str(path).rpartition(".json:")
+    if path.is_dir() or not (file or path.suffix == ".json"):
+        return [RunFolder.open(path)]
+    if not file:
+        return list(read_study(path))
+    runs = {run.content["name"]: run for run in read_study(Path(f"{file}.json"))}
+    return [runs[known_name(f"run of {file}.json", name, runs)]]
+
+
+def read_study(file: Path) -> list[StoredRun]:
+    """Read all runs of a study's file, in its order. Raises BidexError if it is damaged or holds no run."""
+    contents = read_json(file, "a study's runs")
+    if not isinstance(contents, dict) or not contents:
+        raise BidexError(f"{file}: expected a table of runs by name. Collect them again.")
+    for name, content in contents.items():
+        _check(name, content, f"{file}:{name}")
+    return [StoredRun(Path(f"{file}:{name}"), content) for name, content in contents.items()]
+
+
+def study_text(contents: Mapping[str, Json]) -> str:
+    """Return the text of a study's file from its runs by name: one entry of a run per line."""
+    return "{\n" + ",\n".join(f"{json.dumps(name)}: {_run_text(run)}" for name, run in contents.items()) + "\n}\n"
+
+
+def _run_text(content: Json) -> str:
+    entries = (f"{json.dumps(key)}: {json.dumps(value, separators=(',', ':'))}" for key, value in content.items())
+    return "{\n" + ",\n".join(entries) + "\n}"
+
+
+def _check(name: str, content: Json, where: str) -> None:
+    parse(content, _Content, where)
+    if content["name"] != name:
+        raise BidexError(f"{where}: expected the name {name}, got {shortened(content['name'])}. Collect the run again.")
+    config_of(content["config"], f"{where}: config")
+    check_versions(content["versions"], f"{where}: versions")
+    check_evaluation(content["evaluation"], f"{where}: evaluation")
+    curves = content["curves"]
+    steps = curves.get("step", [])
+    if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):
+        raise BidexError(f"{where}: curves.step: expected rising whole numbers. Collect the run again.")
+    for tag, column in curves.items():
+        if len(column) != len(steps):
+            raise BidexError(
+                f"{where}: curves.{tag}: expected {len(steps)} values as in curves.step, got {len(column)}. "
+                "Collect the run again."
+            )

@@ -14,6 +14,7 @@ from bidex_meta.cli.export import exported
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.world.contract import ObservationGroup
+from tests.fakes import trained_run
 from tests.pages import ROOT
 
 onnx = pytest.importorskip("onnx")
@@ -70,7 +71,7 @@ def test_the_difference_to_a_policy_in_bfloat16_is_told(shown, tmp_path: Path, m
     _, gap, as_played = exported(made, SHAPE.state_dict(), {})
     assert gap < 1e-5 < 1e-4 < as_played and made.low_precision
     monkeypatch.setattr(export, "exported", lambda *_: (b"file", 7e-6, 0.038))
-    told = shown("export", ROOT / "tests" / "data" / "old_runs" / "mtppo", "--out", tmp_path / "policy.onnx")
+    told = shown("export", trained_run("mtppo"), "--out", tmp_path / "policy.onnx")
     assert "within 7e-06 of torch in float32" in told
     assert "policy computes in bfloat16: its actions are up to 0.04 away" in told
 
@@ -85,7 +86,7 @@ def test_a_policy_whose_file_would_differ_is_refused() -> None:
 
 
 def test_a_run_exports_with_its_name_tag(shown, tmp_path: Path) -> None:
-    run, out = ROOT / "tests" / "data" / "old_runs" / "mtppo", tmp_path / "policy.onnx"
+    run, out = trained_run("mtppo"), tmp_path / "policy.onnx"
     assert "of torch in float32 on 256 random observations" in shown("export", run, "--out", out)
     model = onnx.load(out)
     said = {entry.key: entry.value for entry in model.metadata_props}
@@ -96,6 +97,6 @@ def test_a_run_exports_with_its_name_tag(shown, tmp_path: Path) -> None:
 
 
 def test_what_adapts_is_refused_in_one_line(refused, tmp_path: Path) -> None:
-    said = refused("export", ROOT / "tests" / "data" / "old_runs" / "rl2", "--out", tmp_path / "x.onnx")
+    said = refused("export", trained_run("rl2"), "--out", tmp_path / "x.onnx")
     assert "rl2 adapts to tasks or remembers" in said and "Export a policy that does not adapt" in said
     assert not (tmp_path / "x.onnx").exists()

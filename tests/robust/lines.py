@@ -12,6 +12,7 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.metaworld import batched
 from bidex_meta.world import world as world_module
+from tests.fakes import trained_run
 
 
 class Built(BaseException):
@@ -27,7 +28,7 @@ def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
     (folder / "torn" / "checkpoints").mkdir(parents=True)
     (folder / "torn" / "metrics.jsonl").touch()
     for name, run in (("run", "mtppo"), ("meta", "promp")):
-        shutil.copytree(Path(__file__).parents[1] / "data" / "old_runs" / run, folder / name)
+        shutil.copytree(trained_run(run), folder / name)
 
     def built(*_: object, **__: object) -> None:
         raise Built

@@ -1,4 +1,4 @@
-"""Runs as files of JSON: tables and pictures take them like folders; what is refused; the best known."""
+"""Runs in a file of JSON: tables and pictures take them like folders; what is refused; the best known."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
-from bidex_meta.runs.stored import StoredRun, open_run
+from bidex_meta.runs.stored import open_runs, read_study, study_text
 from tests.fakes import change, evaluated_run, log
 from tools import collect as tool
 from tools import experts
@@ -39,14 +39,15 @@ def collect(*runs: Path, into: Path, arm: str | None = None) -> None:
 
 def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [evaluated(tmp_path, seed, 0.5 + seed / 7, f"MT4-arm-x-seed{seed}", gamma=0.9) for seed in (0, 1)]
-    collect(*paths, into=tmp_path / "data")
+    collect(*paths, into=tmp_path / "data.json")
     files = capsys.readouterr().out.split()
-    assert files == [str(tmp_path / "data" / f"MT4-arm-x-seed{seed}.json") for seed in (0, 1)]
+    assert files == [f"{tmp_path / 'data.json'}:MT4-arm-x-seed{seed}" for seed in (0, 1)]
     found = []
-    for names in (map(str, paths), files):
+    for names in (map(str, paths), files, [str(tmp_path / "data.json")]):
         assert main(["compare", *names, "--json"]) == 0
         found.append(json.loads(capsys.readouterr().out))
-    (folder,), (stored,) = found
+    (folder,), (stored,), (whole,) = found
+    assert whole == stored
     assert stored["success_iqm"]["value"] == pytest.approx(folder["success_iqm"]["value"], rel=1e-4)
     assert stored["hours"] == folder["hours"] > 0 and stored["seeds"] == [0, 1] and stored["steps"] == 1000
     assert main(["compare", str(paths[0]), files[1]]) == 0, "folders and files beside each other"
@@ -55,12 +56,12 @@ def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest
     assert COMMIT[:10] in (tmp_path / "r.html").read_text()
 
 
-def test_groups_have_the_names_of_their_arms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_groups_have_the_names_of_their_arms(tmp_path: Path) -> None:
     for number, (gamma, arm) in enumerate(
         [(0.9, "usual"), (0.9, "usual"), (0.8, "short"), (0.7, "same"), (0.6, "same")]
     ):
-        collect(evaluated(tmp_path, number, 0.5, f"r{number}", gamma=gamma), into=tmp_path / "data", arm=arm)
-    stored = [StoredRun.open(Path(name)) for name in capsys.readouterr().out.split()]
+        collect(evaluated(tmp_path, number, 0.5, f"r{number}", gamma=gamma), into=tmp_path / "data.json", arm=arm)
+    stored = read_study(tmp_path / "data.json")
     expected = [
         "usual",
         "short",
@@ -71,7 +72,7 @@ def test_groups_have_the_names_of_their_arms(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
-    good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data"
+    good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data.json"
     bad = evaluated(tmp_path, 1, 0.5, "bad")
 
     def refused(told: str) -> None:
@@ -95,30 +96,38 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     collect(good, into=into)
     collect(good, into=into)  # once more is no harm
     change(good, seed=5)
-    with pytest.raises(BidexError, match="is of another run than"):
+    with pytest.raises(BidexError, match="is another run than"):
         collect(good, into=into)
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    content = tool.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5)), "x", 7)
+    content = tool.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5, "good")), "x", 7)
     for other, told in (
-        ({"format": 2}, "format: "),
+        ({"format": 2}, "good: .*format: "),
+        ({"name": "other"}, "expected the name good, got"),
         ({"curves": {"step": [1, 2], "a": [1.0]}}, "curves.a: expected 2 values"),
         ({"curves": {"step": [2, 1]}}, "expected rising"),
         ({"evaluation": {"policy": {"classes": {}}}}, "policy.classes: "),
         ({"config": {"seed": 0}}, "config: "),
         ({"versions": {"git": 3}}, "git: "),
     ):
-        path.write_text(json.dumps({**content, **other}))
+        path.write_text(json.dumps({"good": {**content, **other}}))
         with pytest.raises(BidexError, match=told):
-            StoredRun.open(path)
-    path.write_text(tool.text(content)[:-40])
-    with pytest.raises(BidexError, match="in JSON"):
-        open_run(path)
-    path.write_text(tool.text(content))
-    [group] = read_groups([StoredRun.open(path)])
-    assert group.paths == [path]
+            read_study(path)
+    for text, told in (
+        (study_text({"good": content})[:-40], "in JSON"),
+        ("{}", "runs by name"),
+        ("[]", "runs by name"),
+    ):
+        path.write_text(text)
+        with pytest.raises(BidexError, match=told):
+            open_runs(path)
+    path.write_text(study_text({"good": content}))
+    with pytest.raises(BidexError, match=r"Unknown run of .*x\.json 'bad'"):
+        open_runs(Path(f"{path}:bad"))
+    [group] = read_groups(open_runs(Path(f"{path}:good")))
+    assert group.paths == [Path(f"{path}:good")]
 
 
 def test_the_expert_is_the_best_that_solves_half_of_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

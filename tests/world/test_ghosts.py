@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.hidden import hidden
 from bidex_meta.utils import gl_backend
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.world import World
 from bidex_meta.world.rendering import DrawnGhost, ghosts
 from tests.tasks import wide
 from tests.tasks.worlds import MOVING, engine_of, restart, scene_of, set_pose, task_of, world_of
+from tools.gallery import masked
 
 EGGS = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")
 PLACES = {
@@ -69,8 +69,8 @@ def drawn(goals: list[DrawnGhost]) -> np.ndarray:
 @pytest.mark.parametrize("name", [f"{name}{version}" for name, version in product(MOVING, ("", "-v2"))])
 def test_pictures_do_not_tell_what_a_suite_hides(name: str) -> None:
     task, names = registry.get(name, True), registry.get(name, True).variation_space.names
-    told = hidden(task)
-    columns = sorted({*task.hidden_columns(), *(names.index(each) for each in told.reward + told.success)})
+    reward, success = masked(task)
+    columns = sorted({*task.hidden_columns(), *(names.index(component) for component in reward + success)})
     world = in_equal_states(name, columns, "masked")
     assert ghosts(world, 0) == ghosts(world, 1) == []
     with contextlib.suppress(BidexError):  # a machine that cannot draw

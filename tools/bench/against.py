@@ -43,8 +43,7 @@ def against(
     """Speed of a suite's world, and of its classes alone, beside that of other code on the same interpreter.
 
     Args:
-        other: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
-            earlier run took: that run's commit is measured again, and its ratios stand beside the new ones.
+        other: A commit of the git checkout that this code runs from, or a folder with a checkout.
         suite: A suite that both know, each by its own file.
         num_envs: Environments of the suite's world; a class alone has a quarter of them.
         steps: Control steps of each repeat, after as many to warm up.
@@ -61,10 +60,9 @@ def against(
         less, and each side's ``physics``, "time step × substeps" of its engine batches.
 
     Raises:
-        BidexError: A file that was not measured against a commit, or what either side's code refuses.
+        BidexError: Either side's code refuses something.
         CalledProcessError: git does not know the commit.
     """
-    other, then = recorded(other)
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or usable_cores(), "steps": steps}
     with checkout(other) as folder, _Worker(folder) as old, _Worker(HERE) as new:
         result: dict[str, Any] = {
@@ -78,8 +76,7 @@ def against(
         for task in [None, *(alone if classes else [])]:
             rows = num_envs if task is None else max(1, num_envs // _ROWS_OF_A_SUITE_OVER_A_CLASS)
             world = {"suite": suite, "task": task, "num_envs": rows, "threads": threads, "seed": seed}
-            row = {"what": task or suite, "rows": rows, **_pairs(old, new, world, steps, repeats)}
-            result["table"].append(row | ({"ratio then": then.get(row["what"])} if then else {}))
+            result["table"].append({"what": task or suite, "rows": rows, **_pairs(old, new, world, steps, repeats)})
             if out is not None:
                 write_json(out, result)
     return result
@@ -108,16 +105,6 @@ def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, re
         "old physics": _told(physics[old]),
         "new physics": _told(physics[new]),
     }
-
-
-def recorded(other: str) -> tuple[str, dict[str, float]]:
-    """What to measure against, and where ``out`` of an earlier run was given the ratios that it found."""
-    if not Path(other).is_file():
-        return other, {}
-    found = json.loads(Path(other).read_text())
-    if found["old"]["dirty"] or not found["old"]["commit"]:
-        raise BidexError(f"{other} was not measured against a commit. Name a commit, or a folder with a checkout.")
-    return found["old"]["commit"], {row["what"]: row["ratio"] for row in found["table"]}
 
 
 @contextlib.contextmanager

@@ -42,13 +42,7 @@ def capacity(
     result = {}
     for name, moving in variants(suite, task):
         made = make_task_world(
-            name,
-            num_envs=num_envs,
-            device="cpu",
-            seed=seed,
-            autoreset_mode="DISABLED",
-            threads=threads,
-            moving_base=moving,
+            name, num_envs, "cpu", seed=seed, autoreset_mode="DISABLED", threads=threads, moving_base=moving
         )
         result[name if moving else f"{name} (fixed base)"] = _capacity(made, steps, seed)
     return result
@@ -63,9 +57,8 @@ def _capacity(made: World, steps: int, seed: int) -> dict[str, Any]:
     engine = made.parts[0].group.engine
     assert isinstance(engine, CpuEngine)
     probe = WarpEngine([engine.model(0)], [0], capacity=Capacity(contacts=2048, convex=512, rows=2048))
-    counts = {
-        name: torch.from_numpy(engine.batch.bind(field)) for name, field in (("contacts", "ncon"), ("rows", "nefc"))
-    }
+    fields = {"contacts": "ncon", "rows": "nefc"}
+    counts = {name: torch.from_numpy(engine.batch.bind(field)) for name, field in fields.items()}
     found: dict[str, list[Tensor]] = {name: [] for name in (*counts, "candidates", "convex")}
     held, left = torch.zeros(made.num_envs, made.action_size), torch.zeros(made.num_envs, dtype=torch.int64)
     for _ in range(math.ceil(steps / made.num_envs)):

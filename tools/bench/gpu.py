@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments.learners import choose_preset, learner_kind
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.world import World
-from tools.bench.soak import chosen_learner, resident
-from tools.bench.timing import now, random_steps
 
 _SIZES = (1024, 8192, 32768, 131072)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
@@ -49,8 +49,7 @@ def gpu(
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning. Beside them,
-        for each size, the suite over the harmonic mean of the classes.
+        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning.
     """
     machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
@@ -62,30 +61,7 @@ def gpu(
                 rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning)
                 if out is not None:
                     write_json(out, {"setting": setting, "rows": rows})
-    ratios = {str(size): _ratio(rows, suite, tasks, size) for size in sizes} if tasks else {}
-    return {"setting": setting, "rows": rows, f"{suite} over its classes": ratios}
-
-
-def kernels(suite: str = "MT20", device: str = "cuda:0", engine: str = "warp") -> dict[str, Any]:
-    """Compiles what a suite's world needs, group by group, into the kernel cache; what lies there takes no time.
-
-    Args:
-        suite: The suite.
-        device: For which device.
-        engine: As in ``Benchmark.make_world``.
-
-    Returns:
-        By class the seconds that its world took to build and to make its first step.
-    """
-    took = {}
-    for name in Benchmark(suite).train_classes:
-        start = time.perf_counter()
-        made = make_task_world(name, num_envs=8, device=device, engine=engine, moving_base=True)
-        made.reset(seed=0)
-        random_steps(made, 1)
-        made.close()
-        took[name] = round(time.perf_counter() - start, 1)
-    return took
+    return {"setting": setting, "rows": rows}
 
 
 def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
@@ -97,11 +73,6 @@ def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
     return stored["rows"]
 
 
-def _ratio(rows: dict[str, Any], suite: str, tasks: Sequence[str], size: int) -> float:
-    alone = [rows[f"{task} {size}"]["env_steps_per_s"] for task in tasks]
-    return round(rows[f"{suite} {size}"]["env_steps_per_s"] * sum(1.0 / x for x in alone) / len(alone), 4)
-
-
 def _measured(
     subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
 ) -> dict[str, Any]:
@@ -111,16 +82,16 @@ def _measured(
     else:
         made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
     made.reset(seed=seed)
-    random_steps(made, max(steps, _RECORDED))
-    seconds = random_steps(made, steps).wall
+    _random_steps(made, max(steps, _RECORDED))
+    seconds = _random_steps(made, steps)
     row: dict[str, Any] = {
         "env_steps_per_s": round(size * steps / seconds),
         "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
         "stages": _stages(made, steps),
     }
     if learning:
-        kind, config = chosen_learner("mtppo", device)
-        learner = kind.make(made, config, 0)
+        kind = learner_kind("mtppo")
+        learner = kind.make(made, kind.presets[choose_preset(kind, "auto", device)[0]], 0)
         for _ in range(5):  # its update is recorded as a graph after a few
             numbers = learner.iterate()
         row["training_steps_per_s"] = round(numbers["Perf/steps_per_second"])
@@ -135,7 +106,7 @@ def _stages(made: World, steps: int) -> dict[str, float]:
     ``launching`` is the host's part of the physics. ``overlap`` is 0 where groups run one after the other, and 1 where
     all take no longer than the slowest.
     """
-    took = {"step": 1000.0 * random_steps(made, steps).wall / steps}
+    took = {"step": 1000.0 * _random_steps(made, steps) / steps}
     took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
     took["torch"] = took["step"] - took["physics"]
     alone = {}
@@ -148,13 +119,31 @@ def _stages(made: World, steps: int) -> dict[str, float]:
     return {name: round(value, 3) for name, value in took.items()}
 
 
+def _random_steps(world: World, steps: int) -> float:
+    """Return the seconds that uniform actions take, which are drawn before the clock starts."""
+    generator = torch.Generator(world.device).manual_seed(0)
+    shape = steps, world.num_envs, world.action_size
+    actions = 2.0 * torch.rand(shape, generator=generator, device=world.device) - 1.0
+    start = _now(world.device)
+    for action in actions:
+        world.step(action)
+    return _now(world.device) - start
+
+
+def _now(device: torch.device) -> float:
+    """Return the clock's seconds, once all that a device was given is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
 def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
     """Of one of ``steps`` runs: until all is done, and until the host had it launched."""
-    start = now(made.device)
+    start = _now(made.device)
     for _ in range(steps):
         work()
     launched = time.perf_counter() - start
-    return 1000.0 * (now(made.device) - start) / steps, 1000.0 * launched / steps
+    return 1000.0 * (_now(made.device) - start) / steps, 1000.0 * launched / steps
 
 
 def _memory(device: str) -> int:
@@ -164,4 +153,4 @@ def _memory(device: str) -> int:
         torch.cuda.empty_cache()
         free, total = torch.cuda.mem_get_info(device)
         return total - free
-    return resident() or 0
+    return psutil.Process().memory_info().rss

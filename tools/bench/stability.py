@@ -57,16 +57,8 @@ def stability(
     result = {}
     for name, moving in variants(suite, task):
         # Rows that end are reset by hand, so that the step that ended them is measured too.
-        made = make_task_world(
-            name,
-            num_envs=num_envs,
-            device=device,
-            seed=seed,
-            autoreset_mode="DISABLED",
-            threads=threads,
-            moving_base=moving,
-            engine=engine,
-        )
+        where = {"device": device, "engine": engine, "threads": threads}
+        made = make_task_world(name, num_envs, seed=seed, autoreset_mode="DISABLED", moving_base=moving, **where)
         rough = _stability(made, steps, seed)
         made.close()
         at_work = witness_share(name, threads) if moving else None
@@ -90,7 +82,8 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(seed)
     made.reset(seed=seed)
     engine = made.parts[0].group.engine
-    velocities = [where for name, where in made.parts[0].group.members[0].scene.sensors.items() if _is_speed(name)]
+    sensors = made.parts[0].group.members[0].scene.sensors
+    velocities = [where for name, where in sensors.items() if name.endswith("/linear_velocity")]
     held, left = torch.zeros(made.num_envs, made.action_size), torch.zeros(made.num_envs, dtype=torch.int64)
     unstable = warnings = 0
     fastest, depths = 0.0, []
@@ -106,6 +99,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
             made.reset(options={"reset_mask": info["_final_obs"]})
     depth = torch.tensor(depths)
     shallow, not_deep = (float((depth <= limit).double().mean()) for limit in (SHALLOW, DEEP))
+    not_too_deep = shallow >= LEAST_SHALLOW and not_deep >= LEAST_NOT_DEEP
     return {
         "env_steps": made.num_envs * control_steps,
         "unstable": unstable,
@@ -115,11 +109,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
         "share_below_5mm": round(shallow, 5),
         "share_below_15mm": round(not_deep, 5),
         "depth_q999": round(float(depth.quantile(0.999)), 5),
-        "holds": unstable == 0
-        and warnings == 0
-        and fastest <= MAX_OBJECT_SPEED
-        and shallow >= LEAST_SHALLOW
-        and not_deep >= LEAST_NOT_DEEP,
+        "holds": unstable == warnings == 0 and fastest <= MAX_OBJECT_SPEED and not_too_deep,
     }
 
 
@@ -132,10 +122,6 @@ def witness_share(name: str, threads: int | None = None) -> float | None:
         return None
     depths = replay(name, load_witness(name), threads).depths
     return round(float((depths <= SHALLOW).double().mean()), 5)
-
-
-def _is_speed(sensor: str) -> bool:
-    return sensor.endswith("/linear_velocity")
 
 
 def rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:

@@ -23,7 +23,7 @@ from tools.pages.gained import gains_table, shots_figure, shots_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
-from tools.pages.studies import curves_figure, digest_of, points_figure, read_studies
+from tools.pages.studies import curves_figure, digest_of, read_studies
 from tools.pages.validity import validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
@@ -37,7 +37,6 @@ _TABLES = {
 }
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
-    "points": (points_figure, "Success and score, 95 % intervals over seeds"),
     "shot-curves": (shots_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
@@ -63,7 +62,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
     Args:
         page: A file of Markdown.
-        data: Folder of the studies' folders.
+        data: Folder of the studies' files.
         check: Write nothing.
 
     Returns:

@@ -1,6 +1,7 @@
-"""A study: the files of ``results/data/STUDY``, grouped by arm, and its pictures."""
+"""A study: the runs of ``results/data/STUDY.json``, grouped by arm, and its pictures."""
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,9 +12,9 @@ import numpy as np
 
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, estimates, group_of, iqm
+from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, group_of, iqm
 from bidex_meta.runs import plots
-from bidex_meta.runs.stored import StoredRun
+from bidex_meta.runs.stored import StoredRun, read_study
 from bidex_meta.utils.plugins import short_name
 
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
@@ -53,11 +54,11 @@ class Study:
     """Arms on one suite or class."""
 
     name: str
-    """Name of its folder."""
+    """Name of its file."""
     on: str
     """The suite or class."""
     runs: list[StoredRun]
-    """Sorted by file name."""
+    """Sorted by name."""
     split: str | None = None
     """Split of a meta-test to show; None: all."""
 
@@ -84,18 +85,16 @@ class Study:
         kept = [i for i, name in enumerate(group.classes) if name.endswith(ending)]
         if not kept:
             raise BidexError(f"Study {self.name}: {group.paths[0]} has no {self.split} classes. Leave split out.")
+        classes = [group.classes[i].removesuffix(ending) for i in kept]
+        scores = None if group.scores is None else group.scores[:, kept]
         return replace(
-            group,
-            classes=[group.classes[i].removesuffix(ending) for i in kept],
-            success=group.success[:, kept],
-            returns=group.returns[:, kept],
-            scores=None if group.scores is None else group.scores[:, kept],
+            group, classes=classes, success=group.success[:, kept], returns=group.returns[:, kept], scores=scores
         )
 
     @property
     def ladders(self) -> list[Path]:
-        """Files of ``ladder/`` beside its runs (:mod:`tools.ladder`)."""
-        return sorted((self.runs[0].path.parent / "ladder").glob("*.json"))
+        """Files ``STUDY-ladder-*.json`` beside its own (:mod:`tools.ladder`)."""
+        return sorted(self.runs[0].path.parent.glob(f"{self.name}-ladder-*.json"))
 
     @property
     def classes(self) -> list[str]:
@@ -104,21 +103,22 @@ class Study:
 
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:
-    """The studies in ``data/name``: one for each set of classes; none if there are no files.
+    """Return the studies in ``data/name.json``: one for each set of classes; none if there is no such file.
 
     Suites with the same classes, such as one with other discounts, are one study. Runs on single classes join a suite's
     study if an arm covers all its classes, and otherwise are one study per class.
 
     Args:
-        data: Folder of the studies' folders.
+        data: Folder of the studies' files.
         name: Name of the study.
         on: Only this suite or class.
         split: See :class:`Study`.
 
     Raises:
-        BidexError: A file cannot be read.
+        BidexError: The file cannot be read.
     """
-    runs = [StoredRun.open(path) for path in sorted((data / name).glob("*.json"))]
+    file = data / f"{name}.json"
+    runs = read_study(file) if file.exists() else []
     whole = [run for run in runs if run.config().task is None]
     by_classes: dict[frozenset[str], list[StoredRun]] = {}
     for run in whole:
@@ -135,19 +135,18 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
 
 
 def digest_of(studies: Sequence[Study]) -> str:
-    """Digest of all data that their pictures show."""
-    paths = [path for study in studies for path in [*(run.path for run in study.runs), *study.ladders]]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+    """Return the digest of all data that their pictures show."""
+    found = hashlib.sha256()
+    for study in studies:
+        found.update(json.dumps([run.content for run in study.runs]).encode())
+        for path in study.ladders:
+            found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def curves_figure(study: Study) -> Any:
     """Learning curves, one line per arm."""
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
-
-
-def points_figure(study: Study) -> Any:
-    """Final success and score per arm, with intervals."""
-    return plots.draw_comparison(estimates([arm.group for arm in study.arms]))
 
 
 def _subject(runs: Sequence[StoredRun]) -> str:

@@ -16,7 +16,7 @@ from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness, load_witness, save_witness
 from tools.witness_search.planner import Planner, PlannerConfig
 from tools.witness_search.steady import steadied
-from tools.witness_search.whole import exchanged, searched
+from tools.witness_search.whole import searched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,15 +107,11 @@ class Steady(Improvement):
 class Whole(Improvement):
     """Search whole episodes instead of plans that look some steps ahead."""
 
-    exchange: int = 0
-    """The episode is of a throw from right to left: begin with both hands throwing for so many steps, then catching."""
-
     def run(self) -> None:
         """Searches for so many rounds; the last round's best counts."""
         earlier = load_witness(self.task, self.improve)
-        began = exchanged(earlier.actions, self.exchange) if self.exchange else earlier.actions
-        actions = searched(self.task, began, self.rounds, self.seed, self.threads)
-        how = {"rounds": self.rounds, "exchange": self.exchange, "seed": self.seed, "began_with": earlier.made}
+        actions = searched(self.task, earlier.actions, self.rounds, self.seed, self.threads)
+        how = {"rounds": self.rounds, "seed": self.seed, "began_with": earlier.made}
         self.keep(actions, {"rival": None, "whole": how})
 
 

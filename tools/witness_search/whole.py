@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.replay import SEED, Simulator, Trace
 from bidex_meta.witness.store import quantised
 from tools.witness_search.planner import interpolation
@@ -20,8 +19,6 @@ _SPACING = 3
 _STD, _LEAST_STD = 0.4, 0.12
 _SUCCESS, _LASTING = 5.0, 0.2
 """What an episode's success is worth in units of return, and each step that it lasts."""
-_TURNED = (20, 21, 23, 24)
-"""Forces and torques of a base along x and y: a turn by 180 degrees about the vertical reverses them."""
 
 
 def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
@@ -88,23 +85,3 @@ def _mutants(parents: Tensor, generator: torch.Generator) -> Tensor:
     changed = within[:, :, None] & (uniform(count, 1, size) < 0.03 + 0.3 * uniform(count, 1, 1))
     far = (3.0 * uniform(count, 1, 1) - 3.5).exp()
     return torch.where(changed, parents + far * torch.randn(parents.shape, generator=generator), parents)
-
-
-def exchanged(actions: np.ndarray, give: int) -> np.ndarray:
-    """What both hands do if each throws like the right one and catches like the left one of an episode.
-
-    Both are right hands, one turned by 180 degrees about the vertical.
-
-    Args:
-        actions: Of moving bases, (T, 52): the right hand throws what the left one catches.
-        give: Steps after which the hands do not throw any more.
-
-    Returns:
-        Actions (T, 52).
-    """
-    hand = actions.shape[1] // len(SIDES)
-    right, left = actions[:, :hand], actions[:, hand:]
-    turn = np.ones(hand, np.float32)
-    turn[list(_TURNED)] = -1.0
-    first = np.concatenate((right[:give], turn * left[give:]))
-    return np.concatenate((first, np.concatenate((turn * right[:give], left[give:]))), axis=1)

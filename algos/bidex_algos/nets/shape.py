@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from bidex_algos.nets.architecture import ArchitectureConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig, State
-from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_groups
+from bidex_meta.world.contract import ObservationGroup, VectorWorld
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,6 @@ class Shape:
         classes = 1 if any(group.name == "task_id" for group in groups) else world.num_tasks
         return cls(int(observations.shape[0]), int(actions.shape[0]), groups, hidden, classes)
 
-    @classmethod
-    def plain(cls, observations: int, actions: int, num_id_columns: int = 0) -> "Shape":
-        """That of a world which knows no parts but the task's one-hot behind the rest."""
-        return cls(observations, actions, plain_groups(observations, num_id_columns))
-
     @property
     def num_id_columns(self) -> int:
         """Entries of the task's one-hot, 0 where the observation has none."""
@@ -52,9 +47,7 @@ class Shape:
 
     @classmethod
     def load(cls, state: State) -> "Shape":
-        """What :meth:`state_dict` gave; earlier versions kept the sizes alone, and the one-hot was last."""
-        if "groups" not in state:
-            return cls.plain(**state)
+        """Return the shape of a :meth:`state_dict`."""
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
         named = tuple(ObservationGroup(*group) for group in groups)
         return cls(state["observations"], state["actions"], named, state.get("hidden", 0), state.get("classes", 1))

@@ -19,7 +19,7 @@ from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_max
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import MOST, Positive
 from bidex_meta.world.contract import VectorWorld
 
@@ -159,10 +159,6 @@ class Categorical(OffPolicy):
     critic_network: ClassVar[type[MLP] | None] = None
     returns_type = ReturnBound
     returns: ReturnBound
-
-    def load_state_dict(self, state: State) -> None:
-        """As in the base; older checkpoints have no recent rewards, of which the episodes that go on then lack some."""
-        super().load_state_dict({"recent": torch.zeros_like(self.returns.recent)} | state)
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         network = self.critic_network or network_of(self.config)
