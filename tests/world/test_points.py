@@ -9,7 +9,7 @@ from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.surfaces import FIXTURE, OBJECT, body_kinds, sample
@@ -93,7 +93,10 @@ def test_hands_goal_and_task_id_stay() -> None:
 
 def _mt4(points: PointsRule | None, rows: int = 8) -> World:
     suite = Benchmark("MT4")
-    return World(suite._slots("train"), rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1)
+    return World(
+        suite._slots("train"),
+        WorldConfig(rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1),
+    )
 
 
 def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_gives() -> None:

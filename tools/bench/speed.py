@@ -5,7 +5,7 @@ from typing import Any
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.utils.memory import usable_cores
-from bidex_meta.world import Slot, World
+from bidex_meta.world import Slot, World, WorldConfig
 from tools.bench.timing import random_steps
 
 
@@ -76,7 +76,7 @@ def mixing(
     mixed, classes = [], {}
     for i, slot in enumerate(full.slots):
         part, member = next((p, m) for p in full.parts for m in p.group.members if m.slot == i)
-        alone = World([Slot(slot.name, slot.task_class, slot.tasks)], num_envs, seed=seed, threads=threads)
+        alone = World([Slot(slot.name, slot.task_class, slot.tasks)], WorldConfig(num_envs, seed=seed, threads=threads))
         alone.reset(seed=seed)
         _speed(alone, 5)
         speed = statistics.median(_speed(alone, steps) for _ in range(repeats))
