@@ -36,7 +36,7 @@ from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.utils.validation import Text, real_numbers, whole_number
-from bidex_meta.world import PointsRule, Slot, World
+from bidex_meta.world import PointsRule, Slot, World, WorldConfig
 from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
 
@@ -240,27 +240,29 @@ class Benchmark:
             return self.others.make_world(
                 "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels
             )
-        slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
+        slots = self._slots(self._checked_split(split))
+        mode = checked_mode(autoreset_mode)
+        evaluates = mode.name == "DISABLED"
         if randomisation is None:
-            randomisation = mode.name != "DISABLED"
+            randomisation = not evaluates
         if isinstance(randomisation, bool):
             randomisation = self.suite.randomisation if randomisation else None
-        return World(
-            slots,
-            num_envs,
+        config = WorldConfig(
+            num_envs=num_envs,
             device=device,
             engine=engine,
             seed=self.seed if seed is None else seed,
             autoreset_mode=mode,
             observation=self.suite.observation,
             pad_to=self.padded_size,
-            task_sampling="fixed" if mode.name == "DISABLED" or self.suite.kind == "meta" else "uniform",
+            task_sampling="fixed" if evaluates or self.suite.kind == "meta" else "uniform",
             threads=threads,
             stagger=stagger,
             points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
             randomisation=randomisation,
             pixels=pixels,
         )
+        return World(slots, config)
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
         # By the class's name, so that all objects of a class have the same goals.
@@ -336,27 +338,30 @@ def make_task_world(
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """
-    task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
+    task_name = registry.resolve(task_name)
+    mode = checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     of_tasks = whole_number("seed", seed, 0)
     if task_seed is not None:
         of_tasks = whole_number("task_seed", task_seed, 0)
     tasks = _drawn(task_class.variation_space, of_tasks, task_name, "train", 50)
     slot = Slot(name_with_object(task_name, object), task_class, tasks)
-    return World(
-        [slot],
-        num_envs,
+    if task_sampling is None:
+        task_sampling = "fixed" if mode.name == "DISABLED" else "uniform"
+    config = WorldConfig(
+        num_envs=num_envs,
         device=device,
         engine=engine,
         seed=seed,
         autoreset_mode=mode,
-        task_sampling=task_sampling if task_sampling is not None else "fixed" if mode.name == "DISABLED" else "uniform",
+        task_sampling=task_sampling,
         threads=threads,
         stagger=stagger,
         points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
         randomisation=randomisation,
         pixels=pixels,
     )
+    return World([slot], config)
 
 
 def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:

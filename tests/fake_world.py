@@ -50,8 +50,8 @@ class FakeWorld(ABC):
         self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
         self.observation_space, self.action_space = spaces.observation, spaces.action
         self.observation_groups = plain_groups(sizes[0], self.num_id_columns)
-        self.slot_rows = split_rows(num_envs, self.num_tasks)
-        counts = torch.tensor([rows.stop - rows.start for rows in self.slot_rows])
+        self.slot_env_ids = split_rows(num_envs, self.num_tasks)
+        counts = torch.tensor([rows.stop - rows.start for rows in self.slot_env_ids])
         self.task_id = torch.arange(self.num_tasks).repeat_interleave(counts)
         self._index_in_slot = torch.cat([torch.arange(int(count)) for count in counts])
         self.max_episode_steps = torch.tensor(limits)[self.task_id]

@@ -96,9 +96,9 @@ class ToyWorld(FakeWorld):
     def _scaled(self, unscaled: Tensor) -> Tensor:
         return 10 * unscaled
 
-    def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
+    def render(self, env_id: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         frame = np.zeros((height, width, 3), np.uint8)
-        frame[:, int(self.episodes.elapsed[row]) :, row % 3] = 255
+        frame[:, int(self.episodes.elapsed[env_id]) :, env_id % 3] = 255
         return frame
 
 

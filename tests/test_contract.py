@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld.batched import MetaWorldWorld
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper, TaskWorldWrapper, WorldWrapper
 from bidex_meta.worlds.humanoid import HumanoidWorld
@@ -36,7 +36,10 @@ BOTH = ("SAME_STEP", "DISABLED")
 
 def warp_world(mode: str) -> World:
     slots = suite_world("MT4", 8).slots[:1]
-    return World(slots, 3, engine="warp", autoreset_mode=mode, observation="one-hot", task_sampling="fixed", threads=1)
+    return World(
+        slots,
+        WorldConfig(3, engine="warp", autoreset_mode=mode, observation="one-hot", task_sampling="fixed", threads=1),
+    )
 
 
 def point_world(mode: str) -> PointWorld:
@@ -151,7 +154,7 @@ def test_tasks_of_rows(case: Case) -> None:
     world = case.world
     world.reset(seed=0)
     for _ in range(2):
-        for slot, (rows, pool) in enumerate(zip(world.slot_rows, world.num_slot_tasks, strict=True)):
+        for slot, (rows, pool) in enumerate(zip(world.slot_env_ids, world.num_slot_tasks, strict=True)):
             assert (world.task_id[rows] == slot).all() and rows.stop - rows.start == (world.task_id == slot).sum()
             index = world.task_index[rows]
             assert index.min() >= 0 and index.max() < pool
@@ -378,7 +381,7 @@ def test_other_tasks(case: Case) -> None:
         world.reset(options={"reset_mask": mask})
     world.reset(seed=0)
     if case.kind.fixed or case.mode == "DISABLED":
-        rows = world.slot_rows[-1]
+        rows = world.slot_env_ids[-1]
         assert world.task_index[rows].tolist() == [j % 2 for j in range(rows.stop - rows.start)]
     for bad in ({"nobody": chosen}, {name: chosen[None]}, {name: np.zeros((2, 99))}):
         with pytest.raises(BidexError):

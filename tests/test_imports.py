@@ -38,7 +38,6 @@ LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
 MUTUAL = {
     ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
     ("bidex_meta.worlds.base", "bidex_meta.worlds.external"),
-    ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""
 

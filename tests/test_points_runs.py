@@ -106,14 +106,14 @@ def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(type(world), "render", black)
     looked = filming.CloudView(world, 200)
     looked.reset(seed=0)
-    pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]
+    pictures = [looked.render(env_id=row, width=60, height=50) for row in (0, 2)]
     assert pictures[0].shape == (50, 180, 3) and (pictures[0][:, :60] == 0).all()
     red, blue = (pictures[0][..., i].astype(int) for i in (0, 2))
     orange = np.asarray((red > blue + 40).any(axis=0))
     assert orange[60:120].any() and orange[120:].any(), "the egg is seen from the camera and from the side"
     for _ in range(20):
         looked.step(torch.zeros(3, looked.action_size))
-    assert (looked.render(row=0, width=60, height=50) != pictures[0]).any(), "it moves with the physics"
+    assert (looked.render(env_id=0, width=60, height=50) != pictures[0]).any(), "it moves with the physics"
 
 
 def test_a_copy_of_a_world_with_points_goes_on_alike() -> None:

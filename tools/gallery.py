@@ -80,7 +80,7 @@ def _image(name: str, view: str) -> str:
 def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
     world = make_task_world(name, num_envs=1, seed=0, autoreset_mode="DISABLED", threads=1)
     world.reset(seed=0)
-    video.write_image(path, world.render(row=0, width=width, height=height, camera=view))
+    video.write_image(path, world.render(env_id=0, width=width, height=height, camera=view))
     world.close()
 
 
@@ -112,7 +112,7 @@ def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
         for _ in range(int(world.max_episode_steps[0])):
             obs, *_, info = world.step(agent.eval_action(obs))
         rows = (~info["running"]["success"]).long().argsort(stable=True).tolist()[:3]  # solved ones first
-    pictures = [world.render(row=row, width=width, height=height, camera=VIEWS[0]) for row in rows]
+    pictures = [world.render(env_id=row, width=width, height=height, camera=VIEWS[0]) for row in rows]
     world.close()
     return np.concatenate(pictures, axis=1)
 

@@ -16,7 +16,7 @@ from bidex_meta.experiments.policies import load_policy
 from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
-from bidex_meta.world.hidden_parts import HiddenParts
+from bidex_meta.world.contract import PrivilegedWorld
 from bidex_meta.worlds import Worlds
 
 # Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
@@ -43,7 +43,7 @@ def ladder(
     worlds = Worlds.open(folder.config().to_json())
     worlds, split = (worlds.others, "train") if split == OTHERS else (worlds, split)
     world: Any = worlds.world(split, tasks * len(worlds.tasks(split)))
-    hidden, found = HiddenParts(world), dict[str, dict[str, list[float]]]()
+    found = dict[str, dict[str, list[float]]]()
     longest = adapt_steps_of(folder.config())
 
     def agent() -> Any:
@@ -57,12 +57,12 @@ def ladder(
             print(f"{name}, {each}: {', '.join(f'{100 * share:.0f} %' for share in shares)}", flush=True)
 
     inferring = agent()
-    inferring.policy.actor.candidates = spread(_CANDIDATES, hidden.values().shape[1])
+    inferring.policy.actor.candidates = spread(_CANDIDATES, world.hidden_size)
     inferring.policy.memory = _CANDIDATES
-    inferring.policy.evidence = _Known(hidden, inferring.policy.actor.candidates).evidence
+    inferring.policy.evidence = _Known(world, inferring.policy.actor.candidates).evidence
     play("icl, known rewards", inferring, shots)
     seeing = agent()
-    seeing.policy.believed = lambda state: hidden.values()
+    seeing.policy.believed = lambda state: world.hidden_values()
     play("icl, shown the goal", seeing, 0)
     play("teachers that are shown the goal", teachers_of(folder.config(), worlds, world), 0)
     if out is not None:
@@ -78,12 +78,12 @@ def success(evaluation: MetaEvaluation) -> dict[str, list[float]]:
 class _Known:
     """Log-likelihoods of candidates by the classes' own formulas of the reward."""
 
-    def __init__(self, hidden: HiddenParts, candidates: Tensor):
-        self._hidden, self._candidates = hidden, candidates
+    def __init__(self, world: PrivilegedWorld, candidates: Tensor):
+        self._world, self._candidates = world, candidates
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
         """As of ``BeliefPolicy``; of the step that the world has just made."""
-        paid = self._hidden.rewards(self._candidates[:, None].expand(-1, len(obs), -1))
+        paid = self._world.rewards_if(self._candidates[:, None].expand(-1, len(obs), -1))
         off = (reward[:, None] - paid.T) / _EXACT
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
 

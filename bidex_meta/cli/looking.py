@@ -13,7 +13,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.world.contract import TaskWorld
-from bidex_meta.worlds import WorldConfig, Worlds
+from bidex_meta.worlds import Worlds, WorldsConfig
 
 
 def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
@@ -44,7 +44,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     """
     if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
-    config = WorldConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
+    config = WorldsConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
     if flags.actor not in ("zero", "random"):
         run = RunFolder.open(Path(flags.actor)).config()
         config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)

@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> None:
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     if flags.points:
         world = _with_clouds(world)
-    rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(task)].start]
+    rows = list(range(len(slots))) if flags.tiled else [world.slot_env_ids[slots.index(task)].start]
     longest = int(world.max_episode_steps[rows].max())
     steps = flags.steps if flags.steps is not None else 0 if suffix == ".png" else longest
     look = {"width": width, "height": height, "camera": flags.camera}

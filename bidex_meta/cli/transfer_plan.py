@@ -25,7 +25,7 @@ from bidex_meta.utils.files import absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
-from bidex_meta.worlds import WorldConfig, Worlds
+from bidex_meta.worlds import Worlds, WorldsConfig
 
 _NETWORK = (
     "architecture", "modules", "hidden", "activation", "normalise_observations", "point_widths", "points_read",
@@ -133,7 +133,7 @@ def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path,
 
     Raises BidexError for a data set of other rules: what succeeds by these may fail here.
     """
-    worlds = Worlds.open(WorldConfig(suite=str(file)))
+    worlds = Worlds.open(WorldsConfig(suite=str(file)))
     task = worlds.task_classes()[name]
     for dataset in map(open_dataset, given):
         if [plain_name(slot.partition("/")[0]) for slot in dataset.metadata["tasks"]] != [name]:

@@ -27,8 +27,8 @@ from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import load_witness, witness_path
-from bidex_meta.world import Slot, World
-from bidex_meta.worlds import WorldConfig, Worlds
+from bidex_meta.world import Slot, World, WorldConfig
+from bidex_meta.worlds import Worlds, WorldsConfig
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(ValidityFlags, arguments, "validity")
     if flags.out is not None:
         check_writable(flags.out)
-    worlds = Worlds.open(WorldConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
+    worlds = Worlds.open(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
     rows = {name: row for split in worlds.splits for name, row in _of_split(worlds, split, flags).items()}
     made = {"suite": portable(flags.suite), "seed": flags.seed, "versions": collect_versions()}
     if flags.out is not None:
@@ -127,7 +127,7 @@ def _scripted(world: World) -> list[str]:
 def _identified(slot: Slot, flags: ValidityFlags) -> Json:
     """How well the best of the exploring episodes tells what a class hides."""
     say(f"{slot.name}: what rewards tell")
-    world = World([slot], len(slot.tasks), engine="c", threads=flags.threads, autoreset_mode="DISABLED")
+    world = World([slot], WorldConfig(len(slot.tasks), engine="c", threads=flags.threads, autoreset_mode="DISABLED"))
     explorers: list[Agent | None] = [None]
     explorers += [_witnesses(world)] if _with_witness(world) else []
     explorers += [Scripted(world, misled=True)] if _scripted(world) else []
@@ -158,7 +158,7 @@ def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, di
     for path in flags.policy:
         say(f"the policy of {path}")
         folder = RunFolder.open(path)
-        config = replace(WorldConfig.of(folder.config().to_json()), task_seed=flags.seed, threads=flags.threads)
+        config = replace(WorldsConfig.of(folder.config().to_json()), task_seed=flags.seed, threads=flags.threads)
         own = Worlds.open(config)
         say_other_rules(folder, worlds)
         agent, _ = load_policy(folder, "cpu")

@@ -91,7 +91,7 @@ class SB3VecEnv(vec_env.VecEnv):
         """
         columns = math.ceil(math.sqrt(self.num_envs))
         width = max(32, min(640, 1280 // columns // 4 * 4))
-        return [self.world.render(row=row, width=width, height=width * 3 // 4) for row in range(self.num_envs)]
+        return [self.world.render(env_id=row, width=width, height=width * 3 // 4) for row in range(self.num_envs)]
 
     def close(self) -> None:
         """Frees the world."""

@@ -25,11 +25,11 @@ def film_row(
     agent.reset(obs.new_ones(len(obs), dtype=bool))
     for step in range(steps):
         if every is not None and step % every == 0:
-            yield world.render(row=row, **look)
+            yield world.render(env_id=row, **look)
         obs, _, terminated, truncated, _ = world.step(agent.eval_action(obs))
         if bool(terminated[row] | truncated[row]):
             break
-    yield world.render(row=row, **look)
+    yield world.render(env_id=row, **look)
 
 
 def film_tiles(
@@ -57,7 +57,7 @@ def film_tiles(
     for step in range(steps + 1):
         if step % every == 0:
             done = solved[list(rows)].tolist()
-            frame = tiled([world.render(row=row, **look) for row in rows], names, done)
+            frame = tiled([world.render(env_id=row, **look) for row in rows], names, done)
             if large:
                 at = step * len(rows) // (steps + 1)
                 frame = np.concatenate((_large(world, rows[at], names[at], done[at], len(frame), look), frame), axis=1)
@@ -77,7 +77,7 @@ def _large(world: Any, row: int, name: str, done: bool, height: int, look: dict[
     """A tile of that height, of the others' shape; its width is even, as films need it."""
     inner = height - LABEL
     width = 2 * round(inner * look["width"] / look["height"] / 2)
-    picture = world.render(row=row, **look | {"width": width, "height": inner})
+    picture = world.render(env_id=row, **look | {"width": width, "height": inner})
     return tiled([picture], [name], [done])
 
 
@@ -97,20 +97,20 @@ class CloudView:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._world, name)
 
-    def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
+    def render(self, env_id: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """Three pictures side by side, (height, 3 width, 3), uint8; arguments as those of ``World.render``."""
-        picture = self._world.render(row=row, width=width, height=height, camera=camera)
-        cloud, eye = self._cloud(row)
+        picture = self._world.render(env_id=env_id, width=width, height=height, camera=camera)
+        cloud, eye = self._cloud(env_id)
         return np.concatenate((picture, *(draw(cloud, each, width, height) for each in (eye, beside(eye)))), axis=1)
 
-    def _cloud(self, row: int) -> tuple[np.ndarray, Camera]:
-        slot = int(self._world.task_id[row])
+    def _cloud(self, env_id: int) -> tuple[np.ndarray, Camera]:
+        slot = int(self._world.task_id[env_id])
         part, member = next((p, m) for p in self._world.parts for m in p.group.members if m.slot == slot)
         if slot not in self._clouds:
             surfaces = sample(member.scene.model, max(CANDIDATES, 2 * self._count))
             device = part.group.engine.device
             self._clouds[slot] = Cloud(surfaces, camera_of(member.scene.task), self._count, kinds=True, device=device)
-        at = part.engine_rows[row : row + 1]
+        at = part.engine_rows[env_id : env_id + 1]
         position, rotation = part.group.engine.body_poses()
         cloud = self._clouds[slot](position[at], rotation[at])[0]
         return cloud.double().cpu().numpy(), camera_of(member.scene.task)

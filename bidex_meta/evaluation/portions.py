@@ -32,7 +32,7 @@ class Portions:
         self._pool_sizes = list(world.num_slot_tasks)
         # The task of each adaptation, for each slot.
         self._adaptations = [np.tile(np.arange(min(tasks or size, size)), trials) for size in self._pool_sizes]
-        rows = [part.stop - part.start for part in world.slot_rows]
+        rows = [part.stop - part.start for part in world.slot_env_ids]
         fit = [max(1, number // (rollouts or 1)) for number in rows]
         totals = [len(adaptations) for adaptations in self._adaptations]
         self.count = max(-(-total // at_once) for total, at_once in zip(totals, fit, strict=True))

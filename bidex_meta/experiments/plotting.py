@@ -6,7 +6,7 @@ from pathlib import Path
 from bidex_meta.evaluation.comparison import read_histories
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable
-from bidex_meta.runs.stored import StoredRun, open_run
+from bidex_meta.runs.stored import StoredRun, open_runs
 
 
 def plot(runs: Sequence[RunFolder | StoredRun | str | Path], out: str | Path) -> Path:
@@ -16,7 +16,9 @@ def plot(runs: Sequence[RunFolder | StoredRun | str | Path], out: str | Path) ->
     decides the format (``.png``, ``.svg``, ``.pdf``). Raises BidexError if a run has no metrics or ``out`` cannot be
     written.
     """
-    opened = [run if isinstance(run, RunFolder | StoredRun) else open_run(Path(run)) for run in runs]
+    opened: list[RunFolder | StoredRun] = []
+    for run in runs:
+        opened += [run] if isinstance(run, RunFolder | StoredRun) else open_runs(Path(run))
     path = Path(out)
     check_writable(path)
     histories = read_histories(opened)

@@ -18,7 +18,6 @@ from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import VectorWorld
-from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.worlds import Worlds
 
 SCRIPTS = "scripts"
@@ -123,13 +122,13 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     inner: Any = getattr(world, "unwrapped", world)  # without a recorder
-    hidden = HiddenParts(inner) if source.hides_goals else None
+    privileged = inner if source.hides_goals else None
     if not scripted:
-        return Teachers(world, tutors, hidden=hidden)
+        return Teachers(world, tutors, privileged=privileged)
     names = [inner.slots[i].name for i, task in enumerate(slots) if task in scripted]
     mask = torch.zeros(world.num_envs, dtype=torch.bool)
     mask[_rows(world, slots, scripted)] = True
-    return Teachers(world, tutors, Scripted(inner, names=names), mask, hidden)
+    return Teachers(world, tutors, Scripted(inner, names=names), mask, privileged)
 
 
 def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:

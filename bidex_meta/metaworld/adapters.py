@@ -212,7 +212,7 @@ class MetaWorldEnvs(VectorEnv):
     def sample_tasks(self) -> None:
         """Takes the next tasks of each pool, one for each environment, in turn; they hold from the next reset on."""
         chosen = {}
-        for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_rows, strict=True):
+        for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_env_ids, strict=True):
             count = rows.stop - rows.start
             chosen[name] = pool[(self._samples * count + np.arange(count)) % len(pool)]
         self.world.set_tasks(chosen)

@@ -111,7 +111,6 @@ class MetaWorldWorld(ForeignWorld):
 
         Each running episode is played again from its start, exactly: Meta-World keeps part of its state in Python.
         """
-        state = self._upgraded(state)
         fits(state, self.state_dict())
         self.set_tasks(state["pools"])
         self._restore(state)
@@ -140,7 +139,7 @@ def evaluate_all_tasks(
     """
     protocol = Protocol(seed=seed, episodes_per_task=episodes_per_task)
     check_world(world)
-    at_once = min(rows.stop - rows.start for rows in world.slot_rows)
+    at_once = min(rows.stop - rows.start for rows in world.slot_env_ids)
     parts: list[dict[str, np.ndarray]] = []
     for first in range(0, TASKS_PER_CLASS, at_once):
         pool = np.arange(first, min(first + at_once, TASKS_PER_CLASS))

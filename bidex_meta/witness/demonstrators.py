@@ -10,7 +10,7 @@ from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.replay import SEED, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.groups import Member
 from bidex_meta.world.part import Part, base_rotations
@@ -123,16 +123,16 @@ class _Class:
             rows = torch.tensor(list(leads))
             sensors = self._sensors[rows]
             found = self._hand_actions(list(leads.values()), lambda name: sensors[:, self._member.scene.sensors[name]])
-            actions[self._member.world_rows][rows, : found.shape[1]] = found
+            actions[self._member.env_ids][rows, : found.shape[1]] = found
 
     def begin(self, env_mask: Tensor) -> None:
         """A new script in the environments of the class among a mask (N,)."""
-        for row in env_mask[self._member.world_rows].nonzero().flatten().tolist():
+        for row in env_mask[self._member.env_ids].nonzero().flatten().tolist():
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
         """The script of a row; reads nothing before its first action is asked for."""
-        place = self._member.world_rows.start + row
+        place = self._member.env_ids.start + row
         given = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
         frozen = self._part.frozen(self._number, given)
         places = self._member.scene.sensors
@@ -146,7 +146,9 @@ class ShiftedStarts(PooledWorldWrapper):
     world: World
 
     def __init__(self, name: str, rows: int, shift: float, threads: int | None = None) -> None:
-        super().__init__(World([task_slot(name)], rows, autoreset_mode="DISABLED", seed=SEED, threads=threads))
+        super().__init__(
+            World([task_slot(name)], WorldConfig(rows, autoreset_mode="DISABLED", seed=SEED, threads=threads))
+        )
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:

@@ -12,7 +12,7 @@ from bidex_meta.errors import unknown_name
 from bidex_meta.suite import plain_name
 from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
-from bidex_meta.world import Slot, World
+from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.world.part import judge
 
 SUITE, SEED = "MT20", 0  # witnesses are about task 0 of each class of this suite and seed
@@ -52,7 +52,7 @@ class Simulator:
         slot = task_slot(name)
         self.num, self.task = num, slot.task_class
         self.action_size, self.episode_steps = self.task.action_size, self.task.episode_steps
-        self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
+        self._world = World([slot], WorldConfig(num, autoreset_mode="DISABLED", seed=SEED, threads=threads))
         self._world.reset(seed=SEED)
         self._part = self._world.parts[0]
         self._engine = self._part.group.engine
@@ -125,7 +125,7 @@ class Simulator:
 
     def picture(self, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """Picture of the first environment, (height, width, 3) uint8."""
-        return self._world.render(row=0, width=width, height=height, camera=camera)
+        return self._world.render(env_id=0, width=width, height=height, camera=camera)
 
     def close(self) -> None:
         """Ends the engine."""

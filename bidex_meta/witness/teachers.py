@@ -8,8 +8,7 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent
 from bidex_meta.witness.demonstrators import Scripted
-from bidex_meta.world.contract import VectorWorld
-from bidex_meta.world.hidden_parts import HiddenParts
+from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 
 
 @dataclass(frozen=True)
@@ -25,10 +24,10 @@ class Tutor:
 
 
 class Teachers:
-    """Labels actions of a world's environments; an agent, asked in every step and reset where episodes begin.
+    """Labels actions of a world's environments; an agent that acts in every step and is reset when episodes begin.
 
-    ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays those of ``scripted_rows``, bool
-    (N,); ``tutors`` have others, each its own. ``hidden``: of a world that hides goals, what shows them to the tutors.
+    ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays in those of ``scripted_rows``, bool
+    (N,); each of the ``tutors`` has its own. ``privileged`` shows the goals of a world that hides them to the tutors.
     """
 
     def __init__(
@@ -37,9 +36,9 @@ class Teachers:
         tutors: Sequence[Tutor] = (),
         scripted: Scripted | None = None,
         scripted_rows: Tensor | None = None,
-        hidden: HiddenParts | None = None,
+        privileged: PrivilegedWorld | None = None,
     ) -> None:
-        self.hidden = hidden
+        self.privileged = privileged
         self._tutors, self._scripted = tutors, scripted
         self._shape = world.action_space.shape
         self.known = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
@@ -56,9 +55,8 @@ class Teachers:
     def eval_action(self, obs: Tensor) -> Tensor:
         """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
         labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
-        if self.hidden is not None and self._tutors:
-            # Added, since an entry that is a goal's in one class may be an object's in another.
-            obs = obs.index_add(1, self.hidden.columns, self.hidden.entries())
+        if self.privileged is not None and self._tutors:
+            obs = self.privileged.with_goals(obs)
         for tutor in self._tutors:
             actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
             labels[tutor.rows, : actions.shape[1]] = actions

@@ -2,6 +2,6 @@
 
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot
-from bidex_meta.world.world import World
+from bidex_meta.world.world import World, WorldConfig
 
-__all__ = ["PointsRule", "Slot", "World"]
+__all__ = ["PointsRule", "Slot", "World", "WorldConfig"]

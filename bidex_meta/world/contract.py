@@ -147,7 +147,7 @@ class VectorWorld(Protocol):
 class TaskWorld(VectorWorld, Protocol):
     """A world whose environments play known tasks of their slot's pool: for evaluation and meta-learning."""
 
-    slot_rows: list[slice]
+    slot_env_ids: list[slice]
     """Environments of each slot, contiguous."""
     num_slot_tasks: list[int]
     """Tasks in the pool of each slot."""
@@ -172,7 +172,40 @@ class PooledWorld(TaskWorld, Protocol):
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
         """Gives slots, by name, other pools; they hold from the next reset on, which must be of all environments.
 
-        Environment j of a slot plays task j mod n where tasks are fixed. Raises BidexError for an unknown slot, a
-        wrong shape, or non-finite numbers.
+        Environment j of a slot plays task j mod n if tasks are fixed. Raises BidexError for an unknown slot, a wrong
+        shape, or non-finite numbers.
         """
+        ...
+
+
+class PrivilegedWorld(Protocol):
+    """A world that can show what its observations hide: for teachers, and for learners that are taught in training.
+
+    Hidden values are the numbers of a task that its class hides (such as the goal's position), scaled from their range
+    to [-1, 1]. Classes that hide fewer than ``hidden_size`` numbers have zeros behind theirs.
+    """
+
+    @property
+    def hidden_size(self) -> int:
+        """The most numbers that tasks of a class hide; 0 if observations show the goals."""
+        ...
+
+    @property
+    def hidden_columns(self) -> dict[str, list[int]]:
+        """Columns of the tasks in each slot's pool that are hidden, by the slot's name."""
+        ...
+
+    def hidden_values(self) -> Tensor:
+        """Return the hidden values of the task that each environment plays, float32 (N, hidden_size)."""
+        ...
+
+    def rewards_if(self, goals: Tensor, /) -> Tensor:
+        """Return the rewards that the last step would have earned if the tasks had other hidden values.
+
+        ``goals`` (..., N, hidden_size); returns (..., N), float32. Raises BidexError for another shape.
+        """
+        ...
+
+    def with_goals(self, obs: Tensor, /) -> Tensor:
+        """Return present observations (N, d) with the goals that they hide, in new memory."""
         ...

@@ -1,4 +1,4 @@
-"""Worlds of other libraries' environments, on the CPU: what is the same whoever steps them.
+"""Worlds of other libraries' environments, on the CPU: the base that each library's world extends.
 
 Our learners, evaluation and checkpoints run on them unchanged; a subclass places environments and advances them.
 """
@@ -13,8 +13,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from bidex_meta.world.base import BatchedWorld, Slots, Transition
-from bidex_meta.world.contract import Info, State, plain_groups
+from bidex_meta.world.base import BatchedWorld, Outcome, Slots, Transition
+from bidex_meta.world.contract import State, plain_groups
 from bidex_meta.world.random import uniform
 
 _TASK_DRAW, _ELAPSED_DRAW, OWN_DRAWS = 0, 1, 2
@@ -45,10 +45,10 @@ class ForeignWorld(BatchedWorld):
         autoreset_mode: str | AutoresetMode | None = None,
         stagger: bool = True,
     ) -> None:
-        """Sets up spaces and episodes; a subclass makes what it steps. Raises as ``BatchedWorld``."""
+        """Set up spaces and episodes; a subclass makes what it steps. Raises as ``BatchedWorld``."""
         count = len(names)
-        slots = Slots(list(names), [sizes.episode] * count, [1.0] * count, [None] * count)
-        super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger)
+        slots = Slots(list(names), [sizes.episode] * count, [1.0] * count, [None] * count, [1] * count)
+        super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger, seed)
         self.num_id_columns = count if count > 1 else 0
         self.observation_groups = plain_groups(sizes.state + self.num_id_columns, self.num_id_columns)
         low, high = (
@@ -58,16 +58,16 @@ class ForeignWorld(BatchedWorld):
         self._set_spaces(Box(low, high, dtype=np.float32), sizes.action)
         if self.num_id_columns:
             self._obs[:, sizes.state :] = torch.eye(count)[self.task_id]
-        self._success = torch.zeros(self.num_envs, dtype=torch.bool)  # of the last transition: a frozen one keeps it
-        self._set_seed(seed)
-        self._set_pool_sizes([1] * count)
+        # Success of the last transition, which a frozen environment keeps.
+        self._success = torch.zeros(self.num_envs, dtype=torch.bool)
 
     def _draws(self, num: int) -> Tensor:
-        """Uniform numbers of the running episodes, (n, num), a function of seed, environment and episode."""
+        """Return uniform numbers of the running episodes, (n, num), a function of seed, environment and episode."""
         return uniform(self._keys, self.episodes.number, num)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
-        draws, tasks = uniform(self._keys, self.episodes.number + mask, OWN_DRAWS), self.task_index
+        draws = uniform(self._keys, self.episodes.number + mask, OWN_DRAWS)
+        tasks = self.task_index
         if self.autoreset_mode != AutoresetMode.DISABLED:
             tasks = (draws[:, _TASK_DRAW] * self._pool_size).long()
         self._count_episodes(mask, tasks, draws[:, _ELAPSED_DRAW], stagger)
@@ -75,12 +75,19 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _place(self, mask: Tensor) -> None:
-        """Starts ``task_index`` in the environments of a mask and writes their states into ``_obs``."""
+        """Start ``task_index`` in the environments of a mask and write their states into ``_obs``."""
 
-    def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
-        step = super()._finish(active, broken, transition)
-        self._success = step[3]["success"].clone()
-        return step
+    def _move(self, active: Tensor, broken: Tensor) -> Outcome:
+        reward, terminated, truncated, info = self._finish(active, broken, self._advance(active, broken))
+        self._success = info["success"].clone()
+        return reward, terminated, truncated, info
+
+    @abstractmethod
+    def _advance(self, active: Tensor, broken: Tensor) -> Transition:
+        """Step the ``active`` environments under ``_action``; of others only success is read.
+
+        ``broken``: the active environments whose action was not finite; nothing is read of them.
+        """
 
     def state_dict(self) -> State:
         """As in ``BatchedWorld``."""

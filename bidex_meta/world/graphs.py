@@ -4,8 +4,8 @@ Launched one by one, torch's kernels would take longer than the physics. The sta
 leaves behind lives in tensors at fixed addresses; so does what it returns, which its next replay overwrites.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -34,7 +34,7 @@ def cuda_graph(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
 
 
 class GraphCache:
-    """Stretches of a step by name, over one state.
+    """Recorded stretches of work by key, over one state.
 
     A stretch is recorded with the tensors that its closures hold at that time: ``forget`` after changing any but the
     state and the inputs.
@@ -45,24 +45,24 @@ class GraphCache:
     ) -> None:
         """``get`` and ``put`` read and bind the state's tensors by name; ``record`` is e.g. ``cuda_graph``."""
         self._get, self._put, self._record = get, put, record
-        self._state: dict[str, Tensor] = {}
-        self._runs: dict[str, int] = {}
-        self._recorded: dict[str, tuple[list[Tensor], Callable[[], None], Any]] = {}
+        self.forget()
 
     def forget(self) -> None:
-        """Drops all recordings; stretches run plainly again for a while."""
-        self._state, self._runs, self._recorded = {}, {}, {}
+        """Drop all recordings; stretches run plainly again for a while."""
+        self._state: dict[str, Tensor] = {}
+        self._runs: dict[Hashable, int] = {}
+        self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], Any]] = {}
 
-    def run(self, name: str, work: Work, *inputs: Tensor) -> Any:
-        """What the work returns for the inputs, run or replayed; the next replay of this stretch overwrites it.
+    def run(self, key: Hashable, work: Work, *inputs: Tensor) -> Any:
+        """Run or replay the work and return what it returns; the next replay of this stretch overwrites it.
 
-        A name must always come with the same work and inputs of the same shapes.
+        A key must always come with the same work and inputs of the same shapes.
         """
-        self._runs[name] = self._runs.get(name, 0) + 1
-        if self._runs[name] <= _BEFORE:
+        self._runs[key] = self._runs.get(key, 0) + 1
+        if self._runs[key] <= _BEFORE:
             return work(*inputs)
         self._settle()
-        if name not in self._recorded:
+        if key not in self._recorded:
             own = [value.clone() for value in inputs]
 
             def settled() -> Any:
@@ -70,15 +70,15 @@ class GraphCache:
                 self._settle()
                 return result
 
-            self._recorded[name] = (own, *self._record(settled))
-        own, replay, result = self._recorded[name]
-        for place, value in zip(own, inputs, strict=True):
-            place.copy_(value)
+            self._recorded[key] = (own, *self._record(settled))
+        own, replay, result = self._recorded[key]
+        for fixed, value in zip(own, inputs, strict=True):
+            fixed.copy_(value)
         replay()
         return result
 
     def _settle(self) -> None:
-        """Brings the state into its fixed place."""
+        """Bring the state into its fixed place."""
         now = self._get()
         if not self._state:
             self._state = {name: value.clone() for name, value in now.items()}
@@ -89,13 +89,72 @@ class GraphCache:
 
 
 def fresh(result: Any) -> Any:
-    """A nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
-    found = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
-    copies = {key: torch.empty_like(value) for key, value in found.items()}
-    for kind in {value.dtype for value in found.values()}:  # of one kind at once: few kernels
-        keys = [key for key, value in found.items() if value.dtype == kind]
-        torch._foreach_copy_([copies[k] for k in keys], [found[k] for k in keys])  # pyright: ignore
+    """Return a nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
+    tensors = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
+    copies = {key: torch.empty_like(value) for key, value in tensors.items()}
+    for kind in {value.dtype for value in tensors.values()}:  # one call per dtype launches few kernels
+        keys = [key for key, value in tensors.items() if value.dtype == kind]
+        torch._foreach_copy_([copies[k] for k in keys], [tensors[k] for k in keys])  # pyright: ignore
     return tree_map_only(Tensor, lambda value: copies[id(value)], result)
+
+
+class Stepper(Protocol):
+    """Runs the stretches of a world's step that read no number on the host."""
+
+    def run(self, work: Work, *inputs: Tensor) -> Any:
+        """Run a method of the world on tensors whose shapes never change, and return what it returns.
+
+        The next run of the same method may overwrite what it returned.
+        """
+        ...
+
+    def keep(self, result: Any) -> Any:
+        """Return what a run returned such that no later run overwrites it."""
+        ...
+
+    def forget(self) -> None:
+        """Drop what was remembered of earlier runs: something that the methods read was replaced."""
+        ...
+
+
+class EagerStepper:
+    """Runs each stretch as it is."""
+
+    def run(self, work: Work, *inputs: Tensor) -> Any:
+        """As in ``Stepper``."""
+        return work(*inputs)
+
+    def keep(self, result: Any) -> Any:
+        """As in ``Stepper``."""
+        return result
+
+    def forget(self) -> None:
+        """As in ``Stepper``."""
+
+
+class CapturedStepper:
+    """Records each stretch as a graph and replays it."""
+
+    def __init__(
+        self,
+        get: Callable[[], dict[str, Tensor]],
+        put: Callable[[dict[str, Tensor]], None],
+        record: Record = cuda_graph,
+    ) -> None:
+        """Take the same arguments as ``GraphCache``."""
+        self._graphs = GraphCache(get, put, record)
+
+    def run(self, work: Work, *inputs: Tensor) -> Any:
+        """As in ``Stepper``."""
+        return self._graphs.run(work, work, *inputs)
+
+    def keep(self, result: Any) -> Any:
+        """As in ``Stepper``."""
+        return fresh(result)
+
+    def forget(self) -> None:
+        """As in ``Stepper``."""
+        self._graphs.forget()
 
 
 class SideBySide:

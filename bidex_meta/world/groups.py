@@ -44,7 +44,7 @@ class Member:
 
     slot: int
     scene: Scene
-    world_rows: slice
+    env_ids: slice
     engine_rows: slice
 
 
@@ -137,14 +137,14 @@ def _alike(a: Scene, b: Scene) -> bool:
 
 def _build_group(places: list[tuple[int, Scene, slice]], make_engine: EngineMaker) -> Group:
     members, model_of_row, models, start = [], [], [], 0
-    for slot, scene, world_rows in places:
-        count = world_rows.stop - world_rows.start
-        members.append(Member(slot, scene, world_rows, slice(start, start + count)))
+    for slot, scene, env_ids in places:
+        count = env_ids.stop - env_ids.start
+        members.append(Member(slot, scene, env_ids, slice(start, start + count)))
         if scene.model not in models:
             models.append(scene.model)
         model_of_row += [models.index(scene.model)] * count
         start += count
-    rows = torch.cat([torch.arange(m.world_rows.start, m.world_rows.stop) for m in members])
+    rows = torch.cat([torch.arange(m.env_ids.start, m.env_ids.stop) for m in members])
     first, last = int(rows[0]), int(rows[-1])
     span = slice(first, last + 1) if last - first + 1 == len(rows) else None
     engine = make_engine(models, model_of_row, room_for([scene.task.needs for _, scene, _ in places]))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -144,6 +144,13 @@ class Part:
             if last > first:
                 yield i, member, slice(first, last), rows[first:last]
 
+    def rows_in(self, mask: Tensor) -> Tensor | None:
+        """Return the engine rows of the environments of a mask (num_envs,), ascending; None, all, if masked.
+
+        Counting the entries of a mask would make the host wait for an accelerator.
+        """
+        return None if self._engine.masked else self.group.take(mask).nonzero().squeeze(1)
+
     def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
         """See ``Observer.mounts``; of engine rows, None: all. None where the bases are fixed."""
         chosen = slice(None) if rows is None else rows
@@ -221,6 +228,26 @@ class Part:
         return qpos
 
 
+class PartedWorld(Protocol):
+    """A world of hands as pictures and hidden goals read it (``World``)."""
+
+    num_envs: int
+    device: torch.device
+    slots: list[Slot]
+    slot_env_ids: list[slice]
+    parts: list[Part]
+    task_id: Tensor
+    task_index: Tensor
+    observation_size: int
+    hides_goals: bool
+    """Whether observations have zeros in place of goals."""
+
+    @property
+    def hidden_size(self) -> int:
+        """See ``PrivilegedWorld``."""
+        ...
+
+
 def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None = None) -> Sequence[Tensor | None]:
     """Roll, pitch and yaw (n, 2, 3) of both bases since the start, of engine rows (None: all) of each part.
 
@@ -270,7 +297,7 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
         values = part.observe(states, group.take(action), rotation, out=out)
         broke = part.unstable()
         for member, where, state in states:
-            rows, judged = member.world_rows, judge(member.scene.task, state)
+            rows, judged = member.env_ids, judge(member.scene.task, state)
             if part.looks:
                 checked.own_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
             reward[rows], success[rows], failed[rows] = judged.reward, judged.success, judged.failed

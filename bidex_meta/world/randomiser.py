@@ -125,11 +125,6 @@ class _Models:
         ]
         self._heights = [heights(member.scene) for member in members]
 
-    def _chosen(self, mask: Tensor) -> Tensor | None:
-        """Engine rows of a mask's environments; None: all of them, of which the mask chooses."""
-        group = self._part.group
-        return None if group.engine.masked else group.take(mask).nonzero().squeeze(1)
-
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:
         """Multiplies fields of the models of a mask's environments, as they were compiled, by what was drawn."""
         if not self._fields:
@@ -137,7 +132,7 @@ class _Models:
         group = self._part.group
         new = group.take(mask)[:, None, None]
         factors = {name: group.take(drawn[name]) for name in drawn if name != _DELAY}
-        for i, _, _, rows in self._part.members(self._chosen(mask)):
+        for i, _, _, rows in self._part.members(self._part.rows_in(mask)):
             for name, field in self._fields.items():
                 value = self._bases[i][name]
                 for factor, exponent in self._rules[i][name].items():
@@ -147,7 +142,7 @@ class _Models:
     def lift(self, start: Tensor, size: Tensor, mask: Tensor) -> None:
         """See ``Randomiser.lift``; of this part."""
         size = self._part.group.take(size)
-        for i, _, where, rows in self._part.members(self._chosen(mask)):
+        for i, _, where, rows in self._part.members(self._part.rows_in(mask)):
             for column, height in self._heights[i].items():
                 start[where, column] += (height * (size[rows] - 1.0)).to(start.dtype)
 

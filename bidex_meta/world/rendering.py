@@ -14,8 +14,7 @@ from bidex_meta.utils.maths import wxyz
 if TYPE_CHECKING:
     from bidex_meta.engine.protocol import Engine
     from bidex_meta.tasks.scene import Scene
-    from bidex_meta.world.part import Part
-    from bidex_meta.world.world import World
+    from bidex_meta.world.part import Part, PartedWorld
 
 CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
 """Azimuth and elevation of the named views, degrees; None: the class's ``camera_angle``."""
@@ -53,7 +52,7 @@ class Painter(threading.local):
     def __reduce__(self) -> tuple[Any, ...]:
         return Painter, ()
 
-    def picture(self, world: "World", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
+    def picture(self, world: "PartedWorld", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
         """A picture of a row, shape (height, width, 3), uint8.
 
         Raises BidexError for an unknown camera or row, too large a picture, or a machine that cannot draw.
@@ -66,7 +65,7 @@ class Painter(threading.local):
         engine, engine_row, scene = simulation(world, row)
         return self._draw(world, row, name, (width, height), scene, engine.placement()[engine_row])
 
-    def pictures(self, world: "World", size: int) -> torch.Tensor:
+    def pictures(self, world: "PartedWorld", size: int) -> torch.Tensor:
         """Square pictures of all rows by their classes' own cameras, (num_envs, size, size, 3), uint8, on the CPU."""
         found = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8)
         for part in world.parts:
@@ -78,7 +77,13 @@ class Painter(threading.local):
         return found
 
     def _draw(
-        self, world: "World", row: int, camera: str, size: tuple[int, int], scene: "Scene", placement: torch.Tensor
+        self,
+        world: "PartedWorld",
+        row: int,
+        camera: str,
+        size: tuple[int, int],
+        scene: "Scene",
+        placement: torch.Tensor,
     ) -> np.ndarray:
         renderer, data = self._renderer(scene.dressed, (int(world.task_id[row]), *size))
         pose(scene.dressed, data, placement)
@@ -110,7 +115,7 @@ class Painter(threading.local):
             self._renderers.popitem()[1][0].close()
 
 
-def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
+def _camera(world: "PartedWorld", row: int, name: str) -> mujoco.MjvCamera:
     view = mujoco.MjvCamera()
     task = world.slots[int(world.task_id[row])].task_class
     view.lookat[:] = task.camera_target
@@ -119,14 +124,14 @@ def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
     return view
 
 
-def simulation(world: "World", row: int) -> "tuple[Engine, int, Scene]":
+def simulation(world: "PartedWorld", row: int) -> "tuple[Engine, int, Scene]":
     """The engine that carries a row, its row there, and its scene."""
     part, at = _part(world, row)
     scene = next(m.scene for m in part.group.members if m.engine_rows.start <= at < m.engine_rows.stop)
     return part.group.engine, at, scene
 
 
-def _part(world: "World", row: int) -> "tuple[Part, int]":
+def _part(world: "PartedWorld", row: int) -> "tuple[Part, int]":
     """Return the part that has a row, and its row in the part's engine."""
     part = next(p for p in world.parts if bool((p.group.rows == row).any()))
     return part, int((part.group.rows == row).nonzero()[0])
@@ -142,7 +147,7 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
         part(model, data)
 
 
-def ghosts(world: "World", row: int) -> list[DrawnGhost]:
+def ghosts(world: "PartedWorld", row: int) -> list[DrawnGhost]:
     """Return the goals of a row's task in its present state; none in a world that hides them.
 
     Every picture, film and view asks here, so that none tells what observations hide.

@@ -25,7 +25,7 @@ from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.episodes import check_single_reset
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
-from bidex_meta.world.world import World
+from bidex_meta.world.world import World, WorldConfig
 
 _FAR = 2**31
 
@@ -128,9 +128,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self._picture = (width, height, _camera(camera_name, camera_id))
         recipe, space = self.recipe, self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
-        self._world = World(
-            [slot],
-            1,
+        config = WorldConfig(
+            num_envs=1,
             engine="c",
             threads=1,
             autoreset_mode="DISABLED",
@@ -138,6 +137,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             pad_to=recipe.padded_size,
             points=PointsRule(*recipe.points) if recipe.points[0] else None,
         )
+        self._world = World([slot], config)
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space
         self.goal_space = Box(np.array(space.low), np.array(space.high), dtype=np.float64)

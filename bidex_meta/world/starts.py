@@ -1,7 +1,8 @@
-"""Where episodes start, computed ahead for many rows at once.
+"""Starts of episodes, drawn ahead for many environments at once.
 
-A start depends on the row's key and the number of its episode alone. A vectorised draw for a thousand rows takes hardly
-longer than one for ten; drawn row by row as episodes end, starts would be a tenth of a step's time.
+A start depends on the environment's key and the number of its episode alone. A vectorised draw for a thousand
+environments takes hardly longer than a draw for ten. If starts were drawn one by one as episodes end, they would take a
+tenth of a step's time.
 """
 
 from functools import partial
@@ -9,32 +10,41 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bidex_meta.world.graphs import Together
+from bidex_meta.world.graphs import Stepper, Together
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import uniform
 
 # Draws of an episode that are the world's own: the task, and the elapsed time of a training world's first episode.
 _TASK_DRAW, _ELAPSED_DRAW, _OWN_DRAWS = 0, 1, 2
 _AHEAD = 8
-"""Episodes drawn ahead for a row: some classes fail within ten steps, so one would run out at almost every step."""
+"""Episodes drawn ahead per environment: some classes fail within ten steps, so one would run out at almost every step.
+"""
 
 
 class Starts:
-    """The coming episodes of every row: their tasks, elapsed shares and positions."""
+    """The coming episodes of every environment: their tasks, elapsed shares and positions."""
 
     def __init__(
         self, parts: list[Part], keys: Tensor, start_draws: int, pool_size: Tensor | None, together: Together
     ) -> None:
-        """``keys``: random keys of the world's rows, (n, 2); ``start_draws``: the most draws of any class.
+        """Make room for the draws.
 
-        ``pool_size``: tasks of each row's slot, (n,), where episodes draw them; None where rows keep theirs.
-        ``together`` does a job for each part.
+        Args:
+            parts: The world's parts.
+            keys: Random keys of the environments, (n, 2).
+            start_draws: The most draws of any class.
+            pool_size: Tasks in the pool of each environment's slot, (n,), if episodes draw them; None if environments
+                keep their tasks.
+            together: Does a job for each part.
         """
         self._together = together
-        self._parts, self._keys, self._pool_size = parts, keys, pool_size
+        self._parts = parts
+        self._keys = keys
+        self._pool_size = pool_size
         self._draws = _OWN_DRAWS + start_draws
-        num, device = len(keys), keys.device
-        # The bank holds the episodes first ... first + _AHEAD - 1 of each row.
+        num = len(keys)
+        device = keys.device
+        # The bank holds the episodes first ... first + _AHEAD - 1 of each environment.
         self._first = torch.full((num,), -_AHEAD, device=device)
         self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64, device=device)
         self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64, device=device)
@@ -43,82 +53,77 @@ class Starts:
         self._masked = parts[0].group.engine.masked
         self._takes = 0
 
-    def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The starts of the rows in ``mask``, bool (n,).
-
-        ``number``: of the episode that begins, or would begin next, of every row, (n,); ``task_index``: task that a row
-        keeps where none is drawn. Returns task and elapsed share in [0, 1) of every row, (n,), and for each part the
-        starts (k, start_size) of its k rows in the mask, or of all where the engine is masked; all valid where the mask
-        is true.
-        """
+    def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
+        """Draw ahead if the next ``take`` needs it, which gets the same mask, number and task_index."""
         if self._masked:
-            return self._take_masked(number, task_index)
-        place = number - self._first
-        if ((place >= _AHEAD) & mask).any():
-            half_used = place >= _AHEAD // 2
-            self._draw(half_used.nonzero().squeeze(1), number, task_index)
-            place = number - self._first
-        place = place.clamp(max=_AHEAD - 1)[:, None]
-        chosen = [part.group.take(mask).nonzero().squeeze(1) for part in self._parts]
-        places = [part.group.take(place)[:, 0] for part in self._parts]
-        return (
-            self._task_index.gather(1, place)[:, 0],
-            self._elapsed_share.gather(1, place)[:, 0],
-            [qpos[rows, at[rows]] for qpos, rows, at in zip(self._qpos, chosen, places, strict=True)],
-        )
+            # An environment begins at most one episode per take, so counting them replaces a look at any number.
+            if self._takes % _AHEAD == 0:
+                stepper.run(self._draw_all, number, task_index)
+            self._takes += 1
+            return
+        used = number - self._first
+        if ((used >= _AHEAD) & mask).any():
+            self._draw((used >= _AHEAD // 2).nonzero().squeeze(1), number, task_index)
 
-    def count_take(self) -> bool:
-        """Comes before each ``take`` of a masked engine; whether ``draw_all`` must come between.
+    def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Return the starts of the environments in ``mask``, bool (n,), after ``prepare``.
 
-        A row begins at most one episode a ``take``, so counting them does instead of a look at any number.
+        ``number``: of the episode that begins, or would begin next, of every environment, (n,); ``task_index``: task
+        that an environment keeps if none is drawn. Returns task and elapsed share in [0, 1) of every environment, (n,),
+        and for each part the starts (k, start_size) of its k environments in the mask, or of all if the engine is
+        masked; all valid where the mask is true.
         """
-        self._takes += 1
-        return self._takes % _AHEAD == 1
-
-    def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The same for all rows, without a look at any number."""
-        place = (number - self._first)[:, None]
+        place = (number - self._first).clamp(max=_AHEAD - 1)[:, None]
         starts = []
         for part, qpos in zip(self._parts, self._qpos, strict=True):
-            at = part.group.take(place)[:, :, None].expand(-1, 1, qpos.shape[2])
-            starts.append(qpos.gather(1, at)[:, 0])
+            at = part.group.take(place)
+            rows = part.rows_in(mask)
+            if rows is None:
+                starts.append(qpos.gather(1, at[:, :, None].expand(-1, 1, qpos.shape[2]))[:, 0])
+            else:
+                starts.append(qpos[rows, at[rows, 0]])
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
-    def _draw(self, rows: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Fills the bank of some of the world's rows, from the given episode numbers on."""
-        self._first[rows] = number[rows]
-        many = rows.repeat_interleave(_AHEAD)
-        ahead = torch.arange(_AHEAD).repeat(len(rows))
+    def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
+        """Fill the bank of some environments, from the given episode numbers on."""
+        self._first[env_ids] = number[env_ids]
+        many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
-        self._task_index[rows], self._elapsed_share[rows] = tasks.view(-1, _AHEAD), share.view(-1, _AHEAD)
+        self._task_index[env_ids] = tasks.view(-1, _AHEAD)
+        self._elapsed_share[env_ids] = share.view(-1, _AHEAD)
         for part, qpos in zip(self._parts, self._qpos, strict=True):
             engine_row = part.engine_rows[many]
-            mine = engine_row >= 0
-            if mine.any():
-                start = part.starts(engine_row[mine], signed[mine], tasks[mine])
-                qpos[engine_row[mine], ahead[mine]] = start.to(qpos.dtype)
+            own = engine_row >= 0
+            if own.any():
+                start = part.starts(engine_row[own], signed[own], tasks[own])
+                qpos[engine_row[own], ahead[own]] = start.to(qpos.dtype)
 
-    def draw_all(self, number: Tensor, task_index: Tensor) -> None:
-        """Fills the bank of every row; ``number`` and ``task_index`` as in the next ``take``."""
+    def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
+        """Fill the bank of every environment in place, with shapes that depend on no number."""
         self._first.copy_(number)
-        rows = torch.arange(len(number), device=number.device)
-        # A fixed length keeps repeat_interleave from asking the device for it.
-        many = rows.repeat_interleave(_AHEAD, output_size=_AHEAD * len(rows))
-        ahead = torch.arange(_AHEAD, device=number.device).repeat(len(rows))
+        many, ahead = _repeated(torch.arange(len(number), device=number.device))
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
         self._task_index.copy_(tasks.view(-1, _AHEAD))
         self._elapsed_share.copy_(share.view(-1, _AHEAD))
 
         def place(part: Part, qpos: Tensor) -> None:
-            own, tasks_of = (part.group.take(x.unflatten(0, (-1, _AHEAD))).flatten(0, 1) for x in (signed, tasks))
-            qpos.copy_(part.starts(None, own, tasks_of).view(qpos.shape))
+            own = part.group.take(signed.unflatten(0, (-1, _AHEAD))).flatten(0, 1)
+            own_tasks = part.group.take(tasks.unflatten(0, (-1, _AHEAD))).flatten(0, 1)
+            qpos.copy_(part.starts(None, own, own_tasks).view(qpos.shape))
 
         self._together([partial(place, part, qpos) for part, qpos in zip(self._parts, self._qpos, strict=True)])
 
-    def _numbers(self, rows: Tensor, episode: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws in [-1, 1] (k, start_draws), task (k,) and elapsed share in [0, 1) (k,) of episodes of world rows."""
-        draws = uniform(self._keys[rows], episode, self._draws)
-        tasks = task_index[rows]
+    def _numbers(self, env_ids: Tensor, episode: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return draws in [-1, 1] (k, start_draws), task (k,) and elapsed share in [0, 1) (k,) of episodes (k,)."""
+        draws = uniform(self._keys[env_ids], episode, self._draws)
+        tasks = task_index[env_ids]
         if self._pool_size is not None:
-            tasks = (draws[:, _TASK_DRAW] * self._pool_size[rows]).long()
+            tasks = (draws[:, _TASK_DRAW] * self._pool_size[env_ids]).long()
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
+
+
+def _repeated(env_ids: Tensor) -> tuple[Tensor, Tensor]:
+    """Return each environment ``_AHEAD`` times, and the number of the episode ahead, (k _AHEAD,) each."""
+    # Without output_size repeat_interleave would ask the device for the length.
+    many = env_ids.repeat_interleave(_AHEAD, output_size=_AHEAD * len(env_ids))
+    return many, torch.arange(_AHEAD, device=env_ids.device).repeat(len(env_ids))

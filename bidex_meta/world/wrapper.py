@@ -139,7 +139,7 @@ class NumpyWorld(VectorEnv):
     def render(self) -> tuple[np.ndarray, ...]:
         """A picture of each environment, (height, width, 3), uint8."""
         world: Any = self.world
-        return tuple(world.render(row=row) for row in range(self.num_envs))
+        return tuple(world.render(env_id=row) for row in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the world."""

@@ -35,7 +35,7 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 
 @dataclass(frozen=True)
-class WorldConfig:
+class WorldsConfig:
     """Which worlds (one of ``suite`` and ``task``; ``base`` and ``object`` are of a single class) and how they run."""
 
     suite: str | None = None
@@ -51,11 +51,13 @@ class WorldConfig:
     randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
-    def of(config: "Json | WorldConfig") -> "WorldConfig":
+    def of(config: "Json | WorldsConfig") -> "WorldsConfig":
         """The entries of a run's config that are of worlds; others are left out."""
-        if isinstance(config, WorldConfig):
+        if isinstance(config, WorldsConfig):
             return config
-        return WorldConfig(**{field.name: config[field.name] for field in fields(WorldConfig) if field.name in config})
+        return WorldsConfig(
+            **{field.name: config[field.name] for field in fields(WorldsConfig) if field.name in config}
+        )
 
 
 Identity = dict[str, str | int | None]
@@ -74,7 +76,7 @@ class Worlds(ABC):
     """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
     default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         self.name, self.config = name, config
         self.seed = config.seed if config.task_seed is None else config.task_seed
         self.device, self.threads, self.engine = config.device, config.threads, config.engine
@@ -82,11 +84,11 @@ class Worlds(ABC):
         self.randomisation = None if config.randomisation is None else load_randomisation(config.randomisation)
 
     @staticmethod
-    def open(config: Json | WorldConfig) -> "Worlds":
+    def open(config: Json | WorldsConfig) -> "Worlds":
         """Those of a config's ``suite``, or its class ``task``, in any case; BidexError for unknown or faulty ones."""
         from bidex_meta.worlds import external, own
 
-        config = WorldConfig.of(config)
+        config = WorldsConfig.of(config)
         if config.suite is None:
             task = config.task or ""
             if task.casefold() == external.HUMANOID.casefold():

@@ -8,7 +8,7 @@ from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import metaworld_classes
 from bidex_meta.utils.memory import check_memory
-from bidex_meta.worlds.base import Identity, WorldConfig, Worlds
+from bidex_meta.worlds.base import Identity, Worlds, WorldsConfig
 
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import Agent, PooledWorld, TaskClass
@@ -27,7 +27,7 @@ class Foreign(Worlds):
     on_gpu = False
     bytes_per_environment: int
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         if self.randomisation is not None:
             raise BidexError(f"Worlds of our own are randomised, got {name}. Leave --randomisation out.")
@@ -61,7 +61,7 @@ class MetaWorldSuite(Foreign):
     default_episodes = 1  # its tasks fix their start, so that a policy would only repeat itself
     bytes_per_environment = 10_000_000
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         self.class_names = metaworld_classes(name)
         if self.points:
@@ -97,7 +97,7 @@ class HumanoidTask(Foreign):
     class_name = HUMANOID
     bytes_per_environment = 2_000_000
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         given = {"points": config.points or None, "object": config.object, "base": config.base.replace("own", "")}
         for flag, value in given.items():

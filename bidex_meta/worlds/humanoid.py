@@ -130,7 +130,6 @@ class HumanoidWorld(ForeignWorld):
 
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another size."""
-        state = self._upgraded(state)
         fits(state, self.state_dict())
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         self._restore(state)

@@ -8,7 +8,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.suite import V1, V2, Rules, Split, Suite, load_suite, plain_name
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.worlds.base import V2_PRESET, Identity, WorldConfig, Worlds, physics_of
+from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig, physics_of
 
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import PooledWorld, TaskClass
@@ -21,7 +21,7 @@ class OwnSuite(Worlds):
 
     suite: Suite
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         suite = load_suite(name)
         self.suite = replace(suite, points=self.points) if self.points else suite
@@ -75,7 +75,7 @@ class SingleClass(Worlds):
 
     class_name: str
 
-    def __init__(self, name: str, config: WorldConfig) -> None:
+    def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         self.moving_base = {"own": None, "moving": True, "fixed": False}[config.base]
         self.class_name, self.object = name, config.object

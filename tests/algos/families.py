@@ -55,7 +55,7 @@ class PointGoals(FakePools):
 
     def _seed_rows(self, seed: int) -> None:
         super()._seed_rows(seed)
-        pairs = zip(self.task_names, self.slot_rows, strict=True)
+        pairs = zip(self.task_names, self.slot_env_ids, strict=True)
         self._keys = torch.cat([row_keys(seed, name, r.stop - r.start, self.device) for name, r in pairs])
 
     def _start(self, mask: Tensor) -> None:

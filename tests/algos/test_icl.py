@@ -25,18 +25,20 @@ TEN = (PointClass(steps=10, count=16),)
 class Knowing:
     """Goes to the goals of a world that hides them; reads nothing but what ``Teachers`` show."""
 
-    columns, variations = torch.tensor([2, 3]), {"PointGoals": [0, 1], "Short": [0, 1], "Long": [0, 1]}
+    hidden_size = 2
+    hidden_columns = {"PointGoals": [0, 1], "Short": [0, 1], "Long": [0, 1]}  # noqa: RUF012
 
     def __init__(self, world: PointGoals):
         self.world = world
 
-    def entries(self) -> Tensor:
+    def hidden_values(self) -> Tensor:
         return self.world.goal.float()
 
-    values = entries
+    def with_goals(self, obs: Tensor) -> Tensor:
+        return obs.index_add(1, torch.tensor([2, 3]), self.hidden_values())
 
-    def rewards(self, values: Tensor) -> Tensor:
-        return -(self.world.position - values).norm(dim=-1)
+    def rewards_if(self, goals: Tensor) -> Tensor:
+        return -(self.world.position - goals).norm(dim=-1)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         return self.world.best(obs)
@@ -49,7 +51,7 @@ def taught(world: PointGoals, config: ICLConfig = SMALL, rows: Tensor | None = N
     learner = ICL(world, config, seed=0)
     knowing: Any = Knowing(world)
     rows = torch.arange(world.num_envs) if rows is None else rows
-    learner.learn_from_teachers(Teachers(world, [Tutor(knowing, rows, 4)], hidden=knowing))
+    learner.learn_from_teachers(Teachers(world, [Tutor(knowing, rows, 4)], privileged=knowing))
     return learner
 
 

@@ -121,7 +121,7 @@ def test_classes_with_more_tasks_than_rows_take_them_by_turns():
     for _ in range(5):
         learner.iterate()
         goals.append(world.goal.clone())
-    few, many = (torch.stack(goals)[:, rows].reshape(-1, 2) for rows in world.slot_rows)
+    few, many = (torch.stack(goals)[:, rows].reshape(-1, 2) for rows in world.slot_env_ids)
     assert torch.unique(many, dim=0, return_counts=True)[1].tolist() == [3] * 5
     assert torch.equal(few[:3], few[3:6])
 

@@ -42,7 +42,7 @@ class ToyWorld(FakeWorld):
 
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Rows of one task are contiguous, so concatenation keeps their order.
-        reward = torch.cat([f(action[rows]) for f, rows in zip(self.rewards, self.slot_rows, strict=True)])
+        reward = torch.cat([f(action[rows]) for f, rows in zip(self.rewards, self.slot_env_ids, strict=True)])
         over = self.episodes.elapsed + 1 >= self.max_episode_steps
         return reward, reward > 0.9, over & self.terminal
 

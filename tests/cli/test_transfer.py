@@ -33,7 +33,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
-from bidex_meta.worlds import WorldConfig, Worlds
+from bidex_meta.worlds import Worlds, WorldsConfig
 from tests.data.worlds import ABOUT
 from tests.fakes import run_config
 
@@ -59,7 +59,7 @@ classes = [
 
 
 def opened(suite: str | Path, seed: int = 0) -> Any:
-    return Worlds.open(WorldConfig(suite=str(suite), seed=seed, threads=1))
+    return Worlds.open(WorldsConfig(suite=str(suite), seed=seed, threads=1))
 
 
 @pytest.fixture

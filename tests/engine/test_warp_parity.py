@@ -20,7 +20,7 @@ from bidex_meta.engine.warp import WarpEngine
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.part import Part
 from tests.tasks.worlds import slot
 
@@ -128,7 +128,9 @@ class Pair:
 
 def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
     """Both engines at the same fresh starts of the classes' tasks; the Warp engine on the given device."""
-    world = World([slot(registry.get(name, True)) for name in names], rows, autoreset_mode="DISABLED", threads=1)
+    world = World(
+        [slot(registry.get(name, True)) for name in names], WorldConfig(rows, autoreset_mode="DISABLED", threads=1)
+    )
     world.reset(seed=0)
     (part,) = world.parts
     models = list({id(m.scene.model): m.scene.model for m in part.group.members}.values())

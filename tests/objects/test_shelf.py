@@ -11,7 +11,7 @@ from bidex_meta.cli import main
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.objects.held import held_object, shelf
 from bidex_meta.tasks.scene import compile_scene
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.tasks.worlds import Lens, depths, engine_of, scene_of, slot
 
 ROWS = 48
@@ -30,7 +30,7 @@ LONG = {"banana": (190, 66), "mug": (None, 118), "pen": (216, 42.36), "block": (
 def world_with(name: str, thing: str, rows: int, moving: bool | None = True) -> World:
     """Environments of a class with an object, each with a task of its own; they wait for resets."""
     slots = [slot(registry.get(name, moving, object=thing), min(rows, 16))]
-    return World(slots, rows, autoreset_mode="DISABLED", threads=1)
+    return World(slots, WorldConfig(rows, autoreset_mode="DISABLED", threads=1))
 
 
 def test_the_command_lists_it(capsys: pytest.CaptureFixture[str]) -> None:

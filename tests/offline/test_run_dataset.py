@@ -19,7 +19,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments.run_data import implied
 from bidex_meta.runs import RunFolder
 from bidex_meta.witness.replay import task_slot
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup
 from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.own import OwnSuite
@@ -159,8 +159,8 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
 def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) -> None:
     slot = task_slot("Switch")
     given: dict[str, Any] = {"autoreset_mode": "DISABLED", "seed": 3, "threads": 1}
-    plain = World([slot], 1, observation="plain", **given)
-    masked = World([slot], 1, observation="masked", pad_to=450, **given)
+    plain = World([slot], WorldConfig(1, observation="plain", **given))
+    masked = World([slot], WorldConfig(1, observation="masked", pad_to=450, **given))
     episodes: list[Any] = []
     recorder = EpisodeCollector(plain, episodes.append)
     seen, action = [masked.reset(seed=3)[0]], torch.full((1, 52), 0.1)
@@ -180,7 +180,9 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
 def test_data_of_a_class_of_version_2_are_known_in_suites_of_it_alone(tmp_path: Path) -> None:
     alone = task_slot("Switch-v2")
     of_suite, of_version_1 = replace(alone, name="Switch"), task_slot("Switch")
-    made = [World([slot], 1, autoreset_mode="DISABLED", threads=1) for slot in (alone, of_suite, of_version_1)]
+    made = [
+        World([slot], WorldConfig(1, autoreset_mode="DISABLED", threads=1)) for slot in (alone, of_suite, of_version_1)
+    ]
     episodes: list[Any] = []
     recorder = EpisodeCollector(made[0], episodes.append)
     recorder.reset(seed=3)

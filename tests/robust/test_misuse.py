@@ -41,8 +41,7 @@ from bidex_meta.tasks.layout import Block, Layout, goal_blocks, object_blocks
 from bidex_meta.tasks.placement import placed
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.variation import VariationSpace, box, component, join, orientation
-from bidex_meta.world import PointsRule, Slot, World
-from bidex_meta.world.hidden_parts import HiddenParts
+from bidex_meta.world import PointsRule, Slot, World, WorldConfig
 from bidex_meta.world.wrapper import NumpyWorld, PooledWorldWrapper, WorldWrapper
 from tests.fakes import run_config
 from tests.points import Finder
@@ -148,12 +147,13 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "observation_noise": (0.0, "zero one half"),
         "push_interval": (1.0, "one half"), "draw": ("episode", ""),
     }),
-    "World": lambda s: (made(World), {
+    "World": lambda s: (made(lambda slots, **a: World(slots, WorldConfig(**a))), {
         "slots": ([s.slot], ""), "num_envs": (ROWS, "one -None"), "observation": ("plain", ""),
         "pad_to": (None, "None"),
         "task_sampling": ("fixed", ""), "points": (None, "None"),
     }),
-    "Slot": lambda s: (made(lambda **a: World([Slot(**a)], 1, threads=1)), {
+    "config": lambda s: (made(lambda config: World([s.slot], config)), {"config": (WorldConfig(1, threads=1), "None")}),
+    "Slot": lambda s: (made(lambda **a: World([Slot(**a)], WorldConfig(1, threads=1))), {
         "name": ("HandOver", "word"), "task_class": (s.slot.task_class, ""), "tasks": (s.pool, ""),
         "reward_scale": (1.0, "one half"), "gamma": (None, "None zero"),
     }),
@@ -167,16 +167,13 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "pool": lambda s: (lambda pool: s.world.set_tasks({"HandOver": pool}), {"pool": (s.pool, "")}),
     "load_state_dict": lambda s: (s.training.load_state_dict, {"state": (s.training.state_dict(), "")}),
     "render": lambda s: (s.world.render, {
-        "row": (0, "zero one"), "width": (16, "-one"), "height": (16, "-one"), "camera": ("front", "None"),
+        "env_id": (0, "zero one"), "width": (16, "-one"), "height": (16, "-one"), "camera": ("front", "None"),
     }),
     "to_numpy": lambda s: (s.training.to_numpy, {"stagger": (False, "true")}),
     "get_attr": lambda s: (s.world.get_attr, {"name": ("num_envs", "")}),
     "call": lambda s: (s.world.call, {"name": ("num_envs", "")}),
     "set_attr": lambda s: (s.world.set_attr, {"name": ("mark", "word"), "values": (1, " ".join(HOSTILE))}),
-    "HiddenParts": lambda s: (HiddenParts, {"world": (s.masked, "")}),
-    "HiddenParts.rewards": lambda s: (HiddenParts(s.masked).rewards, {
-        "values": (torch.zeros(ROWS, s.masked.hidden_size), ""),
-    }),
+    "rewards_if": lambda s: (s.masked.rewards_if, {"goals": (torch.zeros(ROWS, s.masked.hidden_size), "")}),
     "NumpyWorld": lambda s: (NumpyWorld, {"world": (s.training, ""), "stagger": (False, "true")}),
     "NumpyWorld.step": lambda s: (s.numpy.step, {"actions": (s.actions.numpy(), "")}),
     "NumpyWorld.reset": lambda s: (s.numpy.reset, {"seed": (0, SEED + " None"), "options": (None, "None dict")}),

@@ -36,7 +36,7 @@ def test_every_class_of_a_mixed_world_has_its_own_scales() -> None:
         engine = part.group.engine
         for member in part.group.members:
             rows = member.engine_rows
-            played = action[member.world_rows].double().numpy()
+            played = action[member.env_ids].double().numpy()
             ctrl, wrench = engine.ctrl[rows].numpy(), engine.xfrc_applied[rows].numpy()
             check_controls(member.scene.task.name, ctrl, wrench, played, member.scene.model)
     covered = [member.scene.task.name for part in world.parts for member in part.group.members]

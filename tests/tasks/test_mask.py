@@ -112,7 +112,7 @@ def test_the_mask_in_a_mixed_world() -> None:
     for seen, zeroed, named in zip(plain, masked, told, strict=True):
         assert torch.equal(named[:, :450], seen)
         assert torch.equal(named[:, 450:], torch.eye(world.num_tasks).repeat_interleave(2, dim=0))
-        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
+        for slot, rows in zip(world.slots, world.slot_env_ids, strict=True):
             layout = slot.task_class.layout
             wanted = seen[rows].clone()
             wanted[:, layout.goal_indices()] = 0.0

@@ -10,7 +10,7 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.bucket import PourWater
 from bidex_meta.tasks.scene import Scene
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.hands import figures
 from tests.tasks import worlds
 from tests.tasks.formulas import FORMULAS
@@ -24,7 +24,7 @@ STANDING = [name for name in PLACES if name not in THROWN and name != "BottleCap
 
 def alone(task: TaskClass, rows: int) -> World:
     """A world at the starts of its first episodes, the hands far away."""
-    world = World([worlds.slot(task, rows)], rows, autoreset_mode="DISABLED", threads=1)
+    world = World([worlds.slot(task, rows)], WorldConfig(rows, autoreset_mode="DISABLED", threads=1))
     world.reset(seed=0)
     start = worlds.engine_of(world).placement()
     worlds.send_hands_away(worlds.scene_of(world), start)

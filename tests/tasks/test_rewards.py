@@ -107,7 +107,7 @@ def test_rewards_of_a_mixed_world() -> None:
     for part in world.parts:
         for member in part.group.members:
             name, lens = member.scene.task.name, Lens(member.scene.model)
-            rows = range(member.world_rows.start, member.world_rows.stop)
+            rows = range(member.env_ids.start, member.env_ids.stop)
             for row, at in zip(rows, range(member.engine_rows.start, member.engine_rows.stop), strict=True):
                 data = lens.look(part.group.engine.placement()[at])
                 told = FORMULAS[name].judge(data, task_of(world, row))

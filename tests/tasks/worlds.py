@@ -13,7 +13,7 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
-from bidex_meta.world import Slot, World
+from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.world.part import base_rotations
 from tests.tasks.oracle import Task
 from tests.tasks.tables import TABLES
@@ -38,12 +38,14 @@ def world_of(
 ) -> World:
     """A world of one class; rows keep their tasks and wait for resets."""
     slots = [slot(registry.get(name, moving), tasks, reward_scale)]
-    return World(slots, num, **({"autoreset_mode": "DISABLED", "threads": 1} | options))
+    return World(slots, WorldConfig(num, **({"autoreset_mode": "DISABLED", "threads": 1} | options)))
 
 
 def mixed_world(rows_a_class: int, **options: Any) -> World:
     slots = [slot(registry.get(name, True)) for name in MOVING]
-    return World(slots, rows_a_class * len(slots), **({"autoreset_mode": "DISABLED", "threads": 1} | options))
+    return World(
+        slots, WorldConfig(rows_a_class * len(slots), **({"autoreset_mode": "DISABLED", "threads": 1} | options))
+    )
 
 
 def engine_of(world: World) -> CpuEngine:

@@ -42,7 +42,7 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
 
         def close(self) -> None: ...
 
-        def render(self, row: int, width: int, height: int, camera: str) -> np.ndarray:
+        def render(self, env_id: int, width: int, height: int, camera: str) -> np.ndarray:
             drawn.append(camera)
             return np.zeros((height, width, 3), np.uint8)
 

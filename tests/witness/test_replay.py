@@ -13,7 +13,7 @@ from bidex_meta.utils import paths
 from bidex_meta.witness.demonstrators import OpenLoopReplay
 from bidex_meta.witness.replay import SHIFT, Replay, Simulator, replay, task_slot
 from bidex_meta.witness.store import Witness, load_witness, quantised, save_witness, witness_path
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 
@@ -27,7 +27,7 @@ def test_the_simulator_plays_what_the_world_plays(name: str) -> None:
     actions = random_actions(40)
     simulator = Simulator(name, 2, threads=1)
     trace = simulator.play(actions[:, None].expand(-1, 2, -1))
-    world = World([task_slot(name)], 1, autoreset_mode="DISABLED", seed=0, threads=1)
+    world = World([task_slot(name)], WorldConfig(1, autoreset_mode="DISABLED", seed=0, threads=1))
     world.reset(seed=0)
     rewards, least, success, ended = [], [], [], False
     for action in actions:

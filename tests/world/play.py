@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidex_meta import Benchmark
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 
 THROWN = ["HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm", "CatchAbreast"]
 """The classes that end early, when something is dropped."""
@@ -82,15 +82,15 @@ def engine_place(world: World, row: int) -> tuple[Any, int]:
 
 def world_at(world: World, mode: str = "DISABLED") -> World:
     """A new world of the same slots whose rows start the very episodes that ``world``'s rows are in, not staggered."""
-    new = World(
-        world.slots,
-        world.num_envs,
+    config = WorldConfig(
+        num_envs=world.num_envs,
         seed=world.seed,
         autoreset_mode=mode,
         observation="one-hot" if world.num_id_columns else "plain",
         pad_to=world.observation_size - world.num_id_columns,
-        task_sampling="uniform" if world._uniform_tasks else "fixed",
+        task_sampling=world._config.task_sampling,
         threads=1,
     )
+    new = World(world.slots, config)
     new.episodes.number = world.episodes.number - 1
     return new

@@ -14,7 +14,7 @@ from torch import Tensor
 from bidex_meta.evaluation.play import ZeroAgent, play_tasks
 from bidex_meta.evaluation.results import results_by_class
 from tests.tasks.worlds import engine_of, world_of
-from tests.world.play import assert_same, flat, play, random_actions
+from tests.world.play import assert_same, play, random_actions
 
 ROWS, STEPS, LIMIT, HELD = 3, 45, 21, 15
 SCRIPTS = st.lists(st.lists(st.integers(0, 24), min_size=1, max_size=12), min_size=ROWS, max_size=ROWS)
@@ -109,14 +109,3 @@ def test_a_checkpoint_within_a_held_stretch_continues_bit_for_bit() -> None:
     rest = play(world, actions[9:])
     assert_same(rest, play(other, actions[9:]))
     assert rest[5]["info/success"].tolist() == [True, False, True]
-
-
-def test_a_state_of_version_0_2_loads() -> None:
-    world, other = (copy.deepcopy(WORLDS["SAME_STEP"]) for _ in range(2))
-    world.reset(seed=4)
-    play(world, random_actions(world, 9))
-    state = world.state_dict()
-    assert not state["episodes"].pop("held").any()
-    other.load_state_dict(state)
-    action = random_actions(world, 1)[0]
-    assert_same([flat(world.step(action))], [flat(other.step(action))])

@@ -13,7 +13,7 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import Randomisation, load_suite
 from bidex_meta.utils import paths
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.worlds.humanoid import HumanoidWorld
 from tests.world.play import engine_state, flat, suite_world
 
@@ -83,11 +83,11 @@ def test_the_world_keeps_no_array_of_the_callers() -> None:
     mine.pools[0][:] = NAN
     assert torch.equal(mine.reset(seed=0)[0], made.reset(seed=0)[0])
     slots = mine.slots
-    built = World(slots, ROWS, seed=0, autoreset_mode="DISABLED", threads=1)
+    built = World(slots, WorldConfig(ROWS, seed=0, autoreset_mode="DISABLED", threads=1))
     expected = built.reset(seed=1)[0]
     slots[0].tasks[:] = NAN
     assert torch.equal(built.reset(seed=1)[0], expected)
-    assert "numbers within" in refused(World, slots, ROWS, threads=1)
+    assert "numbers within" in refused(World, slots, WorldConfig(ROWS, threads=1))
 
 
 ACTIONS: tuple[Any, ...] = (
@@ -265,9 +265,17 @@ def test_states_of_worlds_of_others() -> None:
     ids=str
 )  # fmt: skip
 def test_worlds(world: World, options: dict[str, Any]) -> None:
-    refused(World, world.slots, **({"num_envs": ROWS, "threads": 1} | options))
+    given = {"num_envs": ROWS, "threads": 1} | options
+    refused(lambda: World(world.slots, WorldConfig(**given)))
 
 
 def test_pictures(world: World) -> None:
-    for name, value in (("width", 0), ("height", 1.5), ("row", -1), ("row", 4), ("row", 10**5000), ("camera", ["top"])):
+    for name, value in (
+        ("width", 0),
+        ("height", 1.5),
+        ("env_id", -1),
+        ("env_id", 4),
+        ("env_id", 10**5000),
+        ("camera", ["top"]),
+    ):
         assert name in refused(world.render, **{name: value})

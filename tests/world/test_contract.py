@@ -2,7 +2,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.world.play import play, random_actions, suite_world
 
 ROWS = 10
@@ -41,7 +41,7 @@ def test_modes_in_any_spelling(world: World) -> None:
     }
     for name, modes in spellings.items():
         for mode in (*modes, AutoresetMode[name]):
-            made = World(world.slots, 4, autoreset_mode=mode, threads=1)
+            made = World(world.slots, WorldConfig(4, autoreset_mode=mode, threads=1))
             assert made.metadata["autoreset_mode"] is AutoresetMode[name]
     with pytest.raises(BidexError, match="DISABLED, NEXT_STEP, SAME_STEP"):
-        World(world.slots, 4, autoreset_mode="LAST_STEP")
+        World(world.slots, WorldConfig(4, autoreset_mode="LAST_STEP"))

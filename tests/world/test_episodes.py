@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from bidex_meta.metaworld.batched import MetaWorldWorld
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.points import PointWorld, ring
 from tests.world.play import ENDS, random_actions, suite_world
 
@@ -61,7 +61,7 @@ MADE: dict[str, Callable[[], Any]] = {
     "SAME_STEP": lambda: suite_world("MT4", 8),
     "DISABLED": lambda: suite_world("MT4", 8, "DISABLED"),
     "Meta-World": lambda: MetaWorldWorld("metaworld/MT3", 3),
-    "warp": lambda: World(suite_world("MT4", 8).slots[:1], 3, engine="warp", threads=1),
+    "warp": lambda: World(suite_world("MT4", 8).slots[:1], WorldConfig(3, engine="warp", threads=1)),
 }
 
 
@@ -93,7 +93,7 @@ def test_they_repeat_the_contracts_keys(kind: str) -> None:
 
 def test_without_stagger_first_episodes_are_whole() -> None:
     world = suite_world("MT4", 8)
-    whole = World(world.slots, 8, stagger=False, threads=1)
+    whole = World(world.slots, WorldConfig(8, stagger=False, threads=1))
     world.stagger = False
     staggered, _ = suite_world("MT4", 8).reset(seed=0)
     assert torch.equal(world.reset(seed=0)[0], staggered), "staggering leaves the start itself alone"

@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves
 from bidex_meta import Benchmark
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from bidex_meta.world.graphs import GraphCache, SideBySide, fresh
+from bidex_meta.world.graphs import CapturedStepper, EagerStepper, SideBySide, fresh
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 from tests.world.test_masked import MaskedEngine, at_work
 
@@ -61,12 +61,12 @@ class StillEngine(MaskedEngine):
 
 
 def taped(
-    recorder: list[GraphCache], count: list[int]
+    recorder: list[CapturedStepper], count: list[int]
 ) -> Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]:
     """Records as CUDA does: the work is written down and not done."""
 
     def record(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
-        state = recorder[0]._state
+        state = recorder[0]._graphs._state
         before = fresh(state)
         with Tape() as tape:
             result = work()
@@ -85,10 +85,10 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], t
             maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
             patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
             made = suite_world(suite, rows)
-        holder: list[GraphCache] = []
+        holder: list[CapturedStepper] = []
         count: list[int] = []
-        made._graphs = GraphCache(made._state, made._put_state, taped(holder, count))
-        holder.append(made._graphs)
+        made._stepper = CapturedStepper(made._state, made._put_state, taped(holder, count))
+        holder.append(made._stepper)
         return made, count
 
     yield make
@@ -164,7 +164,7 @@ def test_nothing_of_the_caller_stands_between_jobs_side_by_side(monkeypatch: pyt
 def test_graphs_on_cuda_are_plain_steps() -> None:
     """Nearly everywhere: sums are made in any order there, and what touches something grows apart from then on."""
     plain, graphs = (Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0") for _ in range(2))
-    plain._graphs = None
+    plain._stepper = EagerStepper()
     actions = random_actions(plain, 12)
     for one in (plain, graphs):
         one.reset(seed=0)
@@ -173,4 +173,4 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
         for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/running/l"):
             apart = (x[name].float() - y[name].float()).abs().flatten()
             assert apart.quantile(0.95) < 1e-2, name
-    assert graphs._graphs is not None and len(graphs._graphs._recorded) == 4
+    assert isinstance(graphs._stepper, CapturedStepper) and len(graphs._stepper._graphs._recorded) == 4

@@ -9,7 +9,7 @@ from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.surfaces import FIXTURE, OBJECT, body_kinds, sample
@@ -54,10 +54,8 @@ def banish(world: World, shift: float) -> None:
 
 
 def observed(world: World) -> Tensor:
-    rows = torch.arange(world.num_envs)
-    for part in world.parts:
-        world._refresh([part], [torch.arange(part.group.engine.num)])
-    return world._obs[rows].clone()
+    world._refresh(torch.ones(world.num_envs, dtype=torch.bool))
+    return world._obs.clone()
 
 
 @pytest.mark.parametrize("name", registry.names())
@@ -93,7 +91,10 @@ def test_hands_goal_and_task_id_stay() -> None:
 
 def _mt4(points: PointsRule | None, rows: int = 8) -> World:
     suite = Benchmark("MT4")
-    return World(suite._slots("train"), rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1)
+    return World(
+        suite._slots("train"),
+        WorldConfig(rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1),
+    )
 
 
 def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_gives() -> None:
@@ -101,10 +102,8 @@ def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_give
     world.reset(seed=0)
     obs, *_ = world.step(torch.zeros(8, 52))
     assert torch.equal(observed(world)[:, group(world, "points").where[0]], obs[:, group(world, "points").where[0]])
-    part = world.parts[0]
-    last = torch.tensor([part.group.engine.num - 1])
     before = world._obs.clone()
-    world._refresh([part], [last])
+    world._refresh(torch.arange(8) == int(world.parts[0].group.rows[-1]))
     assert torch.equal(world._obs, before)
 
 

@@ -1,6 +1,6 @@
 import torch
 
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.world.play import class_world, flat, play, random_actions, suite_world, world_at
 
 ROWS = 12
@@ -43,7 +43,7 @@ def test_episode_statistics_are_those_of_a_count_by_hand() -> None:
 def test_step_is_that_of_an_evaluation_world_in_the_same_state() -> None:
     """From equal states both modes make the same transition; what follows an end differs."""
     world = suite_world("MT4", ROWS)
-    twin = World(world.slots, ROWS, autoreset_mode="DISABLED", observation="one-hot", threads=1)
+    twin = World(world.slots, WorldConfig(ROWS, autoreset_mode="DISABLED", observation="one-hot", threads=1))
     world.reset(seed=0)
     ends = 0
     for action in random_actions(world, 80):

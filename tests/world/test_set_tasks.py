@@ -16,7 +16,7 @@ def shown_goals(world: World, obs: torch.Tensor, slot: int) -> torch.Tensor:
     layout = world.slots[slot].task_class.layout
     goal = next(block.name for block, _ in layout if block.goal)
     start = layout.range(goal).start
-    return obs[world.slot_rows[slot], start : start + 3]
+    return obs[world.slot_env_ids[slot], start : start + 3]
 
 
 def test_rows_play_the_given_tasks() -> None:
@@ -30,7 +30,7 @@ def test_rows_play_the_given_tasks() -> None:
     for _ in range(2):
         for name, given in tasks.items():
             slot = world.task_names.index(name)
-            expected = torch.as_tensor(given)[world.task_index[world.slot_rows[slot]], :3].float()
+            expected = torch.as_tensor(given)[world.task_index[world.slot_env_ids[slot]], :3].float()
             assert torch.equal(shown_goals(world, obs, slot), expected)
         assert torch.equal(shown_goals(world, obs, 1), shown_goals(world, before, 1))
         obs = world.step(torch.zeros(16, 52))[0]

@@ -20,7 +20,7 @@ def test_widths_one_hots_and_padding(suite: str, split: str, classes: int, width
         if suite.startswith("MT"):
             assert torch.equal(values[:, -classes:], torch.eye(classes)[world.task_id])
         padded = width - world.num_id_columns
-        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
+        for slot, rows in zip(world.slots, world.slot_env_ids, strict=True):
             assert (values[rows, slot.task_class.observation_size : padded] == 0).all()
         assert values.isfinite().all() and values[:, :398].abs().sum(dim=1).min() > 1
     assert (steps[-1]["obs"] != obs).any(dim=1).all()
@@ -50,7 +50,7 @@ def test_a_class_in_a_suite_moves_as_on_its_own() -> None:
     suite.reset(seed=0)
     actions = random_actions(suite, 40)
     played = play(suite, actions)
-    for slot, rows in enumerate(suite.slot_rows):
+    for slot, rows in enumerate(suite.slot_env_ids):
         name = suite.task_names[slot]
         alone = class_world(name, 3, moving_base=True)
         alone.reset(seed=0)

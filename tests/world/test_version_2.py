@@ -10,9 +10,8 @@ from bidex_meta import make_task_world
 from bidex_meta.data.checking import verify
 from bidex_meta.evaluation.references import references_of
 from bidex_meta.tasks import registry
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.agent_views import agent_views
-from bidex_meta.world.hidden_parts import HiddenParts
 from tests.data.test_commands import recorded
 from tests.tasks.worlds import slot
 from tests.world.play import flat, suite_world
@@ -20,7 +19,10 @@ from tests.world.play import flat, suite_world
 
 @pytest.mark.xdist_group("warp")
 def test_the_warp_engine_agrees_with_c() -> None:
-    worlds = [World([slot(registry.get("BottleCap-v2"))], 2, engine=engine, threads=1) for engine in ("c", "warp")]
+    worlds = [
+        World([slot(registry.get("BottleCap-v2"))], WorldConfig(2, engine=engine, threads=1))
+        for engine in ("c", "warp")
+    ]
     action = torch.rand(2, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
     torch.testing.assert_close(*(world.reset(seed=0)[0] for world in worlds), rtol=0, atol=1e-5)
     ours, theirs = (flat(world.step(action)) for world in worlds)
@@ -55,32 +57,31 @@ def test_recorded_rewards_are_computed_again_by_the_right_formula(of: dict[str, 
 def test_a_world_knows_what_its_observations_hide() -> None:
     classes = [slot(registry.get(name)) for name in ("PushBlock-v2", "BottleCap-v2")]
     shows, hides = (
-        World(classes, 4, observation=rule, autoreset_mode="DISABLED", threads=1) for rule in ("plain", "masked")
+        World(classes, WorldConfig(4, observation=rule, autoreset_mode="DISABLED", threads=1))
+        for rule in ("plain", "masked")
     )
     action = torch.rand(4, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
     for world in (shows, hides):
         world.reset(seed=0)
     (seen, *_), (masked, *_) = shows.step(action), hides.step(action)
-    parts = HiddenParts(hides)
     assert not torch.equal(seen, masked) and shows.hidden_size == 0
-    torch.testing.assert_close(masked.index_add(1, parts.columns, parts.entries()), seen, rtol=0, atol=1e-6)
-    values = parts.values()
+    torch.testing.assert_close(hides.with_goals(masked), seen, rtol=0, atol=1e-6)
+    values = hides.hidden_values()
     assert values.shape == (4, 4) and values.abs().max() <= 1.0 and not values[2:, 1:].any() and values[:, 0].all()
 
 
 def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
     classes = [slot(registry.get(name)) for name in ("PushBlock-v2", "BottleCap-v2")]
-    one = World(classes, 4, observation="masked", autoreset_mode="DISABLED", threads=1)
+    one = World(classes, WorldConfig(4, observation="masked", autoreset_mode="DISABLED", threads=1))
     action = torch.rand(4, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    parts = HiddenParts(one)
     one.reset(seed=0)
-    mirrored, own = -parts.values(), one.step(action)[1]
-    again, earned = parts.rewards(torch.stack([parts.values(), mirrored]))
+    mirrored, own = -one.hidden_values(), one.step(action)[1]
+    again, earned = one.rewards_if(torch.stack([one.hidden_values(), mirrored]))
     torch.testing.assert_close(again, own, rtol=0, atol=1e-5)
-    assert torch.equal(parts.rewards(mirrored), earned)
+    assert torch.equal(one.rewards_if(mirrored), earned)
     pools = {}
     for each in one.slots:
-        space, columns = each.task_class.variation_space, parts.variations[each.name]
+        space, columns = each.task_class.variation_space, one.hidden_columns[each.name]
         pools[each.name] = each.tasks.copy()
         pools[each.name][:, columns] = np.add(space.low, space.high)[columns] - each.tasks[:, columns]
     one.set_tasks(pools)

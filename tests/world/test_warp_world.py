@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta import Benchmark
-from bidex_meta.world import World
+from bidex_meta.world import World, WorldConfig
 from tests.world.play import flat, play, random_actions
 from tests.world.test_masked import assert_steps_look_at_nothing
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
 def make(engine: str) -> World:
     slots = [slot for slot in Benchmark("MT20").make_world(num_envs=20, device="cpu").slots if slot.name in CLASSES]
-    return World(slots, ROWS, engine=engine, observation="one-hot", task_sampling="uniform", threads=1)
+    return World(slots, WorldConfig(ROWS, engine=engine, observation="one-hot", task_sampling="uniform", threads=1))
 
 
 @pytest.fixture(scope="module")

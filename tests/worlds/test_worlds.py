@@ -8,7 +8,7 @@ import pytest
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.utils import paths
-from bidex_meta.worlds import WorldConfig, Worlds
+from bidex_meta.worlds import Worlds, WorldsConfig
 
 CORE = Path(paths.__file__).parents[1]
 
@@ -128,7 +128,7 @@ def test_a_world_that_cannot_be_is_refused(config: dict[str, object], split: str
 
 
 def test_a_config_is_taken_as_it_is_or_from_a_run() -> None:
-    config = WorldConfig(task="HandOver", seed=1, task_seed=5)
+    config = WorldsConfig(task="HandOver", seed=1, task_seed=5)
     of_run = {"task": "HandOver", "suite": None, "algo": "ppo", "seed": 1, "task_seed": 5}
-    assert WorldConfig.of(of_run) == config == Worlds.open(config).config
+    assert WorldsConfig.of(of_run) == config == Worlds.open(config).config
     assert Worlds.open(of_run).seed == 5

@@ -34,7 +34,6 @@ class Stepper:
             Time step (seconds) and substeps of each engine batch; empty where the code keeps them elsewhere.
         """
         from bidex_meta import Benchmark
-        from bidex_meta.world import World
 
         if self._world is not None:
             self._world.close()
@@ -42,7 +41,7 @@ class Stepper:
         if task is None:
             self._world = benchmark.make_world("train", device="cpu", num_envs=num_envs, threads=threads)
         else:
-            self._world = World([_slot(benchmark, task)], num_envs, seed=seed, threads=threads)
+            self._world = _world_of([_slot(benchmark, task)], num_envs, seed=seed, threads=threads)
         self._world.reset(seed=seed)
         try:
             parts = [(part.group.members[0].scene.model, part.substeps) for part in self._world.parts]
@@ -66,6 +65,15 @@ class Stepper:
         for action in actions:
             self._world.step(action)
         return {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
+
+
+def _world_of(slots: list[Any], num_envs: int, **settings: Any) -> Any:
+    from bidex_meta import world
+
+    module: Any = world
+    if not hasattr(module, "WorldConfig"):
+        return module.World(slots, num_envs, **settings)  # older code takes the settings themselves
+    return module.World(slots, module.WorldConfig(num_envs, **settings))
 
 
 def _slot(benchmark: Any, task: str) -> Any:

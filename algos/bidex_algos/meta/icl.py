@@ -30,8 +30,7 @@ from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, w
 from bidex_meta.train.learner import LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
-from bidex_meta.world.contract import PooledWorld
-from bidex_meta.world.hidden_parts import HiddenParts
+from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
 # Added to the deviations of actions, in which errors count: 1.5 % of an action's range.
 _FLOOR = 0.03
@@ -140,7 +139,8 @@ class ICL(TrialLearner):
 
         A memory would learn fifty tasks by heart by where their objects start.
         """
-        hidden = {} if self.teachers.hidden is None else self.teachers.hidden.variations
+        privileged = self.teachers.privileged
+        hidden = {} if privileged is None else privileged.hidden_columns
         mixed = {}
         for name, pool in self.every_pool.items():
             rest, goals = (torch.randperm(len(pool), generator=self.generator, device=self.device) for _ in range(2))
@@ -265,19 +265,19 @@ class _Pupil:
         learner = self._learner
         self._shown = shown[:, None]
         learner.teachers.reset(torch.ones_like(shown))
-        if self._tried is None and learner.teachers.hidden is not None:
-            self._draw_goals(learner.teachers.hidden)
+        if self._tried is None and learner.teachers.privileged is not None:
+            self._draw_goals(learner.teachers.privileged)
 
     def _draw(self, draw: Callable[..., Tensor], *columns: int) -> Tensor:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
-    def _draw_goals(self, hidden: HiddenParts) -> None:
+    def _draw_goals(self, privileged: PrivilegedWorld) -> None:
         """The tasks' own (N, k), and any others of their range. What a class has no use for is drawn too."""
         goals, world = self._data.goals, self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
-        sizes = torch.tensor([len(hidden.variations[name]) for name in world.task_names], device=goals.device)
+        sizes = torch.tensor([len(privileged.hidden_columns[name]) for name in world.task_names], device=goals.device)
         used = torch.arange(goals.shape[2], device=goals.device) < sizes[world.task_id][:, None]
-        goals[:, 0] = torch.where(used, hidden.values(), goals[:, 0])
+        goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:
         """Squared distance of what is believed from what the tasks hide, 1/3 for a guess; mean of entries and rows."""
@@ -285,11 +285,12 @@ class _Pupil:
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Keeps what the step was paid, and would have been for the other goals."""
-        hidden, data = self._learner.teachers.hidden, self._data
+        privileged = self._learner.teachers.privileged
+        data = self._data
         data.rewards[slot, self._rows] = reward[:, None]
-        if hidden is None:
+        if privileged is None:
             return
-        others = hidden.rewards(data.goals[:, 1:].transpose(0, 1))
+        others = privileged.rewards_if(data.goals[:, 1:].transpose(0, 1))
         data.rewards[slot, self._rows, 1:] = others.masked_fill(~valid, 0.0).T
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:

@@ -196,7 +196,7 @@ class PEARL(MTSAC):
 
 def _tasks(world: TaskWorld) -> Tensor:
     """Numbers of the environments' tasks over all classes, (N,); a BidexError where some are played by none."""
-    for name, rows, tasks in zip(world.task_names, world.slot_rows, world.num_slot_tasks, strict=True):
+    for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
         if rows.stop - rows.start < tasks:
             raise BidexError(
                 f"pearl: {name} has {tasks} tasks and {rows.stop - rows.start} environments, each of which keeps its "
