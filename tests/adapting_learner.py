@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import torch
 
-from bidex_meta.train.learner import AutoresetMode
-from bidex_meta.train.learner import Learner as Contract
+from bidex_meta.training.learner import AutoresetMode
+from bidex_meta.training.learner import Learner as Contract
 from bidex_meta.world.contract import State, VectorWorld
 from tests.points import Finder
 

@@ -23,7 +23,7 @@ ORDER = (
     ("engine", "hands", "suite"),
     ("config", "tasks"),
     ("runs", "world"),
-    ("benchmark", "evaluation", "train", "viewer"),
+    ("benchmark", "evaluation", "training", "viewer"),
     ("data", "metaworld", "witness", *(f"bidex_algos.{name}" for name in SHARED)),
     ("clients", "worlds", "bidex_algos.learner"),
     ("bidex_algos.offpolicy", "bidex_algos.onpolicy"),

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 # Checkpoints come once a minute; here, after every iteration.
 _OFTEN = """
 import functools, sys
-import bidex_meta.train.runner as runner
+import bidex_meta.training.runner as runner
 from bidex_meta.cli import main
 runner.train = functools.partial(runner.train, checkpoint_seconds=0.0)
 sys.exit(main(sys.argv[1:]))

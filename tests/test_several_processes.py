@@ -21,8 +21,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_config, training
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.train.distributed import TIMEOUT
-from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.training.distributed import TIMEOUT
+from bidex_meta.training.launch import launch, resume_command
 from tests.algos.ranks import same
 from tests.test_real_run import environment, final
 
@@ -34,7 +34,7 @@ ITERATION = 2 * 4 * 4
 _SCRIPT = """
 import os, sys
 import torch
-import bidex_meta.train.runner as runner
+import bidex_meta.training.runner as runner
 from bidex_meta.cli import main
 train = runner.train
 def often(learner, world, **keywords):

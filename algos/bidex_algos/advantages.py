@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from bidex_meta.train.distributed import pool_moments
+from bidex_meta.training.distributed import pool_moments
 from bidex_meta.world.contract import VectorWorld
 
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from bidex_meta.train.distributed import all_sum, world_size
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_sum, world_size
+from bidex_meta.training.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 

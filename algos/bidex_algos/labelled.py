@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import State
+from bidex_meta.training.learner import State
 
 
 class Labelled:

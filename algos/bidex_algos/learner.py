@@ -19,9 +19,9 @@ from bidex_algos.nets.shape import Shape, check_discounts, check_options
 from bidex_algos.rollout import check_autoreset
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import broadcast, own_seed
-from bidex_meta.train.learner import Learner as Contract
-from bidex_meta.train.learner import LearnerConfig, Parts, State
+from bidex_meta.training.distributed import broadcast, own_seed
+from bidex_meta.training.learner import Learner as Contract
+from bidex_meta.training.learner import LearnerConfig, Parts, State
 from bidex_meta.world.contract import VectorWorld
 
 

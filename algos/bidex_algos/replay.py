@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import is_main
-from bidex_meta.train.learner import State
+from bidex_meta.training.distributed import is_main
+from bidex_meta.training.learner import State
 from bidex_meta.world.contract import Info, VectorWorld
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum
+from bidex_meta.training.distributed import all_sum
 from bidex_meta.utils import maths
 from bidex_meta.world.contract import Info, VectorWorld
 

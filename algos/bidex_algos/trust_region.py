@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_meta.train.distributed import all_sum
+from bidex_meta.training.distributed import all_sum
 
 Product = Callable[[Tensor], Tensor]  # A symmetric positive matrix as a function that multiplies it with a vector (P,)
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from bidex_meta import errors
 from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, shortened
-from bidex_meta.train.launch import launch, notices
+from bidex_meta.training.launch import launch, notices
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import bound_width, open_missing, print_anything, silence, unread
 from bidex_meta.utils.waiting import tell, watched

@@ -13,7 +13,7 @@ from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
 from bidex_meta.evaluation.comparison import Group, estimates, iqm, read_groups, score_over, success_over
 from bidex_meta.runs import plots
 from bidex_meta.runs.provenance import release_of
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.experiments.policies import policy_loader
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.provenance import check_alike
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds

@@ -19,7 +19,7 @@ from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.runs import RunFolder
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads

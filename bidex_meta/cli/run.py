@@ -13,9 +13,9 @@ from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.metatest import splits_of
 from bidex_meta.experiments.training import Stopped, train
 from bidex_meta.runs import RunFolder
-from bidex_meta.train import distributed
-from bidex_meta.train.distributed import together
-from bidex_meta.train.launch import launch, resume_command, say
+from bidex_meta.training import distributed
+from bidex_meta.training.distributed import together
+from bidex_meta.training.launch import launch, resume_command, say
 from bidex_meta.worlds import Worlds
 
 

@@ -18,7 +18,7 @@ from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.runs.provenance import check_alike
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few

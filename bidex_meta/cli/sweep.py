@@ -29,7 +29,7 @@ from bidex_meta.errors import EXIT_FAILED, BidexError, one_line, shortened
 from bidex_meta.experiments.sweep_plan import PlannedRun, Sweep, read_sweep
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.metrics import last_rows
-from bidex_meta.train.launch import BATCH_SIGNALS, say
+from bidex_meta.training.launch import BATCH_SIGNALS, say
 from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 from bidex_meta.utils.waiting import note

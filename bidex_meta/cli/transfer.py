@@ -32,7 +32,7 @@ from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Whole
 from bidex_meta.worlds import Worlds

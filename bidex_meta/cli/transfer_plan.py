@@ -20,7 +20,7 @@ from bidex_meta.experiments.sweep_plan import PlannedRun, words_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.suite import V1, Suite, SuiteClass, plain_name
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted

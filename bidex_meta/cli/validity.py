@@ -21,7 +21,7 @@ from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import plain_name
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted

@@ -7,7 +7,7 @@ from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.provenance import Difference, differences
 from bidex_meta.runs.versions import package_versions
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.worlds import Worlds
 
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")

@@ -19,7 +19,7 @@ from bidex_meta.experiments.policies import policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch

@@ -1,4 +1,4 @@
-"""The learners by name, and how one is loaded; :mod:`bidex_meta.train.learner` says what a learner is."""
+"""The learners by name, and how one is loaded; :mod:`bidex_meta.training.learner` says what a learner is."""
 
 import dataclasses
 import importlib
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.train.launch import launch
-from bidex_meta.train.learner import Learner
+from bidex_meta.training.launch import launch
+from bidex_meta.training.learner import Learner
 from bidex_meta.utils.plugins import is_outside, outside_class
 
 ALGOS: dict[str, str] = {
@@ -99,7 +99,9 @@ def _from_elsewhere(name: str) -> type[Learner]:
             f"learner's config dataclass, got {presets!r}."
         )
     if missing := sorted(learner.__abstractmethods__):
-        raise BidexError(f"--algo {name}: expected {make.__name__} to have {missing[0]}, see bidex_meta.train.learner.")
+        raise BidexError(
+            f"--algo {name}: expected {make.__name__} to have {missing[0]}, see bidex_meta.training.learner."
+        )
     return learner
 
 

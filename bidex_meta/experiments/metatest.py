@@ -10,7 +10,7 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.suite import OTHERS
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds

@@ -14,8 +14,8 @@ from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 from bidex_meta.suite import rules_apart
-from bidex_meta.train.distributed import LostProcess
-from bidex_meta.train.launch import say
+from bidex_meta.training.distributed import LostProcess
+from bidex_meta.training.launch import say
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import is_file
 from bidex_meta.worlds import Worlds

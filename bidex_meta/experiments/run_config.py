@@ -12,7 +12,7 @@ from bidex_meta.experiments import run_data, run_teachers
 from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
 from bidex_meta.runs.folder import AnyConfig, RunFolder
-from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.training.launch import launch, resume_command
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
 from bidex_meta.worlds import Worlds

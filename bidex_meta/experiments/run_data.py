@@ -13,7 +13,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
-from bidex_meta.train.launch import launch, say
+from bidex_meta.training.launch import launch, say
 from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds

@@ -7,7 +7,7 @@ from bidex_meta.data.collect import bytes_held
 from bidex_meta.data.collector import RunCollector, spread_environments
 from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.train.launch import launch, say
+from bidex_meta.training.launch import launch, say
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds

@@ -13,7 +13,7 @@ from bidex_meta.experiments import run_data
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.experiments.policies import load_policy, slots_of
 from bidex_meta.runs import RunFolder
-from bidex_meta.train.launch import launch, say
+from bidex_meta.training.launch import launch, say
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor

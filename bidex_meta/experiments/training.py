@@ -22,9 +22,9 @@ from bidex_meta.experiments.run_config import check, check_resumed, preset_reaso
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
-from bidex_meta.train import distributed, runner
-from bidex_meta.train.distributed import together
-from bidex_meta.train.launch import launch, resume_command, say
+from bidex_meta.training import distributed, runner
+from bidex_meta.training.distributed import together
+from bidex_meta.training.launch import launch, resume_command, say
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch

@@ -17,7 +17,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.provenance import differences
 from bidex_meta.suite import OTHERS
-from bidex_meta.train.launch import say
+from bidex_meta.training.launch import say
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
 from bidex_meta.utils.validation import parse as parse_content

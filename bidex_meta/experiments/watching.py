@@ -22,8 +22,8 @@ from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
 from bidex_meta.tasks.base import CONTROL_RATE
-from bidex_meta.train.launch import launch, say
-from bidex_meta.train.learner import Learner
+from bidex_meta.training.launch import launch, say
+from bidex_meta.training.learner import Learner
 from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds

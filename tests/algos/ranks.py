@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from bidex_meta.train import distributed
+from bidex_meta.training import distributed
 
 # A deadlock shall fail, not last; a busy machine shall do neither.
 _DEADLOCK_SECONDS = 500

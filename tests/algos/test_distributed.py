@@ -30,8 +30,8 @@ from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.train import attendance, distributed
-from bidex_meta.train.runner import checkpoint, resume, train
+from bidex_meta.training import attendance, distributed
+from bidex_meta.training.runner import checkpoint, resume, train
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
-from bidex_meta.train import runner
-from bidex_meta.train.launch import BATCH_SIGNALS
-from bidex_meta.train.runner import train
+from bidex_meta.training import runner
+from bidex_meta.training.launch import BATCH_SIGNALS
+from bidex_meta.training.runner import train
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(8,), rollout_steps=4, autocast="off")

@@ -351,7 +351,7 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
 _TRAIN = """
 import functools, sys, time
 import bidex_meta.runs.progress as progress
-import bidex_meta.train.runner as runner
+import bidex_meta.training.runner as runner
 from bidex_meta.cli import main
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld

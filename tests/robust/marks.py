@@ -97,7 +97,7 @@ def instrument(marks: Marks) -> None:
     from bidex_meta.data.writer import DatasetWriter
     from bidex_meta.experiments import run_recording, watching
     from bidex_meta.runs import atomic, checkpoints, metrics
-    from bidex_meta.train import runner
+    from bidex_meta.training import runner
 
     for module, name, phase in (
         (runner, "train", "training"),

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from bidex_meta.cli import main
 from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.train import runner
+from bidex_meta.training import runner
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fake_world import FakePools

@@ -12,8 +12,8 @@ from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, world_size
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.distributed import all_sum, world_size
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import Count, NonNegative, Positive, Whole
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld

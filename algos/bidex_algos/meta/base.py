@@ -20,8 +20,8 @@ from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.shape import Shape
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import world_size
-from bidex_meta.train.learner import AutoresetMode, Parts, State
+from bidex_meta.training.distributed import world_size
+from bidex_meta.training.learner import AutoresetMode, Parts, State
 from bidex_meta.utils import maths
 from bidex_meta.world.contract import PooledWorld
 

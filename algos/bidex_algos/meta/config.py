@@ -6,7 +6,7 @@ from typing import Literal
 from bidex_algos.meta.adaptation import Adapted, StepSizeKind
 from bidex_algos.nets.architecture import Options, network_bytes
 from bidex_algos.nets.networks import Activation, Layers
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
 USUAL_STEPS = 300

@@ -26,8 +26,8 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, pool_moments, sum_gradients, world_size
-from bidex_meta.train.learner import LearnerConfig, Parts, State
+from bidex_meta.training.distributed import all_sum, pool_moments, sum_gradients, world_size
+from bidex_meta.training.learner import LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld

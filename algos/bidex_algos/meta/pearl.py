@@ -26,8 +26,8 @@ from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Stretches, Transitions
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, own_seed, world_size
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.distributed import all_sum, own_seed, world_size
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import Count, NonNegative, Positive, Widths
 from bidex_meta.world.contract import Info, TaskWorld
 

@@ -21,8 +21,8 @@ from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PPOConfig, mini_batches, policy_loss
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Finite, Positive, check_rising
 from bidex_meta.world.contract import PooledWorld
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_algos.meta.trials import Trials
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import State
+from bidex_meta.training.learner import State
 
 
 class Steps(NamedTuple):

@@ -11,8 +11,8 @@ from bidex_algos.meta.memory_agent import MemoryAgent
 from bidex_algos.meta.trials import Player, Trials, play
 from bidex_algos.nets.recurrent import RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.train.distributed import all_sum, own_seed, rank, world_size
-from bidex_meta.train.learner import AutoresetMode, State
+from bidex_meta.training.distributed import all_sum, own_seed, rank, world_size
+from bidex_meta.training.learner import AutoresetMode, State
 from bidex_meta.world.contract import PooledWorld
 
 

@@ -15,7 +15,7 @@ from bidex_algos.nets.networks import Activation, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils import maths
 from bidex_meta.utils.validation import Count, Fraction, Positive, Widths
 from bidex_meta.world.contract import VectorWorld

@@ -18,8 +18,8 @@ from bidex_algos.nets.networks import ACTIVATIONS, MLP, gaussian_kl, linear
 from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, sum_gradients
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_sum, sum_gradients
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 

@@ -22,8 +22,8 @@ from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_sam
 from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
-from bidex_meta.train.distributed import sum_gradients
-from bidex_meta.train.learner import LearnerConfig, Parts
+from bidex_meta.training.distributed import sum_gradients
+from bidex_meta.training.learner import LearnerConfig, Parts
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Positive
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld

@@ -20,7 +20,7 @@ from bidex_algos.multiagent.base import (
 )
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import policy_loss
-from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.training.distributed import sum_gradients
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgentPPOConfig, Ow
 from bidex_algos.nets.networks import autocast, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, policy_loss
-from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.training.distributed import sum_gradients
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, Towers, Transformer
 from bidex_algos.nets.networks import MLP, Activation, Layers, MakeNetwork
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Whole, Widths
 
 Options = dict[str, Any]  # fields of a config by name

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Columns, Inputs
-from bidex_meta.train.distributed import pool_moments
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.training.distributed import pool_moments
+from bidex_meta.training.learner import LearnerConfig
 
 _FLOOR = 3e-3  # of a deviation: keeps a column that has been constant so far from blowing up noise a thousandfold
 _FOREVER = 1e18  # observations beside which all that follow count nothing

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.products import Linear
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.training.learner import LearnerConfig
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
 _SPREAD = 0.2  # what distances from a cloud's centre are divided by, metres: about a hand's length

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from bidex_algos.nets.architecture import ArchitectureConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import LearnerConfig, State
+from bidex_meta.training.learner import LearnerConfig, State
 from bidex_meta.world.contract import ObservationGroup, VectorWorld
 
 

@@ -21,7 +21,7 @@ from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 

@@ -20,7 +20,7 @@ from bidex_algos.nets.policy import DeterministicActor
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 

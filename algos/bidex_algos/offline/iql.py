@@ -17,7 +17,7 @@ from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 

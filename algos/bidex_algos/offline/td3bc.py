@@ -14,7 +14,7 @@ from bidex_algos.nets.networks import autocast
 from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 

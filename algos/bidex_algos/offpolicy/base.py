@@ -23,8 +23,8 @@ from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
 from bidex_meta.world.contract import Info, VectorWorld
 

@@ -18,8 +18,8 @@ from bidex_algos.nets.networks import MLP, Layers, MakeNetwork, autocast
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_max
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_max
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import MOST, Positive
 from bidex_meta.world.contract import VectorWorld
 

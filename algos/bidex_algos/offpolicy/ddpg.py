@@ -17,7 +17,7 @@ from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import NonNegative, check_rising
 from bidex_meta.world.contract import VectorWorld
 

@@ -21,8 +21,8 @@ from bidex_algos.nets.policy import sample_squashed, squashed_policy
 from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig, CategoricalCritics, check_residual
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Transitions
-from bidex_meta.train.distributed import all_sum, world_size
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_sum, world_size
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, Finite, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 

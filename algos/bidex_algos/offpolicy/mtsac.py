@@ -17,7 +17,7 @@ from bidex_algos.nets.policy import SquashedPolicy, squashed_policy
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Finite, Positive
 from bidex_meta.world.contract import VectorWorld
 

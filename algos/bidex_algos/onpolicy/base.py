@@ -16,8 +16,8 @@ from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy, of_head
 from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, world_size
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.distributed import all_sum, world_size
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 

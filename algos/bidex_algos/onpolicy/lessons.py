@@ -9,7 +9,7 @@ from bidex_algos.labelled import Labelled
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_meta.train.distributed import pool_moments, sum_gradients, world_size
+from bidex_meta.training.distributed import pool_moments, sum_gradients, world_size
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 

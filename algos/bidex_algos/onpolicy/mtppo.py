@@ -21,8 +21,8 @@ from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, own_seed, sum_gradients, world_size
-from bidex_meta.train.learner import Parts, State
+from bidex_meta.training.distributed import all_sum, own_seed, sum_gradients, world_size
+from bidex_meta.training.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from bidex_algos.nets.networks import Autocast, autocast, gaussian_kl, gaussian_log_prob
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig
 from bidex_algos.trust_region import trust_region_step
-from bidex_meta.train.distributed import all_sum, sum_gradients
-from bidex_meta.train.learner import Parts
+from bidex_meta.training.distributed import all_sum, sum_gradients
+from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 

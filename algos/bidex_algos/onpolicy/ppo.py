@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
-from bidex_meta.train.distributed import all_sum
-from bidex_meta.train.learner import LearnerConfig, Parts, State
+from bidex_meta.training.distributed import all_sum
+from bidex_meta.training.learner import LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Positive, check_rising
 
 

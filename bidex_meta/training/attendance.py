@@ -10,7 +10,7 @@ from typing import Any
 
 from typing_extensions import override
 
-from bidex_meta.train.launch import notices
+from bidex_meta.training.launch import notices
 
 _BEAT_SECONDS = 0.5
 _LISTEN_SECONDS = 3.0

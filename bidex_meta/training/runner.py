@@ -1,6 +1,6 @@
 """The training loop of every learner: iterate, log, save; and stop cleanly at a signal.
 
-Several processes (:mod:`bidex_meta.train.distributed`) do the same iterations and stop together; process 0 writes.
+Several processes (:mod:`bidex_meta.training.distributed`) do the same iterations and stop together; process 0 writes.
 """
 
 import math
@@ -17,9 +17,9 @@ import gymnasium
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.recorder import Recorder
-from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
-from bidex_meta.train.launch import notices
-from bidex_meta.train.learner import Learner, State
+from bidex_meta.training.distributed import any_process, gather, is_main, rank, world_size
+from bidex_meta.training.launch import notices
+from bidex_meta.training.learner import Learner, State
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
 from bidex_meta.errors import BidexError
-from bidex_meta.train.attendance import Attendance, end_patiently
-from bidex_meta.train.learner import State
+from bidex_meta.training.attendance import Attendance, end_patiently
+from bidex_meta.training.learner import State
 
 # A dead process closes its sockets and is noticed at once; this is for a machine that no longer answers, and must be
 # longer than process 0 takes to write a checkpoint.
