@@ -4,8 +4,7 @@ import imageio.v3 as imageio
 import pytest
 from PIL import Image
 
-from bidex_meta.cli import main
-from bidex_meta.experiments import policies
+from bidex_meta.cli import looking, main
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.cli.conftest import toy
@@ -37,7 +36,7 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, t
     capsys.readouterr()
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
     shape = {"observations": 7, "actions": 1}
-    monkeypatch.setattr(policies, "checkpoint", lambda *_: ({"learner": {"policy": {"shape": shape}}}, 24))
+    monkeypatch.setattr(looking, "checkpoint", lambda *_: ({"learner": {"policy": {"shape": shape}}}, 24))
     assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
     assert "takes 7 observations" in capsys.readouterr().err
 
