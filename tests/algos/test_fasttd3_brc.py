@@ -16,7 +16,6 @@ from bidex_algos.offpolicy.categorical import Atoms, ReturnBound
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Replay, Stretches, Transitions
 from tests.algos.problems import LQR, OFF_POLICY, a_draw, opposite_bandits, shake, trained
-from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness
 
 
@@ -213,15 +212,6 @@ def test_fasttd3s_target_is_that_of_the_definition(lower: bool) -> None:
     rewards = draw.rewards / torch.tensor([2.0] * 3 + [5.0] * 3)
     expected = projected(learner, draw, rewards, following, torch.zeros(6))
     assert_close(target.double(), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_an_older_fasttd3_checkpoint_still_loads() -> None:
-    learner, again = (FastTD3(opposite_bandits(rows=6), FAST, seed=seed) for seed in (0, 1))
-    state = learner.state_dict()
-    assert "target_actor" not in state
-    del state["recent"]
-    again.load_state_dict(state | {"target_actor": again.policy.actor.state_dict()})
-    assert same(again.policy.state_dict(), learner.policy.state_dict())
 
 
 def test_brcs_target_is_that_of_the_definition() -> None:
