@@ -4,15 +4,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
 import tyro
 from torch import Tensor
 
 from bidex_algos.meta.icl import ICL
-from bidex_algos.nets.evidence import spread
+from bidex_algos.nets.evidence import Belief, spread
+from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.experiments.metatest import adapt_steps_of
-from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.policies import checkpoint, fitting
 from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
@@ -46,8 +48,11 @@ def ladder(
     found = dict[str, dict[str, list[float]]]()
     longest = adapt_steps_of(folder.config())
 
-    def agent() -> Any:
-        return load_policy(folder, "cpu")[0]
+    state = checkpoint(folder)[0]["learner"]["policy"]
+
+    def believing(belief: Belief) -> Agent:
+        with fitting(folder.path):
+            return ICL.load_policy(state, belief=belief)
 
     def play(name: str, agent: Any, shots: int) -> None:
         found[name] = success(
@@ -56,14 +61,8 @@ def ladder(
         for each, shares in found[name].items():
             print(f"{name}, {each}: {', '.join(f'{100 * share:.0f} %' for share in shares)}", flush=True)
 
-    inferring = agent()
-    inferring.policy.actor.candidates = spread(_CANDIDATES, world.hidden_size)
-    inferring.policy.memory = _CANDIDATES
-    inferring.policy.evidence = _Known(world, inferring.policy.actor.candidates).evidence
-    play("icl, known rewards", inferring, shots)
-    seeing = agent()
-    seeing.policy.believed = lambda state: world.hidden_values()
-    play("icl, shown the goal", seeing, 0)
+    play("icl, known rewards", believing(_KnownRewards(world)), shots)
+    play("icl, shown the goal", believing(_ShownGoal(world)), 0)
     play("teachers that are shown the goal", teachers_of(folder.config(), worlds, world), 0)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -75,17 +74,38 @@ def success(evaluation: MetaEvaluation) -> dict[str, list[float]]:
     return {name: [each.classes[name].success for each in evaluation.by_shot] for name in evaluation.before.classes}
 
 
-class _Known:
-    """Log-likelihoods of candidates by the classes' own formulas of the reward."""
+class _KnownRewards:
+    """A belief whose log-likelihoods come from the classes' own reward formulas."""
 
-    def __init__(self, world: PrivilegedWorld, candidates: Tensor):
-        self._world, self._candidates = world, candidates
+    def __init__(self, world: PrivilegedWorld):
+        self._world = world
+        self.candidates = spread(_CANDIDATES, world.hidden_size)
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """As of ``BeliefPolicy``; of the step that the world has just made."""
-        paid = self._world.rewards_if(self._candidates[:, None].expand(-1, len(obs), -1))
+        """Return log-likelihoods of the rewards of the step that the world has just made."""
+        paid = self._world.rewards_if(self.candidates[:, None].expand(-1, len(obs), -1))
         off = (reward[:, None] - paid.T) / _EXACT
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
+
+    def believed(self, state: Tensor) -> Tensor:
+        """Return the means of the beliefs."""
+        return state.softmax(-1) @ self.candidates
+
+
+class _ShownGoal:
+    """A belief that is certain of the true goal and needs no evidence."""
+
+    def __init__(self, world: PrivilegedWorld):
+        self._world = world
+        self.candidates = torch.zeros(1, world.hidden_size)
+
+    def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
+        """Return zeros."""
+        return torch.zeros(len(obs), 1)
+
+    def believed(self, state: Tensor) -> Tensor:
+        """Return the goals of the tasks that the environments play now."""
+        return self._world.hidden_values()
 
 
 if __name__ == "__main__":

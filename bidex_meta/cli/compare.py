@@ -10,7 +10,8 @@ import numpy as np
 from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
 from bidex_meta.cli.plot import named_runs
 from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
-from bidex_meta.evaluation.comparison import Group, estimates, iqm, read_groups, score_over, success_over
+from bidex_meta.evaluation.comparison import Group, estimates, read_groups, score_over, success_over
+from bidex_meta.evaluation.statistics import iqm_over_seeds
 from bidex_meta.runs import plots
 from bidex_meta.runs.provenance import release_of
 from bidex_meta.training.launch import say
@@ -54,7 +55,7 @@ def _row(group: Group, first: Group) -> Json:
     }  # fmt: skip
     measures = ("success", group.success, success_over(group, first)), ("score", group.scores, score_over(group, first))
     for name, own, over in measures:
-        row[f"{name}_iqm"] = None if own is None else vars(iqm(own))
+        row[f"{name}_iqm"] = None if own is None else vars(iqm_over_seeds(own))
         row[f"{name}_over_first"] = None if over is None else vars(over)
     row["classes"] = {
         name: {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
@@ -68,8 +69,8 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
     columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
     rows = []
     for group in groups:
-        score = None if group.scores is None else iqm(group.scores)
-        measures = (iqm(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
+        score = None if group.scores is None else iqm_over_seeds(group.scores)
+        measures = (iqm_over_seeds(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
         over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
         cells = [NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]
         seeds = f"{len(group.seeds)} ({', '.join(map(str, group.seeds))})"

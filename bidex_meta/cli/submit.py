@@ -9,7 +9,7 @@ from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, estimate, iqm, read_entry
+from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, read_entry, success_iqm
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments.conditions import check_worlds_of, conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, entry)
     read = read_entry(path)
-    own, others = (estimate(iqm, read.success(part)).text(100.0, " %") for part in (read.own, read.others))
+    own, others = (success_iqm(read.success(part)).text(100.0, " %") for part in (read.own, read.others))
     print(f"{path}: success, IQM {own}, on other tasks {others}")
 
 

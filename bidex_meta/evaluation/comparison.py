@@ -10,7 +10,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
-from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, bootstrap_interval, interquartile_mean
+from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, iqm_difference, iqm_over_seeds
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
@@ -113,59 +113,38 @@ def _check_copies(runs: Sequence[Run]) -> None:
             raise BidexError(f"{run.path} is a copy of {known[times]}: one run is not two seeds. Name it once.")
 
 
-def iqm(values: np.ndarray) -> Estimate:
-    """Interquartile mean over seeds and classes (seeds, classes), and its interval over seeds.
-
-    All classes of a seed are resampled together: they come from one run.
-    """
-    interval = bootstrap_interval(
-        lambda rows, axis: _resampled(lambda p: interquartile_mean(values[p]), rows), np.arange(len(values))
-    )
-    return Estimate(interquartile_mean(values), interval)
-
-
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
-    """The content of a picture of groups: by title the label, interquartile mean and interval of each."""
-    found: dict[str, list[tuple[str, float, Interval | None]]] = {}
+    """Return the content of a picture of groups: per title the label, interquartile mean and interval of each group."""
+    pictured: dict[str, list[tuple[str, float, Interval | None]]] = {}
     for group in groups:
         for title, values, factor in (("success, IQM (%)", group.success, 100.0), ("score, IQM", group.scores, 1.0)):
-            if values is not None:
-                of_all = iqm(values)
-                ends = of_all.interval and (factor * of_all.interval[0], factor * of_all.interval[1])
-                found.setdefault(title, []).append((group.label, factor * of_all.value, ends))
-    return found
-
-
-def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
-    """Interquartile mean of ``a`` minus that of ``b``, each (seeds, classes), seeds of both resampled."""
-    value = interquartile_mean(a) - interquartile_mean(b)
-
-    def difference(p: np.ndarray, q: np.ndarray) -> float:
-        return interquartile_mean(a[p]) - interquartile_mean(b[q])
-
-    samples = np.arange(len(a)), np.arange(len(b))
-    return Estimate(value, bootstrap_interval(lambda i, j, axis: _resampled(difference, i, j), *samples))
+            if values is None:
+                continue
+            measured = iqm_over_seeds(values)
+            interval = None
+            if measured.interval is not None:
+                low, high = measured.interval
+                interval = (factor * low, factor * high)
+            pictured.setdefault(title, []).append((group.label, factor * measured.value, interval))
+    return pictured
 
 
 def success_over(group: Group, first: Group) -> Estimate | None:
-    """Success above the first group's; None of the first itself, and of other classes than its own."""
-    comparable = group is not first and set(group.classes) == set(first.classes)
-    return iqm_difference(group.success, first.success) if comparable else None
+    """Return the difference in success from the first group; None for the first group and for other classes."""
+    if not _comparable(group, first):
+        return None
+    return iqm_difference(group.success, first.success)
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Normalised score above the first group's, likewise; None too where either is unknown."""
-    known = group is not first and set(group.classes) == set(first.classes)
-    if not known or group.scores is None or first.scores is None:
+    """Return the difference in normalised score as :func:`success_over`; None also if either score is unknown."""
+    if not _comparable(group, first) or group.scores is None or first.scores is None:
         return None
     return iqm_difference(group.scores, first.scores)
 
 
-def _resampled(statistic: Callable[..., float], *rows: np.ndarray) -> float | np.ndarray:
-    """``statistic`` of row numbers (seeds,), or of each resample of them (resamples, seeds)."""
-    if rows[0].ndim == 1:
-        return statistic(*(row.astype(int) for row in rows))
-    return np.array([_resampled(statistic, *resample) for resample in zip(*rows, strict=True)])
+def _comparable(group: Group, first: Group) -> bool:
+    return group is not first and set(group.classes) == set(first.classes)
 
 
 def classes_of(evaluation: Json, convert: Callable[[Json], Json] = lambda rows: rows) -> Json:

@@ -14,9 +14,10 @@ import numpy as np
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.gains import MEASURES, difference_over_runs, grouped
+from bidex_meta.evaluation.gains import MEASURES, grouped
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
+from bidex_meta.evaluation.statistics import paired_difference
 from bidex_meta.runs.atomic import Json
 from bidex_meta.world.contract import PooledWorld, TaskWorld
 
@@ -101,4 +102,4 @@ def _own_minus(
         if own is None or len(known) < len(foreign):
             return None
         differences.append(grouped(own - np.mean(known, axis=0), run.adaptations[class_name]))
-    return difference_over_runs(differences)
+    return paired_difference(np.stack(differences))

@@ -6,13 +6,13 @@ episodes, a nominal 95 % held the truth in 81 to 88 % of simulated cases, with t
 not differ it is rather too wide. With a single one the interval does not cover what another adaptation would give.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
-from bidex_meta.evaluation.statistics import BOOTSTRAP_SEED, RESAMPLES
+from bidex_meta.evaluation.statistics import estimate_from, generator_of_resamples, resampled_means
 from bidex_meta.runs.atomic import Json
 
 MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
@@ -21,8 +21,6 @@ MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
     "score": lambda result: result.scores,
 }
 """Measures by name: per episode, None where a class does not have it."""
-
-_BATCH = 200  # resamples at a time; bounds memory
 
 
 @dataclass(frozen=True)
@@ -45,54 +43,36 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
     """
     classes: dict[str, dict[str, Difference | None]] = {name: {} for name in after.classes}
     aggregate: dict[str, Difference | None] = {}
-    for measure, of in MEASURES.items():
+    for measure, values_of in MEASURES.items():
         means: list[float] = []
-        resampled: list[np.ndarray | None] = []
-        # One generator for all classes: the same draws in each would tie their errors together.
-        generator = np.random.default_rng(BOOTSTRAP_SEED)
+        resampled: list[np.ndarray] = []
+        # One generator serves all classes: the same draws in each class would correlate their errors.
+        generator = generator_of_resamples()
         for name, result in after.classes.items():
-            new, old = of(result), of(before.classes[name])
+            new = values_of(result)
+            old = values_of(before.classes[name])
             if new is None or old is None:
                 classes[name][measure] = None
                 continue
-            of_class = grouped(new - old, adaptations[name])
-            means.append(float(of_class.mean()))
-            resampled.append(_resampled_means(of_class[None], generator))
-            classes[name][measure] = _difference(means[-1], resampled[-1])
-        known = [sample for sample in resampled if sample is not None]
-        together = np.mean(known, axis=0) if len(known) == len(classes) else None
-        # A mean over some of the classes would pass for one over all.
-        aggregate[measure] = _difference(float(np.mean(means)), together) if len(means) == len(classes) else None
+            differences = grouped(new - old, adaptations[name])[None]
+            value = float(differences.mean())
+            means.append(value)
+            of_class = resampled_means(differences, generator)
+            if of_class is not None:
+                resampled.append(of_class)
+            classes[name][measure] = estimate_from(value, of_class)
+        aggregate[measure] = _over_classes(means, resampled, len(classes))
     return Gains(classes, aggregate)
 
 
-def grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Values (groups, episodes of each) from values (n,) and the groups they belong to, (n,)."""
-    return values[np.argsort(groups, kind="stable")].reshape(len(np.unique(groups)), -1)
-
-
-def difference_over_runs(differences: Sequence[np.ndarray]) -> Difference:
-    """Mean of paired differences of several runs, each (adaptations, episodes of each), and its interval over all."""
-    values = np.stack(differences)
-    return _difference(float(values.mean()), _resampled_means(values, np.random.default_rng(BOOTSTRAP_SEED)))
-
-
-def _resampled_means(values: np.ndarray, generator: np.random.Generator) -> np.ndarray | None:
-    """Means over resampled runs, groups of each and episodes of each, ``(RESAMPLES,)``."""
-    runs, groups, episodes = values.shape
-    if values.size < 2:
+def _over_classes(means: list[float], resampled: list[np.ndarray], classes: int) -> Difference | None:
+    """Return the mean over classes; None if a class is missing, as the rest would pass for a mean over all."""
+    if len(means) < classes:
         return None
-    means = []
-    for size in [min(_BATCH, RESAMPLES - first) for first in range(0, RESAMPLES, _BATCH)]:
-        run = generator.integers(runs, size=(size, runs, 1, 1))
-        group = generator.integers(groups, size=(size, runs, groups, 1))
-        episode = generator.integers(episodes, size=(size, runs, groups, episodes))
-        means.append(values[run, group, episode].mean(axis=(1, 2, 3)))
-    return np.concatenate(means)
+    together = np.mean(resampled, axis=0) if len(resampled) == classes else None
+    return estimate_from(float(np.mean(means)), together)
 
 
-def _difference(value: float, resampled: np.ndarray | None) -> Difference:
-    if resampled is None:
-        return Difference(value, None)
-    low, high = np.percentile(resampled, [2.5, 97.5])
-    return Difference(value, (float(low), float(high)))
+def grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Return values (groups, episodes per group) from values (n,) and the number of the group of each, (n,)."""
+    return values[np.argsort(groups, kind="stable")].reshape(len(np.unique(groups)), -1)

@@ -4,7 +4,7 @@ Interquartile mean, performance profile and probability of improvement are those
 2108.13264). Intervals resample seeds, and within each class the tasks, so that a single seed has one too: of its tasks.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,8 +13,14 @@ import numpy as np
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.evaluation.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate, interquartile_mean
+from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.evaluation.statistics import (
+    Estimate,
+    crossed_estimate,
+    iqm,
+    probability_of_improvement,
+    share_above,
+)
 from bidex_meta.runs.atomic import Json
 from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
@@ -194,51 +200,34 @@ def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
 
 
 def class_rows(evaluations: Sequence[Evaluation]) -> Json:
-    """The classes of an entry from an evaluation of each seed, ready for JSON."""
+    """Return the classes of an entry from one evaluation per seed, ready for JSON."""
     rows = {}
     for name in evaluations[0].classes:
-        found = [evaluation.classes[name] for evaluation in evaluations]
-        tasks = np.array(
-            [[each.successes[each.tasks == task].mean() for task in np.unique(each.tasks)] for each in found]
-        )
-        mean = estimate(lambda classes: classes[0].mean(), [tasks])
+        tasks = np.array([_success_of_tasks(evaluation.classes[name]) for evaluation in evaluations])
+        mean = crossed_estimate(lambda tables: tables[0].mean(), [tasks])
         rows[name] = {"success": mean.value, "interval": mean.interval, "tasks": tasks.round(4).tolist()}
     return rows
 
 
-def iqm(classes: Sequence[np.ndarray]) -> float:
-    """Interquartile mean over seeds and classes, whose tasks are (seeds, tasks)."""
-    return interquartile_mean(_rates(classes))
+def _success_of_tasks(result: ClassResult) -> list[float]:
+    return [result.successes[result.tasks == task].mean() for task in np.unique(result.tasks)]
 
 
-def profile(classes: Sequence[np.ndarray], rate: float) -> float:
-    """Share of seeds and classes that succeed in more than ``rate`` of their tasks."""
-    return float((_rates(classes) > rate).mean())
+def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:
+    """Return the interquartile mean of success over seeds and classes of tables (seeds, tasks), one per class."""
+    return crossed_estimate(lambda tables: float(iqm(success_rates(tables).ravel())), tables)
 
 
-def improvement(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
-    """Probability that a seed of ``a`` has more success than one of ``b`` in a class, a tie counting half."""
-    gaps = _rates(a)[:, None] - _rates(b)[None]
-    return float((0.5 + 0.5 * np.sign(gaps)).mean())
+def profile(tables: Sequence[np.ndarray], rate: float) -> float:
+    """Return the share of seeds and classes that succeed in more than ``rate`` of their tasks."""
+    return share_above(success_rates(tables), rate)
 
 
-def estimate(statistic: Callable[..., float], *entries: Sequence[np.ndarray]) -> Estimate:
-    """A statistic of entries (each its classes, as above) and its 95 % bootstrap interval, equal for equal input."""
-    value = float(statistic(*entries))
-    if max(array.size for classes in entries for array in classes) < 2:
-        return Estimate(value, None)
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    found = [statistic(*(_resampled(classes, rng) for classes in entries)) for _ in range(RESAMPLES)]
-    low, high = np.percentile(found, (2.5, 97.5))
-    return Estimate(value, (float(low), float(high)))
+def improvement(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> Estimate:
+    """Return the probability that a seed of ``a`` has more success in a class than a seed of ``b``."""
+    return crossed_estimate(lambda a, b: probability_of_improvement(success_rates(a), success_rates(b)), a, b)
 
 
-def _resampled(classes: Sequence[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
-    """All classes of a seed stay together: they come from one run."""
-    seeds = rng.integers(len(classes[0]), size=len(classes[0]))
-    return [array[seeds][:, rng.integers(array.shape[1], size=array.shape[1])] for array in classes]
-
-
-def _rates(classes: Sequence[np.ndarray]) -> np.ndarray:
-    """Success rates, (seeds, classes)."""
-    return np.stack([array.mean(axis=1) for array in classes], axis=1)
+def success_rates(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """Return success rates (seeds, classes)."""
+    return np.stack([table.mean(axis=1) for table in tables], axis=1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bidex_meta.evaluation.references import Reference, counted_returns
-from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
+from bidex_meta.evaluation.statistics import Estimate, aggregate, estimate, mean, mean_difference
 from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.arguments import checked_arguments
 
@@ -63,9 +63,9 @@ class ClassResult:
     def to_json(self) -> Json:
         """Numbers of this class, ready for JSON."""
         return {
-            "success": self.success, "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
+            "success": self.success, "success_interval": estimate(mean, self.drawn(self.successes)).interval,
             "success_once": self.once, "success_at_end": self.at_end,
-            "return": self.mean_return, "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
+            "return": self.mean_return, "return_interval": estimate(mean, self.drawn(self.returns)).interval,
             "length": float(self.lengths.mean()), "score": self.score, "episodes": self.episodes,
             "tasks": len(np.unique(self.tasks)), "unstable": self.unstable,
         }  # fmt: skip
@@ -119,12 +119,12 @@ def results_by_class(
 
 @checked_arguments
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
-    """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval."""
+    """Return the mean return of ``a`` minus that of ``b`` for each class of both, with a bootstrap interval."""
     differences = {}
-    for name in (name for name in a.classes if name in b.classes):
-        ours, theirs = (result.drawn(result.returns) for result in (a.classes[name], b.classes[name]))
-        interval = bootstrap_interval(mean_difference, ours, theirs)
-        differences[name] = Difference(float(ours.mean() - theirs.mean()), interval)
+    for name, ours in a.classes.items():
+        if name in b.classes:
+            theirs = b.classes[name]
+            differences[name] = estimate(mean_difference, ours.drawn(ours.returns), theirs.drawn(theirs.returns))
     return differences
 
 

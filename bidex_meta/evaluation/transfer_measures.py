@@ -1,4 +1,4 @@
-"""What runs say of a class that their policy to start from was not trained on: measures over seeds, ready for JSON."""
+"""Measures of transfer to a class that the initial policy was not trained on, over seeds and ready for JSON."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.evaluation.comparison import over_runs, series
-from bidex_meta.evaluation.statistics import Estimate, bootstrap_interval, mean, mean_difference
+from bidex_meta.evaluation.statistics import estimate, mean, mean_difference
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
 
@@ -16,19 +16,19 @@ NOTHING = "nothing"  # what runs with a fresh policy start from
 
 
 def area(steps: np.ndarray, success: np.ndarray, end: float) -> float:
-    """Mean success over the environment steps 0 to ``end``, by the trapezoid rule.
+    """Return the mean success over the environment steps 0 to ``end``, by the trapezoid rule.
 
-    Evaluations are at rising ``steps`` (n,), n > 0, with success (n,) in [0, 1]; before the first one and after the
-    last one it counts as there.
+    Evaluations are at rising ``steps`` (n,), n > 0, with ``success`` (n,) in [0, 1]. Success before the first
+    evaluation is taken to equal the first, and success after the last to equal the last.
     """
     grid = np.unique(np.concatenate([[0.0, end], steps[steps < end]]))
     return float(np.trapezoid(np.interp(grid, steps, success), grid) / end)
 
 
 def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int | None:
-    """Steps of the first of two evaluations in a row with this success; None where there are no such two.
+    """Return the step of the first of two successive evaluations with success of at least ``level``, or None.
 
-    An evaluation is ten episodes: one alone reaches one half by chance now and then.
+    An evaluation has ten episodes, and a single one sometimes reaches one half by chance.
     """
     reached = success >= level
     found = np.flatnonzero(reached[:-1] & reached[1:])
@@ -36,45 +36,50 @@ def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int 
 
 
 def median_steps(found: Sequence[int | None]) -> int | None:
-    """The median, of an even number the larger of the middle two; None counts as more steps than any number."""
+    """Return the median, the larger middle value of an even count; None counts as more steps than any number."""
     ranked = sorted(found, key=lambda steps: np.inf if steps is None else steps)
     return ranked[len(ranked) // 2]
 
 
 def at_the_end(folders: Sequence[RunFolder]) -> Json:
-    """Success and return of runs that differ in the seed alone, in their final evaluation (4 episodes of each task)."""
+    """Return success and return in the final evaluation (4 episodes per task) of runs that differ only in the seed."""
     classes = [folder.evaluation()["policy"]["classes"].values() for folder in folders]
-    measures = ("success", "return")
-    return {name: estimate([float(np.mean([row[name] for row in rows])) for rows in classes]) for name in measures}
+    measured = {}
+    for name in ("success", "return"):
+        measured[name] = over_seeds([float(np.mean([row[name] for row in rows])) for rows in classes])
+    return measured
 
 
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:
-    """The same, and measures of their evaluations while training for ``end`` environment steps."""
+    """Return :func:`at_the_end` and measures of the evaluations during ``end`` environment steps of training."""
     curves = [series(folder.metrics(), TAG) for folder in folders]
     curve: Any = over_runs(curves)
     powers = [10**power for power in range(4, 15) if 10**power < end]
     reached = [steps_to(*each) for each in curves]
     return at_the_end(folders) | {
         "curve": {name: None if values is None else values.tolist() for name, values in vars(curve).items()},
-        "at": {str(at): estimate([float(np.interp(at, *each)) for each in curves]) for at in powers},
-        "area": estimate([area(*each, end) for each in curves]),
+        "at": {str(at): over_seeds(_success_at(at, curves)) for at in powers},
+        "area": over_seeds([area(*each, end) for each in curves]),
         "half": {"of_seeds": reached, "median": median_steps(reached)},
     }
 
 
-def estimate(of_seeds: list[float]) -> Json:
-    """The mean, its 95 % bootstrap interval over seeds (None of one alone), and each seed."""
-    values = np.array(of_seeds)
-    return asdict(Estimate(float(values.mean()), bootstrap_interval(mean, values))) | {"of_seeds": of_seeds}
+def _success_at(step: int, curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float]:
+    return [float(np.interp(step, *curve)) for curve in curves]
+
+
+def over_seeds(of_seeds: list[float]) -> Json:
+    """Return the mean of the seeds, its interval (None for a single seed) and the value of each seed."""
+    return asdict(estimate(mean, np.array(of_seeds))) | {"of_seeds": of_seeds}
 
 
 def add_over_nothing(rows: Sequence[Json], measure: str) -> None:
-    """Adds to each row how far its measure is above that of the like runs from nothing, seeds of both resampled."""
+    """Add the difference from the same runs trained from scratch to each row; seeds of both are resampled."""
     alone = {(row["class"], row.get("demonstrations")): row for row in rows if row["from"] == NOTHING}
     for row in rows:
         other = alone.get((row["class"], row.get("demonstrations")), row)
         row["over_nothing"] = None
         if other is not row:
-            own, fresh = (np.array(each[measure]["of_seeds"]) for each in (row, other))
-            difference = Estimate(float(own.mean() - fresh.mean()), bootstrap_interval(mean_difference, own, fresh))
-            row["over_nothing"] = asdict(difference)
+            own = np.array(row[measure]["of_seeds"])
+            fresh = np.array(other[measure]["of_seeds"])
+            row["over_nothing"] = asdict(estimate(mean_difference, own, fresh))

@@ -9,7 +9,7 @@ from torch import Tensor
 from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trials import Trials
-from bidex_algos.nets.evidence import BeliefNet
+from bidex_algos.nets.evidence import BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_meta.errors import BidexError
 from bidex_meta.witness.teachers import Teachers, Tutor
@@ -123,17 +123,38 @@ def test_belief_is_bayes_rule_over_candidates(monkeypatch: pytest.MonkeyPatch) -
         torch.tensor([[1.0, -1.0], [0.5, 0.2]]),
     )
     memory = policy.fresh_memory(2)
-    assert torch.allclose(policy.believed(memory.state), candidates.mean(0).expand(2, -1), atol=1e-6)
+    assert torch.allclose(policy.belief.believed(memory.state), candidates.mean(0).expand(2, -1), atol=1e-6)
     for step, paid in zip(obs, reward, strict=True):
         memory.known, memory.reward = torch.tensor([True, False]), paid
         _, memory.state = policy.step(step, memory)
-    likely = sum(policy.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
+    likely = sum(policy.belief.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
     assert isinstance(likely, Tensor) and torch.allclose(memory.state, likely, atol=1e-5) and not likely[1].any()
     monkeypatch.setattr("bidex_meta.utils.maths.may_look", lambda device: False)  # as on a GPU
-    again = sum(policy.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
+    again = sum(policy.belief.evidence(*each, memory.known) for each in zip(obs, reward, strict=True))
     assert isinstance(again, Tensor) and torch.allclose(again, likely, atol=1e-5)
     memory.done = memory.known  # what the last step of an episode led to was not seen
     assert torch.equal(policy.step(obs[0], memory)[1], memory.state)
+
+
+def test_a_loaded_policy_acts_on_the_belief_that_is_passed() -> None:
+    class Sure:
+        candidates = torch.zeros(1, 2)
+
+        def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
+            return torch.zeros(len(obs), 1)
+
+        def believed(self, state: Tensor) -> Tensor:
+            return torch.tensor([[0.3, -0.4]]).expand(len(state), -1)
+
+    learner = ICL(PointGoals(2), SMALL, seed=0)
+    policy = ICL.load_policy(learner.policy_state_dict(), belief=Sure()).policy
+    assert isinstance(policy, BeliefPolicy) and policy.fresh_memory(3).state.shape == (3, 1)
+    obs = torch.randn(3, policy.inputs.width - policy.num_actions - 3)
+    seen = policy.observations(obs)
+    wanted = policy.actor.act(seen, torch.tensor([[0.3, -0.4]]).expand(3, -1), policy.actor.class_of(seen))
+    assert torch.allclose(policy.step(obs, policy.fresh_memory(3))[0], wanted)
+    own = ICL.load_policy(learner.policy_state_dict()).policy
+    assert all(torch.equal(a, b) for a, b in zip(own.parameters(), policy.parameters(), strict=True))
 
 
 def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:

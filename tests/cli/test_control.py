@@ -9,7 +9,6 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.control_arms import arms, control
-from bidex_meta.evaluation.gains import difference_over_runs
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import FINDER
@@ -60,17 +59,6 @@ def test_splits_with_other_classes_are_refused():
     other = PointWorld(6, {"Far": EAST})
     with pytest.raises(BidexError, match="same classes in both splits"):
         control(Finder, world(NORTH, rows=6), other)
-
-
-def test_the_interval_knows_that_runs_differ():
-    generator = np.random.default_rng(0)
-    alike = [1 + generator.normal(size=(20, 10)) for _ in range(4)]
-    apart = [each + shift for each, shift in zip(alike, (-3, -1, 1, 3), strict=True)]
-    narrow, wide = difference_over_runs(alike), difference_over_runs(apart)
-    assert narrow.value == pytest.approx(wide.value) and narrow.interval and wide.interval
-    assert narrow.interval[0] > 0.7 and narrow.interval[1] < 1.3
-    # Seeds of mean square sqrt(5) around the mean, four of them: a standard error of about 1.1.
-    assert wide.interval[0] < -0.5 and wide.interval[1] > 2.5
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import iqm, iqm_difference, over_runs, read_groups, read_histories
-from bidex_meta.evaluation.statistics import bootstrap_band, bootstrap_interval, mean
+from bidex_meta.evaluation.comparison import over_runs, read_groups, read_histories
 from bidex_meta.runs import RunFolder
 from tests.fakes import change, evaluated_run, log
 
@@ -79,23 +78,6 @@ def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
     paths = [evaluated_run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
     [group] = groups(*paths)
     assert (group.label, group.classes, group.seeds, group.steps, group.hours) == ("ppo", ["A", "B"], [0, 1], 2000, 1.0)
-
-
-def test_the_interquartile_mean_leaves_out_the_outer_quarters():
-    values = np.array([[0.0, 0.4], [0.6, 100.0]])
-    assert iqm(values).value == pytest.approx(0.5)
-    interval = iqm(values).interval
-    assert interval is not None and interval[0] <= 0.5 <= interval[1]
-    assert iqm(values[:1]).interval is None
-
-
-def test_a_difference_that_seeds_blur_holds_zero_and_a_clear_one_does_not():
-    low, high = np.array([[0.1, 0.2], [0.12, 0.22], [0.1, 0.21]]), np.array([[0.5, 0.6], [0.52, 0.6], [0.5, 0.63]])
-    clear = iqm_difference(high, low).interval
-    assert clear is not None and clear[0] > 0.3
-    blurred = iqm_difference(np.array([[0.0], [0.5], [1.0]]), np.array([[0.1], [0.4], [0.9]])).interval
-    assert blurred is not None and blurred[0] < 0 < blurred[1]
-    assert iqm_difference(high[:1], low).interval is None
 
 
 def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -202,16 +184,6 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 # Curves over training.
-
-
-def test_a_band_is_the_interval_of_each_point():
-    values = np.random.default_rng(3).normal(size=(8, 4))
-    low, high = bootstrap_band(values)
-    for point in range(4):
-        ends = bootstrap_interval(mean, values[:, point])
-        assert ends is not None
-        width = ends[1] - ends[0]
-        assert (low[point], high[point]) == pytest.approx(ends, abs=0.08 * width)
 
 
 def test_curves_of_runs_meet_where_all_have_values():

@@ -9,7 +9,6 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
-from bidex_meta.evaluation.statistics import bootstrap_interval, mean
 from bidex_meta.experiments.metatest import Options
 from bidex_meta.worlds import Worlds
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
@@ -123,10 +122,6 @@ def test_refusals_name_the_mend():
         evaluate(Seeker(), ToyWorld(4, "DISABLED"), 1)
     with pytest.raises(BidexError, match="whole number from 1"):
         evaluate(Seeker(), ToyWorld(6, "DISABLED"), 0)
-
-
-def test_one_episode_has_no_interval():
-    assert bootstrap_interval(mean, np.array([1.0])) is None
 
 
 @pytest.mark.parametrize("tasks", [5, MANY_TASKS, 50])

@@ -10,8 +10,8 @@ from bidex_meta.evaluation.transfer_measures import (
     add_over_nothing,
     area,
     by_reinforcement,
-    estimate,
     median_steps,
+    over_seeds,
     steps_to,
 )
 from bidex_meta.runs import RunFolder
@@ -75,7 +75,7 @@ def test_success_is_read_off_at_powers_of_ten_before_the_end(tmp_path):
 
 def test_a_start_is_measured_against_nothing_of_the_same_class_and_demonstrations():
     def row(arm, count, *values, name="Near"):
-        return {"class": name, "from": arm, "demonstrations": count, "success": estimate([*values])}
+        return {"class": name, "from": arm, "demonstrations": count, "success": over_seeds([*values])}
 
     rows = [row("run", 1, 0.5, 0.7), row("nothing", 1, 0.1, 0.3), row("run", 5, 0.5), row("run", 1, 0.9, name="Far")]
     add_over_nothing(rows, "success")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate
+from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.utils.files import read_json

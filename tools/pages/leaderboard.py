@@ -7,12 +7,13 @@ from bidex_meta.evaluation.leaderboard import (
     PROFILE,
     Entry,
     check_apart,
-    estimate,
     improvement,
-    iqm,
     profile,
     read_entry,
+    success_iqm,
+    success_rates,
 )
+from bidex_meta.evaluation.statistics import iqm
 from bidex_meta.suite import load_suite, suite_names
 from tools.pages.tables import table
 
@@ -34,15 +35,15 @@ def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
 
 
 def _rank(entry: Entry) -> float:
-    return iqm(entry.success(entry.own))
+    return float(iqm(success_rates(entry.success(entry.own)).ravel()))
 
 
 def _row(place: int, entry: Entry, below: list[Entry]) -> list[str]:
     own, others, stated = entry.success(entry.own), entry.success(entry.others), entry.stated
-    better = estimate(improvement, own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
+    better = improvement(own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
     return [
         str(place), f"{entry.name} ({entry.algorithm})" if entry.name != entry.algorithm else entry.name,
-        *(estimate(iqm, part).text(100.0, " %") for part in (own, others)),
+        *(success_iqm(part).text(100.0, " %") for part in (own, others)),
         *(f"{100 * profile(own, rate):.0f} %" for rate in PROFILE), better,
         str(len(entry.weights)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
         f"{sum(stated.hours) / len(stated.hours):.2f}", stated.device,

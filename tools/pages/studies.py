@@ -12,7 +12,8 @@ import numpy as np
 
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, group_of, iqm
+from bidex_meta.evaluation.comparison import Group, classes_of, curves_of, group_of
+from bidex_meta.evaluation.statistics import Estimate, iqm_over_seeds
 from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun, read_study
 from bidex_meta.utils.plugins import short_name
@@ -33,7 +34,7 @@ class Arm:
     @cached_property
     def success(self) -> Estimate:
         """Interquartile mean over seeds and classes."""
-        return iqm(self.group.success)
+        return iqm_over_seeds(self.group.success)
 
     @cached_property
     def others(self) -> np.ndarray | None:

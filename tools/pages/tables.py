@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from bidex_meta.evaluation.comparison import Estimate, Group, iqm, scored_classes
+from bidex_meta.evaluation.comparison import Group, scored_classes
 from bidex_meta.evaluation.references import Kind, load
+from bidex_meta.evaluation.statistics import Estimate, iqm_over_seeds
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.tasks import registry
 from tools.pages.studies import Study
@@ -66,7 +67,7 @@ def arms_table(study: Study) -> Iterator[str]:
         means = dict(zip(group.classes, group.returns.mean(axis=0), strict=True))
         measured = [_over_seeds(group.success), _over_seeds(arm.others)]
         if not means_only:
-            measured = [arm.success.text(100.0, " %"), "–" if scores is None else iqm(scores).text()]
+            measured = [arm.success.text(100.0, " %"), "–" if scores is None else iqm_over_seeds(scores).text()]
         rows.append([
             group.label, str(len(group.seeds)), group.steps_text(), *measured,
             *(f"{means[name]:.4g}" if name in means else "–" for name in classes),
@@ -76,7 +77,7 @@ def arms_table(study: Study) -> Iterator[str]:
     if random.keys() == set(study.classes):
         success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
         returns = [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
-        value = success.mean() if means_only else iqm(success).value
+        value = success.mean() if means_only else iqm_over_seeds(success).value
         rows.append(["uniform actions", "", "", f"{100 * value:.1f} %", "–", *returns, "", ""])
     return table(head, rows)
 

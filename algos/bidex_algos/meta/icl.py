@@ -15,11 +15,12 @@ from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
 from bidex_algos.meta.config import USUAL_STEPS
+from bidex_algos.meta.memory_agent import MemoryAgent
 from bidex_algos.meta.taught_trials import Steps, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.architecture import network_bytes
-from bidex_algos.nets.evidence import BeliefNet, BeliefPolicy
+from bidex_algos.nets.evidence import Belief, BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Activation, Layers
 from bidex_algos.nets.normalise import RunningStats
@@ -91,7 +92,9 @@ class ICL(TrialLearner):
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
 
     @classmethod
-    def _make_policy(cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device) -> BeliefPolicy:
+    def _make_policy(
+        cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device, belief: Belief | None = None
+    ) -> BeliefPolicy:
         seen, goals = cls._inputs(config, shape), max(1, shape.hidden)  # a 0 where nothing is hidden
 
         def actor(inputs: Inputs) -> BeliefNet:
@@ -102,8 +105,23 @@ class ICL(TrialLearner):
 
         return BeliefPolicy(
             seen, shape.actions, config.candidates, goals, config.try_steps, config.trust, config.init_std,
-            config.reward_unit, config.normalise_observations, actor
+            config.reward_unit, config.normalise_observations, actor, belief=belief
         ).to(device)  # fmt: skip
+
+    @classmethod
+    def load_policy(cls, state: State, device: str | torch.device = "cpu", belief: Belief | None = None) -> MemoryAgent:
+        """Return the agent of a checkpoint; see ``Learner.load_policy``.
+
+        With ``belief``, its actor acts on that belief instead of the learned one.
+        """
+        agent = super().load_policy(state, device)
+        if belief is None:
+            return agent
+        config = ICLConfig(**state["config"])
+        init = torch.Generator().manual_seed(0)
+        policy = cls._make_policy(config, Shape.load(state["shape"]), init, torch.device(device), belief)
+        policy.load_state_dict(agent.policy.state_dict())
+        return MemoryAgent(policy)
 
     def learn_from_teachers(self, teachers: Teachers) -> None:
         """Takes who labels; before the first iteration and before a checkpoint is loaded."""
@@ -281,7 +299,7 @@ class _Pupil:
 
     def missed(self) -> Tensor:
         """Squared distance of what is believed from what the tasks hide, 1/3 for a guess; mean of entries and rows."""
-        return (self._learner.policy.believed(self._state) - self._data.goals[:, 0]).square().mean()
+        return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Keeps what the step was paid, and would have been for the other goals."""

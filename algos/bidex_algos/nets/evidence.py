@@ -7,7 +7,7 @@ which every rewarded step adds its own.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -92,58 +92,109 @@ class BeliefNet(nn.Module):
         return head_of(one_hot, self.head(given), self.classes)
 
 
-class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on the mean of its belief of the goal, and where it explores, on a candidate drawn from it.
+class Belief(Protocol):
+    """Infers the goal, of n normalised numbers, from rewards: a belief over a fixed list of candidates."""
 
-    ``actor`` is a :class:`BeliefNet`. Its memory (N, candidates) adds up log-likelihoods, each counted ``trust`` times:
-    the model's errors in neighbouring steps are alike. A candidate is tried for ``try_steps`` steps in the mean.
-    """
-
-    actor: BeliefNet
-
-    def __init__(
-        self, inputs: Inputs, actions: int, candidates: int, goals: int, try_steps: int, trust: float, *rest: Any
-    ):
-        """``goals``: numbers of a goal; the others as of :class:`RecurrentPolicy`."""
-        super().__init__(inputs, actions, candidates, *rest)
-        self.goals, self.try_steps, self.trust = ObservationNormaliser(goals), try_steps, trust
-
-    def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
-        """Which candidate is tried: the place (rows, 1) in [0, 1) of the sum of their probabilities."""
-        device = self.log_std.device
-        new, again = torch.rand(2, rows, 1, generator=generator, device=device)
-        return new if last is None else torch.where(again < 1.0 / self.try_steps, new, last)
+    @property
+    def candidates(self) -> Tensor:
+        """The goals (C, n) over which belief is distributed."""
+        ...
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Log-likelihoods (N, candidates) of the rewards (N,) that led to raw observations (N, d); 0 if not ``known``.
+        """Return log-likelihoods (N, C) of rewards (N,) that led to raw observations (N, d); 0 where not ``known``."""
+        ...
 
-        They take most of a step's time: where looking costs nothing, unknown ones are left out.
+    def believed(self, state: Tensor) -> Tensor:
+        """Return the goals (N, n) to act on, given the sums (N, C) of the evidence of a trial."""
+        ...
+
+
+class ModelBelief:
+    """The belief by the reward model of a policy's ``actor``, with ``actor.candidates``.
+
+    Each log-likelihood counts ``trust`` times, because the model's errors in successive steps are correlated.
+    """
+
+    def __init__(self, policy: "BeliefPolicy", trust: float):
+        self._policy = policy
+        self._trust = trust
+
+    @property
+    def candidates(self) -> Tensor:
+        """The candidates of the actor, (C, n)."""
+        return self._policy.actor.candidates
+
+    def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
+        """Return what :class:`Belief` says.
+
+        The evidence takes most of a step's time, so on the CPU, where a host sync is free, unknown rewards are skipped.
         """
         if maths.may_look(known.device):
-            found = torch.zeros(len(obs), self.memory)
+            found = torch.zeros(len(obs), len(self.candidates))
             if known.any():
                 found[known] = self._likelihood(obs[known], reward[known])
             return found
         return self._likelihood(obs, reward).masked_fill(~known[:, None], 0.0)
 
-    def _likelihood(self, obs: Tensor, reward: Tensor) -> Tensor:
-        seen, actor = self.observations(obs), self.actor
-        mean, log_std = actor.pays(seen, self.goals(actor.candidates), actor.class_of(seen))
-        off = (self.earned(reward)[:, None] - mean) / log_std.exp()
-        return self.trust * (-0.5 * (_TAIL + 1.0) * torch.log1p(off.square() / _TAIL) - log_std)
-
     def believed(self, state: Tensor) -> Tensor:
-        """Means (N, n) of the beliefs in memories (N, candidates)."""
-        return state.softmax(-1) @ self.actor.candidates
+        """Return the means (N, n) of the beliefs."""
+        return state.softmax(-1) @ self.candidates
+
+    def _likelihood(self, obs: Tensor, reward: Tensor) -> Tensor:
+        policy = self._policy
+        seen = policy.observations(obs)
+        mean, log_std = policy.actor.pays(seen, policy.goals(self.candidates), policy.actor.class_of(seen))
+        off = (policy.earned(reward)[:, None] - mean) / log_std.exp()
+        return self._trust * (-0.5 * (_TAIL + 1.0) * torch.log1p(off.square() / _TAIL) - log_std)
+
+
+class BeliefPolicy(RecurrentPolicy):
+    """A policy that acts on its belief of the goal, and where it explores, on a candidate drawn from the belief.
+
+    ``actor`` is a :class:`BeliefNet`. The memory (N, candidates) sums the evidence of the steps. A candidate is tried
+    for ``try_steps`` steps on average.
+    """
+
+    actor: BeliefNet
+
+    def __init__(
+        self, inputs: Inputs, actions: int, candidates: int, goals: int, try_steps: int, trust: float, *rest: Any,
+        belief: Belief | None = None
+    ):  # fmt: skip
+        """Make the networks and the belief.
+
+        Args:
+            inputs: As of :class:`RecurrentPolicy`, like ``actions`` and ``rest``.
+            actions: Number of actions.
+            candidates: Number of candidates of the actor.
+            goals: Number of entries of a goal.
+            try_steps: Mean number of steps for which exploration keeps a candidate.
+            trust: Weight of the evidence of a :class:`ModelBelief`.
+            rest: The other arguments of :class:`RecurrentPolicy`.
+            belief: Infers the goal. Default: a :class:`ModelBelief` of this policy.
+        """
+        super().__init__(inputs, actions, candidates if belief is None else len(belief.candidates), *rest)
+        self.goals = ObservationNormaliser(goals)
+        self.try_steps = try_steps
+        self.belief: Belief = belief or ModelBelief(self, trust)
+
+    def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
+        """Return which candidate each of ``rows`` environments tries.
+
+        The result (rows, 1) is a place in [0, 1) within the cumulative probabilities of the candidates.
+        """
+        device = self.log_std.device
+        new, again = torch.rand(2, rows, 1, generator=generator, device=device)
+        return new if last is None else torch.where(again < 1.0 / self.try_steps, new, last)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As in the base; where ``drawn`` is negative nothing is tried."""
+        """Return what the base class does; where ``drawn`` is negative nothing is tried."""
         known = memory.known & ~memory.done  # what the last step of an episode led to was not seen
-        state = memory.state + self.evidence(obs, memory.reward, known)
-        goal = self.believed(state)
+        state = memory.state + self.belief.evidence(obs, memory.reward, known)
+        goal = self.belief.believed(state)
         if drawn is not None:
             place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
-            goal = torch.where(drawn < 0.0, goal, self.actor.candidates[place])
+            goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
         seen = self.observations(obs)
         return self.actor.act(seen, self.goals(goal), self.actor.class_of(seen)), state
