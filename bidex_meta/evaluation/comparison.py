@@ -42,15 +42,15 @@ class Group:
     paths: list[Path]  # its run folders, or files of JSON
 
     def steps_text(self) -> str:
-        """The mean number of steps, with its range where seeds differ."""
+        """Return the mean number of steps, with its range if seeds differ."""
         low, high = self.steps_range
         return f"{self.steps:,}" if low == high else f"{self.steps:,} ({low:,} to {high:,})"
 
 
 def read_groups(runs: Sequence[Run]) -> list[Group]:
-    """Evaluated runs by group, in the order they are named.
+    """Return evaluated runs by group, in the order they are named.
 
-    Raises BidexError where one is not evaluated, two are the same, or a group's seeds cover different classes.
+    Raises BidexError if one is not evaluated, two are the same, or a group's seeds cover different classes.
     """
     kinds = [run_kind(run.config(), run.evaluation().get("split", "train")) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
@@ -105,7 +105,7 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
 
 
 def _check_copies(runs: Sequence[Run]) -> None:
-    """Raises BidexError for a run and its copy, whatever seed the copy's config says: both were trained at one time."""
+    """Raise BidexError for a run and its copy, whatever seed the copy's config says: their times are equal."""
     known: dict[tuple[float, ...], Path] = {}
     for run in runs:
         times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
@@ -159,7 +159,7 @@ def classes_of(evaluation: Json, convert: Callable[[Json], Json] = lambda rows: 
 
 
 def scored_classes(run: Run) -> Json:
-    """As :func:`classes_of` of its evaluation, with scores by today's references."""
+    """Return :func:`classes_of` of the run's evaluation, with scores by the current references."""
     config = run.config()
     return classes_of(run.evaluation(), lambda rows: rescored(rows, config))
 
@@ -167,9 +167,12 @@ def scored_classes(run: Run) -> Json:
 def group_of(label: str, runs: Sequence[Run]) -> Group:
     """Evaluated runs that the caller takes as seeds of one group; errors as of :func:`read_groups`."""
     by_seed: dict[int, dict[str, Json]] = {}
-    seconds, steps = defaultdict[int, float](float), defaultdict[int, int](int)
+    seconds = defaultdict[int, float](float)
+    steps = defaultdict[int, int](int)
     for run in runs:
-        seed, goal, own = run.config().seed, run.goal, scored_classes(run)
+        seed = run.config().seed
+        goal = run.goal
+        own = scored_classes(run)
         evaluated = run.evaluation().get("steps", goal)
         if evaluated < goal:
             raise BidexError(
@@ -182,7 +185,8 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         of_seed |= own
         seconds[seed] += training_seconds(run.metrics())
         steps[seed] += goal
-    seeds, classes = sorted(by_seed), list(next(iter(by_seed.values())))
+    seeds = sorted(by_seed)
+    classes = list(by_seed[next(iter(by_seed))])
     for seed in seeds:
         if set(by_seed[seed]) != set(classes):
             raise BidexError(
@@ -229,7 +233,7 @@ def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
 
 
 def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """Mean and 95 % bootstrap interval over runs, of their steps and values (points,); None where no run has a point.
+    """Return mean and 95 % bootstrap interval over runs of their steps and values (points,); None without any point.
 
     Several are interpolated to 200 steps between the last of their first points and the first of their last ones, so
     that each point is of all runs; a run without a point is left out.
@@ -248,7 +252,7 @@ def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
 
 
 def series(rows: list[Json], tag: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and values (points,) of a tag in the rows of a run's metrics that have it."""
+    """Return steps and values (points,) of a tag in those rows of a run's metrics that have it."""
     points = [(row["step"], row[tag]) for row in rows if row.get(tag) is not None]
     steps, values = zip(*points, strict=True) if points else ((), ())
     return np.array(steps, float), np.array(values, float)

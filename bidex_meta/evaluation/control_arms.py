@@ -94,10 +94,11 @@ def _own_minus(
     runs: Sequence[Control], others: Sequence[Sequence[ClassResult]], class_name: str,
     of: Callable[[ClassResult], np.ndarray | None]
 ) -> Difference | None:  # fmt: skip
-    """Own data minus the mean of others, episode by episode."""
+    """Return the paired difference of adaptation to own data and the mean of others."""
     differences = []
     for run, of_run in zip(runs, others, strict=True):
-        own, foreign = of(run.own.classes[class_name]), [of(other) for other in of_run]
+        own = of(run.own.classes[class_name])
+        foreign = [of(other) for other in of_run]
         known = [values for values in foreign if values is not None]
         if own is None or len(known) < len(foreign):
             return None

@@ -32,12 +32,12 @@ class Gains:
     """Mean over classes. Returns of different classes have different scales: of several classes quote the score."""
 
     def to_json(self) -> Json:
-        """The same, ready for JSON."""
+        """Return the gains, ready for JSON."""
         return asdict(self)
 
 
 def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str, np.ndarray]) -> Gains:
-    """``after`` minus ``before``, the same episodes (tasks and starts, in the same order) of two policies.
+    """Return ``after`` minus ``before`` of two policies that played the same tasks and starts in the same order.
 
     ``adaptations``: per class the number of each episode's adaptation, ``(episodes,)``; all have as many episodes.
     """

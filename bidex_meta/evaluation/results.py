@@ -28,40 +28,40 @@ class ClassResult:
 
     @property
     def episodes(self) -> int:
-        """How many episodes were played."""
+        """Return the number of episodes."""
         return len(self.returns)
 
     @property
     def success(self) -> float:
-        """Success rate in [0, 1]."""
+        """Return the success rate in [0, 1]."""
         return float(self.successes.mean())
 
     @property
     def mean_return(self) -> float:
-        """Mean return."""
+        """Return the mean return."""
         return float(self.returns.mean())
 
     @property
     def score(self) -> float | None:
-        """Mean normalised score; None where a reference is missing."""
+        """Return the mean normalised score; None if a reference is missing."""
         scores = self.scores
         return None if scores is None else float(scores.mean())
 
     @property
     def scores(self) -> np.ndarray | None:
-        """The normalised score of every episode, ``(episodes,)``."""
+        """Return the normalised score of each episode, ``(episodes,)``; None if a reference is missing."""
         return None if self.reference is None else self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
-        """``values`` (episodes,) as a bootstrap may resample them: means of tasks; of few tasks as they are.
+        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` of few tasks.
 
-        Episodes of a task are alike (without drawn starts all the same) and, one by one, would feign precision.
+        Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """
         names, task = np.unique(self.tasks, return_inverse=True)
         return values if len(names) < MANY_TASKS else np.bincount(task, values) / np.bincount(task)
 
     def to_json(self) -> Json:
-        """Numbers of this class, ready for JSON."""
+        """Return the numbers of this class, ready for JSON."""
         return {
             "success": self.success, "success_interval": estimate(mean, self.drawn(self.successes)).interval,
             "success_once": self.once, "success_at_end": self.at_end,
@@ -79,7 +79,7 @@ class Evaluation:
     episodes_per_task: int  # episodes of every task
 
     def to_json(self) -> Json:
-        """Everything but the single episodes, ready for JSON."""
+        """Return everything but the single episodes, ready for JSON."""
         return {
             "episodes_per_task": self.episodes_per_task,
             "classes": {name: result.to_json() for name, result in self.classes.items()},
@@ -97,7 +97,7 @@ def results_by_class(
     names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None,
     compared: Sequence[dict[str, np.ndarray]] = ()
 ) -> dict[str, ClassResult]:  # fmt: skip
-    """Results of episodes of ``play_tasks`` by the names of their slots, broken ones as ``counted_returns``.
+    """Return results by slot name for episodes of ``play_tasks``; broken episodes count as ``counted_returns``.
 
     ``compared``: episodes of the policies that this one is compared with.
     """
@@ -107,7 +107,8 @@ def results_by_class(
         finished = [
             each["return"][(each["slot"] == slot) & ~each["unstable"].astype(bool)] for each in (episodes, *compared)
         ]
-        broken, reference = own["unstable"].astype(bool), (references or {}).get(name)
+        broken = own["unstable"].astype(bool)
+        reference = (references or {}).get(name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
