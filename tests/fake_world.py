@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.world.base import make_spaces, split_rows
+from bidex_meta.world.base import make_spaces, split_envs
 from bidex_meta.world.checked import clean
 from bidex_meta.world.contract import Info, Options, State, Step, plain_groups
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
@@ -50,7 +50,7 @@ class FakeWorld(ABC):
         self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
         self.observation_space, self.action_space = spaces.observation, spaces.action
         self.observation_groups = plain_groups(sizes[0], self.num_id_columns)
-        self.slot_env_ids = split_rows(num_envs, self.num_tasks)
+        self.slot_env_ids = split_envs(num_envs, self.num_tasks)
         counts = torch.tensor([rows.stop - rows.start for rows in self.slot_env_ids])
         self.task_id = torch.arange(self.num_tasks).repeat_interleave(counts)
         self._index_in_slot = torch.cat([torch.arange(int(count)) for count in counts])

@@ -59,6 +59,6 @@ def test_the_bare_engines_do_the_physics_of_the_world() -> None:
     for a, b in zip(full.parts, bare.parts, strict=True):
         mine, its = a.group.engine.state_dict(), b.group.engine.state_dict()
         for name in ("qpos", "qvel", "ctrl", "xfrc_applied"):
-            begun = (full._action == 0).all(dim=1)[a.group.rows]  # a row just begun has not been stepped by either
+            begun = (full._action == 0).all(dim=1)[a.group.env_ids]  # a row just begun has not been stepped by either
             assert torch.equal(mine[name], its[name]) or begun.any(), name
             assert torch.equal(mine[name][~begun], its[name][~begun]), name

@@ -1,4 +1,4 @@
-"""What each of several agents observes of a world and which actions are its own (appendix A.2).
+"""Views of several agents on a world: what each observes and which actions are its own (appendix A.2).
 
 The smallest agents are a hand's fingers and its palm (with wrist and base). An agent observes the whole block of each
 hand it has a unit of, and all that is of no hand: object, goal, task id. All share the reward.
@@ -30,20 +30,21 @@ class AgentView:
         return tuple(sorted(i for group in self.groups for part in group.where for i in range(part.start, part.stop)))
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
-        """The groups as they stand in its own observation, which is :attr:`columns` side by side."""
+        """Return the groups as they stand in its own observation, which is :attr:`columns` side by side."""
         index = {column: i for i, column in enumerate(self.columns)}
         parts = [(slice(index[part.start], index[part.stop - 1] + 1) for part in group.where) for group in self.groups]
         return tuple(ObservationGroup(g.name, _joined(where)) for g, where in zip(self.groups, parts, strict=True))
 
 
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
-    """The agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
+    """Return the agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
 
     ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or units by agent; a world without hands has the
     units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError for a unit that is
     unknown, missing or there twice, and where only some bases move.
     """
-    units, views = _units(groups, num_actions), []
+    units = _units(groups, num_actions)
+    views = []
     for name, own in _units_of_agents(units, partition_line(agents)).items():
         others = {f"{side}_hand" for side in SIDES} - {f"{unit.partition('/')[0]}_hand" for unit in own}
         visible = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
@@ -68,7 +69,8 @@ def _has_hands(groups: Sequence[ObservationGroup]) -> bool:
 def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, list[int]]:
     if not _has_hands(groups):
         return {f"action/{i}": [i] for i in range(num_actions)}
-    share, found = num_actions // len(SIDES), dict[str, list[int]]()
+    share = num_actions // len(SIDES)
+    found = dict[str, list[int]]()
     sizes = {group.name: group.size for group in groups}
     whole = sum(block.size for block in hand_blocks("right", moving=share > len(hand().actuated)))
     if any(sizes.get(f"{side}_hand") != whole for side in SIDES):

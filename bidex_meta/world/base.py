@@ -21,7 +21,7 @@ from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 from bidex_meta.world.graphs import EagerStepper, Stepper
-from bidex_meta.world.random import row_keys
+from bidex_meta.world.random import env_keys
 from bidex_meta.world.threads import one_torch_thread
 from bidex_meta.world.wrapper import NumpyWorld
 
@@ -104,7 +104,7 @@ class BatchedWorld(VectorEnv, ABC):
         self.gammas = tuple(slots.gammas)
         self._slots = slots
         self.num_tasks = len(self.task_names)
-        self.slot_env_ids = split_rows(self.num_envs, self.num_tasks)
+        self.slot_env_ids = split_envs(self.num_envs, self.num_tasks)
         counts = [rows.stop - rows.start for rows in self.slot_env_ids]
         self.task_id = torch.arange(self.num_tasks).repeat_interleave(torch.tensor(counts)).to(device)
         self._index_in_slot = torch.cat([torch.arange(count, device=device) for count in counts])
@@ -147,7 +147,7 @@ class BatchedWorld(VectorEnv, ABC):
         """Return the environments' keys, (n, 2), of the random numbers for one purpose."""
         keys = []
         for name, env_ids in zip(self.task_names, self.slot_env_ids, strict=True):
-            keys.append(row_keys(self.seed, name + purpose, env_ids.stop - env_ids.start, self.device))
+            keys.append(env_keys(self.seed, name + purpose, env_ids.stop - env_ids.start, self.device))
         return torch.cat(keys)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
@@ -330,7 +330,7 @@ def make_spaces(single_observation: Box, action_size: int, num_envs: int) -> Spa
     return Spaces(single_observation, single_action, observation, action)
 
 
-def split_rows(num_envs: int, slots: int) -> list[slice]:
+def split_envs(num_envs: int, slots: int) -> list[slice]:
     """Return the contiguous environments of each slot, an even split; the first slots take the remainder."""
     share, rest = divmod(num_envs, slots)
     stops = [share * (i + 1) + min(i + 1, rest) for i in range(slots)]

@@ -1,4 +1,4 @@
-"""What a world is given, checked before anything changes: arguments, actions, saved states, formulas of classes."""
+"""Checks of everything that a world is given, before anything changes: arguments, actions, states, formulas."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
@@ -31,7 +31,7 @@ _ROWS = 11
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
-    """The number of environments; BidexError where it is no whole number or less than the slots."""
+    """Return the number of environments; BidexError unless it is a whole number and at least that of the slots."""
     number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
     if number < len(slots):
         raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
@@ -39,12 +39,12 @@ def num_envs(given: object, slots: Sequence[str]) -> int:
 
 
 def seed(given: object) -> int:
-    """The seed of a world; BidexError where it is no whole number from 0 on."""
+    """Return the seed of a world; BidexError unless it is a whole number from 0 on."""
     return whole_number("seed", given, 0, _LARGEST_SEED)
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:
-    """Raises BidexError for unknown names, and for points that are neither a ``PointsRule`` nor None."""
+    """Raise BidexError for unknown names, and for points that are neither a ``PointsRule`` nor None."""
     for name, given, known in (
         ("task_sampling", task_sampling, ("uniform", "fixed")),
         ("observation", observation, get_args(Rule)),
@@ -56,9 +56,9 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
 
 
 def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Actions as a float32 tensor on the device, without a gradient; non-finite ones are left to :func:`clean`.
+    """Return actions as a float32 tensor on the device, without a gradient; :func:`clean` handles non-finite ones.
 
-    Raises BidexError where they are not real numbers of this shape, or torch's default precision is not single.
+    Raises BidexError if they are not real numbers of this shape, or torch's default precision is not single.
     """
     check_precision()
     wanted = f"Expected actions of shape {shape}"
@@ -71,20 +71,22 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.dev
 
 
 def one_row(action: Any) -> Any:
-    """The action (a,) of a single environment as a batch (1, a); what is no array of numbers stays as it is."""
+    """Return the action (a,) of a single environment as a batch (1, a); anything but an array of numbers unchanged."""
     given = dense(action, torch.device("cpu"))
     return action if given is None else given[None]
 
 
 def clean(action: Tensor) -> tuple[Tensor, Tensor]:
-    """Actions (n, a) clipped to [-1, 1] with 0 for non-finite numbers, and which environments had one, bool (n,)."""
-    # Zero times a number is zero unless it is infinite or none.
+    """Return actions (n, a) clipped to [-1, 1], 0 for non-finite numbers, and which environments had one, bool (n,)."""
+    # Zero times a number is zero unless the number is infinite or NaN.
     broken = (0.0 * action).sum(dim=1) != 0.0
     return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
 
 
 def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """The slots with the pools of a saved state, checked against the world's own state and slots (task_id: (n,)).
+    """Return the slots with the pools of a saved state, checked against the world's own state and slots.
+
+    ``task_id`` (n,): slot of each environment.
 
     Raises BidexError for another world's state, or a damaged one.
     """
@@ -161,7 +163,7 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
 
 
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
-    """Calls a class's methods once, for a few rows of its first task and sensors that all read 0.
+    """Call a class's methods once, for a few rows of its first task and sensors that all read 0.
 
     ``sensors`` has the engine's precision and device; ``observed``: whether ``observe`` is called too. Raises
     BidexError with class, method, the expected and the returned where a method returns something else.

@@ -46,7 +46,7 @@ class Camera:
 
 
 def camera_of(task: TaskClass) -> Camera:
-    """The depth camera of a class: its own, or one that looks down at the target of its pictures."""
+    """Return the depth camera of a class: its own, or one that looks down at the target of its pictures."""
     if task.depth_camera is not None:
         return Camera(*task.depth_camera)
     away = np.array(_DIRECTION) / np.linalg.norm(_DIRECTION)
@@ -109,7 +109,7 @@ class Cloud:
         self._size = len(surfaces.points)
 
     def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Clouds of n environments, world frame, metres: (n, *shape), float32; zeros where nothing is visible.
+        """Return clouds of n environments, world frame, metres: (n, *shape), float32; zeros if nothing is visible.
 
         Fewer visible candidates than points are repeated, of more an even share is taken. Hidden ones change no bit.
         Positions (n, nbody, 3), metres, and rotation matrices (n, nbody, 3, 3) are of the model's bodies.
@@ -134,11 +134,14 @@ class Cloud:
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
     def seen(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Which candidates are visible, (n, P), bool; arguments as of a call."""
+        """Return which candidates are visible, (n, P), bool; arguments as of a call."""
         return self._seen(*self._in_camera(position, rotation))
 
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """To the right, down and forward of the camera (m), and distance to the tangent plane, (n, P) each."""
+        """Return right, down and forward of the candidates from the camera, and distances to their tangent planes.
+
+        Metres, (n, P) each.
+        """
         turn = rotation.index_select(1, self._bodies).float()
         offset = position.index_select(1, self._bodies).float() - self._eye
         poses = torch.cat((self._axes @ turn, (offset @ self._axes.T)[..., None]), dim=3)
@@ -173,7 +176,7 @@ class Cloud:
 
 
 def _spread(buffer: Tensor) -> Tensor:
-    """The minimum over each pixel and its eight neighbours."""
+    """Return the minimum over each pixel and its eight neighbours."""
     wide = buffer.clone()
     torch.minimum(wide[:, :, 1:], buffer[:, :, :-1], out=wide[:, :, 1:])
     torch.minimum(wide[:, :, :-1], buffer[:, :, 1:], out=wide[:, :, :-1])
@@ -190,14 +193,14 @@ _DOT = 0.0035
 
 
 def beside(camera: Camera) -> Camera:
-    """A camera at the same distance from the same target, from the side."""
+    """Return a camera at the same distance from the same target, from the side."""
     far = float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
     x, y, z = camera.target
     return Camera((x, y - 0.94 * far, z + 0.34 * far), camera.target, camera.field_of_view)
 
 
 def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
-    """A picture (height, width, 3), uint8, of points (n, 4): world, metres, and kinds (``surfaces.FIXTURE``, ...).
+    """Draw points (n, 4), world, metres, and kinds (``surfaces.FIXTURE``, ...), as (height, width, 3), uint8.
 
     The camera's field of view fits the smaller side of the picture.
     """

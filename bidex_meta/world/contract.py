@@ -1,16 +1,17 @@
-"""What a batched world is to learners, evaluation and clients: the one page that says what they may rely on.
+"""The contract of batched worlds: learners, evaluation and clients may rely on this page and on nothing else.
 
-``tests/test_contract.py`` holds every world to it. N environments (rows), each of one slot (a task class of the suite;
-MT1: a task of its class). All tensors are on ``device``. What a reset or step returns is the caller's: no later step
-changes it, and changing it, or the action that was given, changes nothing in the world.
+``tests/test_contract.py`` checks every world against it. A world has N environments, each of one slot (a task class of
+the suite; MT1: a task of its class). All tensors are on ``device``. A reset or step returns tensors that the caller
+owns: no later step changes them, and changing them, or the action that was given, changes nothing in the world.
 
-Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) a row that ends starts its next episode within the step;
-the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
-(evaluation, meta-learning) an ended row is frozen: it may be stepped, keeps its observation and its flags and gets
-reward 0, until a ``reset`` whose ``reset_mask`` names it. NEXT_STEP, which Gymnasium's tools expect and no learner of
-ours takes, is between them: the step after its end starts a row's next episode, whatever the action, with reward 0.
+Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) an environment that ends starts its next episode within
+the step; the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In
+DISABLED (evaluation, meta-learning) an ended environment is frozen: it may be stepped, keeps its observation and its
+flags and gets reward 0, until a ``reset`` whose ``reset_mask`` names it. NEXT_STEP, which Gymnasium's tools expect and
+none of our learners uses, lies between them: the step after its end starts an environment's next episode, whatever the
+action, with reward 0.
 
-``info`` of a reset is empty (save ``pixels``); that of a step is about the transition just made:
+``info`` of a reset is empty (except ``pixels``); ``info`` of a step describes the transition just made:
 
 =====================  ====================  ===========================================================================
 key                    shape, type           meaning
@@ -18,15 +19,16 @@ key                    shape, type           meaning
 success                (N,), bool            the goal is met in this state; where success counts at the end, for the
                                              last 15 steps
 unstable               (N,), bool            physics broke, or the action was not finite: reward 0, truncated, the
-                                             transition teaches nothing; never in a frozen row
-reward_unscaled        (N,), float32         reward before the suite's scale of the class; 0 in a frozen row
+                                             transition teaches nothing; never in a frozen environment
+reward_unscaled        (N,), float32         reward before the suite's scale of the class; 0 in a frozen environment
 final_obs              (N, d), float32       the observation that the transition led to; of an unstable one the last
                                              before it
-_final_obs             (N,), bool            rows that ended in this step: there ``final_obs`` is the last of the
-                                             episode; elsewhere it is the observation that the step returns
+_final_obs             (N,), bool            environments that ended in this step: there ``final_obs`` is the last of
+                                             the episode; elsewhere it is the observation that the step returns
 running                dict of (N,)          r (return, float32), l (length, int64), success (by the suite's
                                              rule, bool), unscaled (return, float32), of the episode so far
-episode_mask           (N,), bool            rows whose episode ended and counts (shortened first ones do not)
+episode_mask           (N,), bool            environments whose episode ended and counts (shortened first ones do
+                                             not)
 =====================  ====================  ===========================================================================
 
 The world decides what a successful episode is, by the suite's rule, and reports it in ``running["success"]``: the entry
@@ -35,13 +37,13 @@ there. Nothing else decides: success at several steps must not be combined, beca
 episode can lose it again.
 
 For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
-(``episodes.py``) where a row ended, and on the warp engine, which would have to wait for the answer, in every step:
-zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may add keys
-like these, ``reward_terms`` and ``pixels``; learners may not rely on them.
+(``episodes.py``) when an environment ended, and on the warp engine, which would have to wait for the answer, in every
+step: zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may
+add keys like these, ``reward_terms`` and ``pixels``; learners may not rely on them.
 
-Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
-seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there. A world
-that does so has an attribute ``stagger``, which may be set: whether the next such reset does.
+Shortened first episodes: in SAME_STEP mode the first episode of each environment, after the first reset and after each
+reset with a seed, may begin at a random elapsed step, so that environments do not end together; the time limit counts
+from there. A world that does so has an attribute ``stagger``, which may be set: it decides about the next such reset.
 """
 
 from dataclasses import dataclass
@@ -53,9 +55,9 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 Info = dict[str, Any]
-"""What a step reports; the keys are above."""
+"""Report of a step; the keys are above."""
 Options = dict[str, Any]
-"""Of a reset."""
+"""Options of a reset."""
 State = dict[str, Any]
 """Tensors and plain values, nested, as a checkpoint holds them."""
 Step = tuple[Tensor, Tensor, Tensor, Tensor, Info]
@@ -80,7 +82,7 @@ class ObservationGroup:
 
 
 def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
-    """The groups of a world without parts: ``state``, and the task id if the last ``num_id_columns`` are one-hot."""
+    """Return the groups of a world without parts: ``state``, and ``task_id`` for the last ``num_id_columns``."""
     groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
     return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
 
@@ -112,34 +114,34 @@ class VectorWorld(Protocol):
     """Holds ``autoreset_mode``, gymnasium's SAME_STEP, NEXT_STEP or DISABLED."""
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes; observations (N, d), float32, and an empty info.
+        """Start episodes; return observations (N, d), float32, and an empty info.
 
         Args:
-            seed: Starts all draws anew: equal seeds and actions give equal trajectories. None continues with the old
+            seed: Restarts all draws: equal seeds and actions give equal trajectories. None continues with the old
                 seed's next episodes.
-            options: ``reset_mask``: which environments to start, bool (N,); others stay as they are. All by default.
+            options: ``reset_mask``: environments to start, bool (N,); others stay as they are. All by default.
 
         Raises BidexError for another option, a seed below 0, or a seed with a partial mask.
         """
         ...
 
     def step(self, action: Tensor, /) -> Step:
-        """Takes actions (N, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
+        """Take actions (N, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
 
         Returns observations (N, d), rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
         """
         ...
 
     def state_dict(self) -> State:
-        """Tensors and plain values from which it continues bit for bit, copied."""
+        """Return tensors and plain values from which the world continues bit for bit, copied."""
         ...
 
     def load_state_dict(self, state: State, /) -> None:
-        """Puts back what ``state_dict`` gave, on a world made alike; it may be stepped without a reset."""
+        """Restore a ``state_dict`` of a world that was made alike; it may be stepped without a reset."""
         ...
 
     def close(self) -> None:
-        """Frees what it holds."""
+        """Free the world's resources."""
         ...
 
 
@@ -148,7 +150,7 @@ class TaskWorld(VectorWorld, Protocol):
     """A world whose environments play known tasks of their slot's pool: for evaluation and meta-learning."""
 
     slot_env_ids: list[slice]
-    """Environments of each slot, contiguous."""
+    """Contiguous environments of each slot, as slices."""
     num_slot_tasks: list[int]
     """Tasks in the pool of each slot."""
     task_index: Tensor
@@ -170,7 +172,7 @@ class PooledWorld(TaskWorld, Protocol):
         ...
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Gives slots, by name, other pools; they hold from the next reset on, which must be of all environments.
+        """Give slots, by name, other pools, from the next reset on, which must be of all environments.
 
         Environment j of a slot plays task j mod n if tasks are fixed. Raises BidexError for an unknown slot, a wrong
         shape, or non-finite numbers.

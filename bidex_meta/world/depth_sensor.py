@@ -59,7 +59,7 @@ class DepthSensor:
         self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
 
     def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Zeroes the hidden entries of observations (n, d) and fills in clouds, in place; bodies' poses as of Cloud."""
+        """Zero the hidden entries of observations (n, d) and fill in clouds, in place; bodies' poses as of Cloud."""
         values.index_fill_(1, self._hidden, 0.0)
         values[:, self._columns] = self._cloud(position, rotation).flatten(1)
 
@@ -68,7 +68,7 @@ _OF_HANDS = tuple(f"{side}/" for side in SIDES)
 
 
 def privileged_columns(scene: Scene) -> list[int]:
-    """Indices, ascending, of the observation's entries from which an object's pose or motion could be read.
+    """Return the ascending indices of the observation's entries that show an object's pose or motion.
 
     Every sensor that is not a hand's is replaced by NaN; entries that become NaN depend on one.
     """
@@ -86,7 +86,7 @@ def privileged_columns(scene: Scene) -> list[int]:
 
 
 def _without_objects(scene: Scene) -> TaskState:
-    """The nominal start of the middle of the variation space, objects' sensors NaN, of one environment."""
+    """Return the nominal start of the middle of the variation space, objects' sensors NaN, of one environment."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.start_qpos[: scene.model.nq]
     mujoco.mj_forward(scene.model, data)

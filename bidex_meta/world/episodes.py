@@ -1,4 +1,4 @@
-"""Episodes of a world: their counters, how a reset begins them, and what is reported where they end."""
+"""Episodes of a world: their counters, the arguments of a reset, and the report when they end."""
 
 import time
 from collections.abc import Mapping
@@ -46,13 +46,13 @@ class Episodes:
 
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
-        """Counters of n environments none of which has begun."""
+        """Return counters of n environments none of which has begun."""
         kinds = [torch.int64] * 2 + [torch.bool] * 5 + [torch.int64] + [torch.float32] * 2 + [torch.int64]
         number, *rest = (torch.zeros(num, dtype=kind, device=device) for kind in kinds)
         return cls(number - 1, *rest)
 
     def begin(self, mask: Tensor, elapsed: Tensor) -> None:
-        """Starts episodes in the environments of a mask at a given number of elapsed steps, shape (n,)."""
+        """Start episodes in the environments of a mask at a given number of elapsed steps, shape (n,)."""
         self.elapsed = torch.where(mask, elapsed, self.elapsed)
         self.counts = torch.where(mask, elapsed == 0, self.counts)
         for name in ("finished", "terminated", "truncated", "success"):
@@ -61,7 +61,7 @@ class Episodes:
             setattr(self, name, getattr(self, name).masked_fill(mask, 0))
 
     def add(self, active: Tensor, reward: Tensor, unscaled: Tensor, solved: Tensor) -> None:
-        """Counts one step of the active environments."""
+        """Count one step of the active environments."""
         self.elapsed = self.elapsed + active
         self.length = self.length + active
         self.success = self.success | (solved & active)
@@ -75,28 +75,29 @@ class Episodes:
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
-        """Statistics of the running episodes, as ``info["running"]`` carries them; ``success`` at the end or once."""
+        """Return statistics of the running episodes, as in ``info["running"]``; ``success`` at the end or once."""
         success = self.solved_at_end if at_end else self.success
         values = {"r": self.reward, "l": self.length, "success": success, "unscaled": self.unscaled}
         return {name: value.clone() for name, value in values.items()}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All counters, copied."""
+        """Return all counters, copied."""
         return {f.name: getattr(self, f.name).clone() for f in fields(self)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave."""
+        """Restore a ``state_dict``."""
         for f in fields(self):
             setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))
 
 
 def ended_info(info: Info) -> dict[str, Any]:
-    """Gymnasium's keys for what ended in a step, from the contract's keys; environments outside a mask are zero.
+    """Return Gymnasium's keys for what ended in a step, from the contract's keys; zero outside each mask.
 
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last
     step's values, ``episode`` once more and a mask each; ``_final_info``: ended.
     """
-    ended, episode_mask = info["_final_obs"], info["episode_mask"]
+    ended = info["_final_obs"]
+    episode_mask = info["episode_mask"]
     episode = {name: value.masked_fill(~episode_mask, 0) for name, value in info["running"].items()}
     final: Info = {name: info[name].masked_fill(~ended, 0) for name in _FINAL}
     final |= {f"_{name}": ended for name in _FINAL} | {"episode": dict(episode), "_episode": episode_mask}
@@ -110,20 +111,21 @@ class Clock:
         self._began = torch.full((num,), time.perf_counter(), dtype=torch.float64, device=device)
 
     def begin(self, mask: Tensor) -> None:
-        """Episodes of the environments of a mask begin now."""
+        """Note that episodes of the environments of a mask begin now."""
         self._began = torch.where(mask, time.perf_counter(), self._began)
 
     def stamp(self, info: Info) -> None:
-        """Adds ``t``, float32 (N,), where ``info`` has ended episodes."""
+        """Add ``t``, float32 (N,), if ``info`` has ended episodes."""
         if "episode" in info:
             took = torch.where(info["_episode"], time.perf_counter() - self._began, 0).float()
-            info["episode"]["t"], info["final_info"]["episode"]["t"] = took, took.clone()
+            info["episode"]["t"] = took
+            info["final_info"]["episode"]["t"] = took.clone()
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """The autoreset mode as a member, from any spelling; None: SAME_STEP.
+    """Return the autoreset mode as a member, from any spelling; None: SAME_STEP.
 
-    Raises BidexError for other modes, and where torch's default precision is not single.
+    Raises BidexError for other modes, and if torch's default precision is not single.
     """
     check_precision()
     if mode is None:
@@ -136,7 +138,7 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
 
 
 def set_stagger(world: VectorWorld, stagger: bool) -> None:
-    """Whether first episodes begin at random elapsed steps, from the world's next first reset on.
+    """Set whether first episodes begin at random elapsed steps, from the world's next first reset on.
 
     Other libraries sum rewards from the first step to the first end, so what is made for them begins at 0 by default.
     The world may be wrapped; one without ``stagger`` is left as it is.
@@ -148,7 +150,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
 
 
 def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
-    """The environments that ``reset`` shall start, bool (num_envs,): those of ``reset_mask``, else all.
+    """Return the environments that ``reset`` starts, bool (num_envs,): those of ``reset_mask``, else all.
 
     Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and where
     torch's default precision is not single.
@@ -174,7 +176,7 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
 
 
 def checked_seed(seed: object, mask: Tensor) -> int:
-    """The seed of a reset; BidexError where it is no whole number from 0 on, or comes with a partial mask."""
+    """Return the seed of a reset; BidexError unless it is a whole number from 0 on and all environments start."""
     number = whole_number("seed", seed, 0)
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")
@@ -182,7 +184,7 @@ def checked_seed(seed: object, mask: Tensor) -> int:
 
 
 def check_single_reset(seed: object, options: object) -> None:
-    """Raise BidexError unless a single environment can be reset so: with a seed from 0 on or None, without options."""
+    """Raise BidexError unless the seed is None or a whole number from 0 on, and there are no options."""
     if seed is not None:
         whole_number("seed", seed, 0)
     if options is not None and not isinstance(options, Mapping):

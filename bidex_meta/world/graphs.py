@@ -1,7 +1,7 @@
-"""How a step keeps an accelerator busy: engines side by side on streams, torch's work as CUDA graphs.
+"""Ways to keep an accelerator busy during a step: engines side by side on streams, torch's work as CUDA graphs.
 
-Launched one by one, torch's kernels would take longer than the physics. The state that a stretch of work reads and
-leaves behind lives in tensors at fixed addresses; so does what it returns, which its next replay overwrites.
+If torch's kernels were launched one by one, they would take longer than the physics. The state that a stretch of work
+reads and leaves behind lives in tensors at fixed addresses; so does its result, which its next replay overwrites.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -26,7 +26,7 @@ stepped a few times only, or whose tasks change as often, never pays for a recor
 
 
 def cuda_graph(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
-    """Records work as one CUDA graph."""
+    """Record work as one CUDA graph."""
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         result = work()
@@ -166,7 +166,7 @@ class SideBySide:
         self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
 
     def run(self, jobs: Sequence[Callable[[], None]]) -> None:
-        """Does the jobs.
+        """Do the jobs.
 
         On CUDA what comes after in the caller's stream waits for them all, and they for what came before, in a
         recording too, where they become branches of the graph. What they read must live until this ends.

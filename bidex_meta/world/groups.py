@@ -1,9 +1,10 @@
-"""Rows of equal structure share one engine batch."""
+"""Groups of environments whose models have equal structure and share one engine batch."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+import mujoco
 import numpy as np
 import torch
 from msgspec import Meta
@@ -40,7 +41,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Member:
-    """A slot's rows in the world and in its group's engine, both contiguous."""
+    """A slot's environments in the world and its rows in its group's engine, both contiguous."""
 
     slot: int
     scene: Scene
@@ -54,24 +55,25 @@ class Group:
 
     engine: Engine
     members: tuple[Member, ...]
-    rows: Tensor
-    """World row of each simulation, shape (num,), int64."""
+    env_ids: Tensor
+    """Environment of each simulation, shape (num,), int64."""
     span: slice | None
-    """The same as a slice if they are contiguous, else None."""
+    """The environments as a slice if they are contiguous, else None."""
 
     def take(self, values: Tensor) -> Tensor:
-        """This group's rows of a tensor over the world's rows (a view where the rows are contiguous)."""
-        return values[self.span] if self.span is not None else values[self.rows]
+        """Return this group's part of a tensor over all environments (a view if they are contiguous)."""
+        return values[self.span] if self.span is not None else values[self.env_ids]
 
 
 def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
-    """The slots, those named with other pools of tasks; see :func:`with_pool`.
+    """Return the slots with other pools of tasks for those named; see :func:`with_pool`.
 
     Raises BidexError for an unknown slot.
     """
     if not isinstance(pools, Mapping):
         raise BidexError(f"Expected tasks as a dict from slot to variations, got {type(pools).__name__}.")
-    slots, names = list(slots), [slot.name for slot in slots]
+    slots = list(slots)
+    names = [slot.name for slot in slots]
     for name, tasks in pools.items():
         if name not in names:
             raise BidexError(f"Expected a slot among {', '.join(names)}, got {name!r}.")
@@ -81,7 +83,7 @@ def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
 
 
 def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
-    """The slot with another pool of tasks, shape (n, variation_space.size), of which it keeps a copy.
+    """Return the slot with a copy of another pool of tasks, shape (n, variation_space.size).
 
     Raises BidexError for a wrong shape, or numbers that are not finite.
     """
@@ -106,8 +108,11 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
     return replace(slot, tasks=tasks)
 
 
-def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker) -> list[Group]:
-    """Compiles the slots' scenes and puts those of equal structure together, in the slots' order."""
+def build_groups(slots: list[Slot], env_ids: list[slice], make_engine: EngineMaker) -> list[Group]:
+    """Compile the slots' scenes and put those of equal structure together, in the slots' order.
+
+    ``env_ids``: contiguous environments of each slot.
+    """
     scenes: dict[Hashable, Scene] = {}
     pools: list[list[int]] = []
     for slot in slots:
@@ -119,11 +124,11 @@ def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker)
         if home is None:
             pools.append(home := [])
         home.append(i)
-    return [_build_group([(i, by_slot[i], rows[i]) for i in pool], make_engine) for pool in pools]
+    return [_build_group([(i, by_slot[i], env_ids[i]) for i in pool], make_engine) for pool in pools]
 
 
 def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
-    """The depth sensor of each slot, in the slots' order; ``first``: where in an observation the clouds begin."""
+    """Return the depth sensor of each slot, in the slots' order; clouds begin at entry ``first`` of observations."""
     scenes = {m.slot: (m.scene, group.engine.device) for group in groups for m in group.members}
     unique = {id(scene): (scene, device) for scene, device in scenes.values()}
     sensors = {key: DepthSensor(scene, rule, first, device) for key, (scene, device) in unique.items()}
@@ -131,21 +136,25 @@ def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSenso
 
 
 def _alike(a: Scene, b: Scene) -> bool:
-    """Whether two scenes may share an engine and an observer."""
+    """Return whether two scenes may share an engine and an observer."""
     return a.task.layout == b.task.layout and same_structure(a.model, b.model)
 
 
-def _build_group(places: list[tuple[int, Scene, slice]], make_engine: EngineMaker) -> Group:
-    members, model_of_row, models, start = [], [], [], 0
-    for slot, scene, env_ids in places:
-        count = env_ids.stop - env_ids.start
-        members.append(Member(slot, scene, env_ids, slice(start, start + count)))
+def _build_group(slots: list[tuple[int, Scene, slice]], make_engine: EngineMaker) -> Group:
+    members: list[Member] = []
+    model_of_row: list[int] = []
+    models: list[mujoco.MjModel] = []
+    start = 0
+    for slot, scene, own in slots:
+        count = own.stop - own.start
+        members.append(Member(slot, scene, own, slice(start, start + count)))
         if scene.model not in models:
             models.append(scene.model)
         model_of_row += [models.index(scene.model)] * count
         start += count
-    rows = torch.cat([torch.arange(m.env_ids.start, m.env_ids.stop) for m in members])
-    first, last = int(rows[0]), int(rows[-1])
-    span = slice(first, last + 1) if last - first + 1 == len(rows) else None
-    engine = make_engine(models, model_of_row, room_for([scene.task.needs for _, scene, _ in places]))
-    return Group(engine, tuple(members), rows.to(engine.device), span)
+    env_ids = torch.cat([torch.arange(m.env_ids.start, m.env_ids.stop) for m in members])
+    first = int(env_ids[0])
+    last = int(env_ids[-1])
+    span = slice(first, last + 1) if last - first + 1 == len(env_ids) else None
+    engine = make_engine(models, model_of_row, room_for([scene.task.needs for _, scene, _ in slots]))
+    return Group(engine, tuple(members), env_ids.to(engine.device), span)

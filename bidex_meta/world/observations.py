@@ -27,7 +27,7 @@ class Observer:
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Looks up source, factor and offset of every entry; ``scene`` is any whose task has the layout.
+        """Look up source, factor and offset of every entry; ``scene`` is any whose task has the layout.
 
         ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
         the observation with padding and task id.
@@ -49,7 +49,8 @@ class Observer:
                 self._source[where] = torch.cat([_indices(scene, name) for name in block.sensors]).to(device)
                 self._scale[where] = block.scale
             if block.name.endswith("joint_position"):
-                self._scale[where], self._offset[where] = 2.0 / span, -middle / span
+                self._scale[where] = 2.0 / span
+                self._offset[where] = -middle / span
         share = scene.task.action_size // len(SIDES)
         for i, side in enumerate(SIDES):
             self._take(f"{side}_action", sensors + i * share)
@@ -85,32 +86,33 @@ class Observer:
         return found
 
     def choose_signs(self, values: Tensor) -> None:
-        """Turns quaternions of objects and goals in observations (n, width), in place, to w >= 0 (wide variation)."""
+        """Turn quaternions of objects and goals in observations (n, width), in place, to w >= 0 (wide variation)."""
         if len(self._quaternions):
             columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
             turns = values[:, columns].unflatten(1, (-1, 4))
             values[:, columns] = torch.where(turns[..., 3:] < 0.0, -turns, turns).flatten(1)
 
     def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Orientations of both mounts and the inverse of those at the start, (x, y, z, w), each (n, 2, 4)."""
+        """Return orientations of both mounts, and the inverse of those at the start, (x, y, z, w), each (n, 2, 4)."""
         return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
 
     def __call__(self, sensors: Tensor, action: Tensor, rotation: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Observations of some rows (n, width), float32, without the tasks' own blocks, not yet clipped.
+        """Return observations of some rows (n, width), float32, without the tasks' own blocks, not yet clipped.
 
         From sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3; None for fixed bases); written
         into ``out`` where it is given.
         """
         values = self._values[: len(sensors)]
         sensed, acted, turned = self._columns
-        values[:, sensed], values[:, acted] = sensors, action
+        values[:, sensed] = sensors
+        values[:, acted] = action
         if rotation is not None:
             values[:, turned] = rotation.flatten(1)
         return torch.index_select(values, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
 
 
 def _indices(scene: Scene, name: str) -> Tensor:
-    """Indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
+    """Return the indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
     return xyzw(indices) if name.endswith("quaternion") else indices
@@ -123,7 +125,7 @@ def observation_groups(
     hidden: Sequence[Sequence[int]] | None = None,
     points: tuple[str, int] | None = None,
 ) -> tuple[ObservationGroup, ...]:
-    """Groups that hold for all of a world's classes; entries of different kinds are in ``task``.
+    """Return groups that hold for all of a world's classes; entries of different kinds are in ``task``.
 
     ``width``: entries before the task id, at least those of each layout; ``hidden``: entries of each layout that are
     zero, as padding is; ``points``: name and entries of the cloud between the padded observation and the task id.

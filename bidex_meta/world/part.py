@@ -39,7 +39,7 @@ class Controls:
             self._wrench[member.engine_rows, 3:] = TORQUE_PER_SCALE * task.orientation_scale
 
     def write(self, action: Tensor) -> None:
-        """Sets targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
+        """Set targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
 
         ``action``: clean, shape (num, 52 or 40).
         """
@@ -70,10 +70,13 @@ class Part:
 
         ``sights``: depth sensor of each of its slots; None: observations show objects' states.
         """
-        self.group, self._engine, self._rule, self._sights = group, group.engine, rule, sights
+        self.group = group
+        self._engine = group.engine
+        self._rule = rule
+        self._sights = sights
         self.engine_rows = torch.full((num_envs,), -1, device=self._engine.device)
         """Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,)."""
-        self.engine_rows[group.rows] = torch.arange(self._engine.num, device=self._engine.device)
+        self.engine_rows[group.env_ids] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
         self.looks = self._engine.device.type == "cpu"
@@ -104,28 +107,28 @@ class Part:
         ]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Frozen numbers of a member's environments, by their tasks' indices in the pool."""
+        """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
-        """Writes the actions of the part's environments, shape (num, a), into the engine."""
+        """Write the actions of the part's environments, shape (num, a), into the engine."""
         self._controls.write(action)
 
     def step(self, action: Tensor, active: Tensor | None) -> None:
-        """Applies actions, shape (num, a), and advances all environments, or those of the mask, by a control step."""
+        """Apply actions, shape (num, a), and advance all environments, or those of the mask, by a control step."""
         self.control(action)
         self.advance(active)
 
     def advance(self, active: Tensor | None) -> None:
-        """Advances all environments, or those of the mask, by one control step."""
+        """Advance all environments, or those of the mask, by one control step."""
         self._engine.step(self.substeps, active)
 
     def unstable(self) -> Tensor:
-        """Which environments broke since their last reset. Shape (num,), bool."""
+        """Return which environments broke since their last reset, shape (num,), bool."""
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """The members among some rows, the slice of their rows, and their state.
+        """Yield the members among some rows, the slice of their rows, and their state.
 
         ``task_index``: task of each of the part's environments, (num,); ``rows``: engine rows, ascending, None for all.
         """
@@ -134,7 +137,7 @@ class Part:
             yield member, where, TaskState(self._engine.sensordata[chosen], member.scene.sensors, frozen)
 
     def members(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
-        """Index, member, slice among the chosen rows, and engine rows of the members that have rows among them."""
+        """Yield index, member, slice among the chosen rows, and engine rows of each member that has chosen rows."""
         for i, member in enumerate(self.group.members):
             if rows is None:
                 yield i, member, member.engine_rows, member.engine_rows
@@ -152,7 +155,7 @@ class Part:
         return None if self._engine.masked else self.group.take(mask).nonzero().squeeze(1)
 
     def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
-        """See ``Observer.mounts``; of engine rows, None: all. None where the bases are fixed."""
+        """See ``Observer.mounts``; of engine rows, None: all. Returns None if the bases are fixed."""
         chosen = slice(None) if rows is None else rows
         return self._observer.mounts(self._engine.sensordata[chosen], chosen) if self._observer.moving else None
 
@@ -164,7 +167,7 @@ class Part:
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
+        """Return observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
 
         ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a), ``rotation`` what
         ``base_rotations`` did; ``out`` (n, width) is written into where it is given.
@@ -193,7 +196,7 @@ class Part:
                 values[where, self._observer.layout.range(name)] = block.float()
 
     def goals(self, task_index: Tensor, width: int) -> Tensor:
-        """The goals' entries of observations (num, width), as a suite that hides nothing shows them, zero elsewhere.
+        """Return the goals' entries of observations (num, width), as if nothing were hidden, zero elsewhere.
 
         ``task_index``: task of each of the part's environments, (num,).
         """
@@ -203,14 +206,14 @@ class Part:
         return values.clamp_(-CLIP, CLIP)
 
     def check_formulas(self, task_index: Tensor) -> None:
-        """Raise BidexError where a class of the user's own gives numbers that are not finite in the present state."""
+        """Raise BidexError if a class of the user's own gives numbers that are not finite in the present state."""
         for member, _, state in self.states(task_index):
             task = member.scene.task
             checked.own_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
             checked.own_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
-        """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
+        """Return start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
         ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
         numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,).
@@ -249,7 +252,7 @@ class PartedWorld(Protocol):
 
 
 def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None = None) -> Sequence[Tensor | None]:
-    """Roll, pitch and yaw (n, 2, 3) of both bases since the start, of engine rows (None: all) of each part.
+    """Return roll, pitch and yaw (n, 2, 3) of both bases since the start, of engine rows (None: all) of each part.
 
     All parts at once: a dozen operations on a few rows take as long as on all.
     """
@@ -272,7 +275,7 @@ class Judgement(NamedTuple):
 
 
 def judge(task: TaskClass, state: TaskState) -> Judgement:
-    """Reward, success and true ends of the step just made."""
+    """Return reward, success and true ends of the step just made."""
     terms = task.rewards(state)
     values = list(terms.values())
     reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
@@ -280,13 +283,15 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
 
 
 def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together) -> Transition:
-    """Judges and observes all environments after a step, part by part at the same time.
+    """Judge and observe all environments after a step, part by part at the same time.
 
     ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations, whose task ids are not
     written.
     """
-    n, device = len(action), action.device
-    reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)
+    n = len(action)
+    device = action.device
+    reward = torch.empty(n, device=device)
+    obs = torch.empty(n, width, device=device)
     success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=device).unbind()
     found: list[tuple[slice, dict[str, Tensor]]] = []
 
@@ -297,20 +302,23 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
         values = part.observe(states, group.take(action), rotation, out=out)
         broke = part.unstable()
         for member, where, state in states:
-            rows, judged = member.env_ids, judge(member.scene.task, state)
+            env_ids = member.env_ids
+            judged = judge(member.scene.task, state)
             if part.looks:
                 checked.own_numbers(member.scene.task, "reward_terms", judged.terms, part.unstable, member.engine_rows)
-            reward[rows], success[rows], failed[rows] = judged.reward, judged.success, judged.failed
-            unstable[rows] = broke[where]
-            found.append((rows, judged.terms))
+            reward[env_ids] = judged.reward
+            success[env_ids] = judged.success
+            failed[env_ids] = judged.failed
+            unstable[env_ids] = broke[where]
+            found.append((env_ids, judged.terms))
             if out is None:
-                obs[rows] = values[where]
+                obs[env_ids] = values[where]
 
     rotations = base_rotations(parts)
     together([partial(look, part, rotation) for part, rotation in zip(parts, rotations, strict=True)])
     names = list(dict.fromkeys(name for _, own in found for name in own))
     terms = dict(zip(names, torch.zeros(len(names), n, device=device), strict=True))
-    for rows, own in found:
+    for env_ids, own in found:
         for name, value in own.items():
-            terms[name][rows] = value
+            terms[name][env_ids] = value
     return Transition(obs, reward, success, failed, unstable, terms)

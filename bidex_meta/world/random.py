@@ -1,7 +1,7 @@
 """Counter-based random numbers: a pure function of key and counter, with no generator to store.
 
 Threefry-2x32 with 20 rounds (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), in integer torch
-operations, so that the numbers are the same on every device, for any subset of rows, and for free after a resume.
+operations, so that the numbers are the same on every device, for any subset of environments, and after a resume.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two 32-bit words per counter, from two words of key and of counter: int64 below 2^32, broadcast together."""
+    """Return two 32-bit words per counter, from two words of key and counter: int64 below 2^32, broadcast together."""
     k0, k1 = key
     keys = (k0, k1, k0 ^ k1 ^ _PARITY)
     x0, x1 = torch.broadcast_tensors((counter[0] + k0) & _MASK, (counter[1] + k1) & _MASK)
@@ -29,8 +29,8 @@ def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tupl
     return x0, x1
 
 
-def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
-    """One key (two words) per row of a class, from seed, class name and index in it alone, int64 (count, 2)."""
+def env_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
+    """Return one key (two words) per environment of a class, from seed, class and index alone, int64 (count, 2)."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     words = [torch.tensor(int.from_bytes(digest[i : i + 4], "little"), device=device) for i in (0, 4)]
     index = torch.arange(count, device=device)
@@ -38,20 +38,20 @@ def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
 
 
 def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
-    """Keys (n, 2) of a stream of numbers within an episode (n,), from the keys (n, 2) of its environment."""
+    """Return keys (n, 2) of a stream of numbers within an episode (n,), from the keys (n, 2) of its environment."""
     beyond = torch.full_like(episode, _MASK - stream)  # no pair of an episode's own draws is counted so far
     return torch.stack(threefry((keys[:, 0], keys[:, 1]), (episode, beyond)), dim=1)
 
 
 def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
-    """Standard normal numbers, float32 (n, draws), that depend on the same as ``uniform``'s."""
+    """Return standard normal numbers, float32 (n, draws), of the same keys, episodes and draws as ``uniform``."""
     pairs = uniform(keys, episode, draws + draws % 2).float().unflatten(1, (-1, 2))
     radius, angle = (-2.0 * torch.log1p(-pairs[..., 0])).sqrt(), 2.0 * math.pi * pairs[..., 1]
     return torch.stack((radius * angle.cos(), radius * angle.sin()), dim=2).flatten(1)[:, :draws]
 
 
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
-    """Uniform numbers in [0, 1), float64 (n, draws), that depend on key (n, 2), episode (n,) and draw alone.
+    """Return uniform numbers in [0, 1), float64 (n, draws), that depend on key (n, 2), episode (n,) and draw alone.
 
     They are multiples of 2^-24, so exact in single precision.
     """

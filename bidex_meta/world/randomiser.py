@@ -1,4 +1,4 @@
-"""Domain randomisation of a world: what is drawn, and how it gets into models, actions and observations.
+"""Domain randomisation of a world: draws, and their way into models, actions and observations.
 
 A draw depends on seed, slot, environment, episode and, of noise and pushes, on the elapsed steps alone.
 """
@@ -22,7 +22,7 @@ _DELAY = "action_delay"
 
 
 class Randomiser:
-    """What is drawn for the environments of a world."""
+    """Draws for the environments of a world."""
 
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
         """``deviation``: of the observations' noise, (n, width), or of none of their columns.
@@ -48,16 +48,18 @@ class Randomiser:
         return most + 1 if most else 0
 
     def seed(self, keys: Tensor) -> None:
-        """Takes the environments' random keys, (n, 2), for all that is drawn from now on."""
+        """Take the environments' random keys, (n, 2), for all later draws."""
         self._keys.copy_(keys)
 
     def begin(self, mask: Tensor, number: Tensor) -> None:
-        """Draws for the episodes ``number`` (n,) of the environments of a mask (n,), and changes their models."""
+        """Draw for the episodes ``number`` (n,) of the environments of a mask (n,), and change their models."""
         masked = self._parts[0].group.engine.masked
-        rows = torch.arange(len(mask), device=mask.device) if masked else mask.nonzero().squeeze(1)
-        keys, episode, new = self._keys[rows], number[rows], mask[rows]
+        env_ids = torch.arange(len(mask), device=mask.device) if masked else mask.nonzero().squeeze(1)
+        keys = self._keys[env_ids]
+        episode = number[env_ids]
+        new = mask[env_ids]
         for i, stream in enumerate(self._streams):
-            stream[rows] = torch.where(new[:, None], derived(keys, episode, i), stream[rows])
+            stream[env_ids] = torch.where(new[:, None], derived(keys, episode, i), stream[env_ids])
         counter = episode if self._rule.draw == "episode" else torch.zeros_like(episode)
         share = uniform(keys, counter, len(FACTORS) + 1)
         for name, drawn in self.drawn.items():
@@ -66,21 +68,21 @@ class Randomiser:
                 value = low + (share[:, -1] * (high - low + 1)).long()
             else:
                 value = low + share[:, FACTORS.index(name)] * (high - low)
-            drawn[rows] = torch.where(new, value, drawn[rows])
+            drawn[env_ids] = torch.where(new, value, drawn[env_ids])
         for models in self._models:
             models.write(self.drawn, mask)
 
     def lift(self, starts: Sequence[Tensor], mask: Tensor) -> None:
-        """Raises larger objects in the starts of a mask's environments (of each part, see ``Starts.take``), in place.
+        """Lift larger objects in the starts of a mask's environments (of each part, see ``Starts.take``), in place.
 
-        So that they do not begin within what they lie on.
+        Otherwise they would begin within the surface that they lie on.
         """
         if "object_size" in self.drawn:
             for models, start in zip(self._models, starts, strict=True):
                 models.lift(start, self.drawn["object_size"], mask)
 
     def act(self, action: Tensor, past: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
-        """What of the actions (n, a) comes to the engines, and the remembered ones; pushes objects.
+        """Return the actions (n, a) that the engines get, and the remembered ones; push objects.
 
         ``past``: the remembered actions, newest first, (n, ``remembered``, a); ``elapsed``: steps since the start (n,).
         """
@@ -99,12 +101,12 @@ class Randomiser:
                 models.push(CONTROL_RATE * change)
         return action, past
 
-    def observe(self, obs: Tensor, elapsed: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-        """Observations (k, width) of some environments with noise; ``elapsed``: their steps since the start, (k,)."""
+    def observe(self, obs: Tensor, elapsed: Tensor, env_ids: Tensor | slice = slice(None)) -> Tensor:
+        """Return observations (k, width) of some environments with noise; ``elapsed`` (k,): their steps so far."""
         if not self._rule.observation_noise:
             return obs
-        noise = normal(self._streams[_OBSERVATION][rows], elapsed, self._deviation.shape[1])
-        noisy = (obs[:, : noise.shape[1]] + self._deviation[rows] * noise).clamp(-CLIP, CLIP)
+        noise = normal(self._streams[_OBSERVATION][env_ids], elapsed, self._deviation.shape[1])
+        noisy = (obs[:, : noise.shape[1]] + self._deviation[env_ids] * noise).clamp(-CLIP, CLIP)
         return torch.cat((noisy, obs[:, noise.shape[1] :]), dim=1)
 
 
@@ -126,7 +128,7 @@ class _Models:
         self._heights = [heights(member.scene) for member in members]
 
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:
-        """Multiplies fields of the models of a mask's environments, as they were compiled, by what was drawn."""
+        """Multiply fields of the models of a mask's environments, as they were compiled, by the drawn factors."""
         if not self._fields:
             return
         group = self._part.group
@@ -140,14 +142,14 @@ class _Models:
                 field[rows] = torch.where(new[rows], value.to(field.dtype), field[rows])
 
     def lift(self, start: Tensor, size: Tensor, mask: Tensor) -> None:
-        """See ``Randomiser.lift``; of this part."""
+        """See ``Randomiser.lift``; for this part."""
         size = self._part.group.take(size)
         for i, _, where, rows in self._part.members(self._part.rows_in(mask)):
             for column, height in self._heights[i].items():
                 start[where, column] += (height * (size[rows] - 1.0)).to(start.dtype)
 
     def push(self, acceleration: Tensor) -> None:
-        """Forces on all objects that accelerate them so, (n, 3), m/s², for the next control step."""
+        """Push all objects with forces that give this acceleration, (n, 3), m/s², for the next control step."""
         acceleration = self._part.group.take(acceleration)
         masses = self._fields.get("body_mass")
         for member, first, nominal in zip(self._part.group.members, self._first, self._masses, strict=True):
@@ -157,9 +159,9 @@ class _Models:
 
 
 def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
-    """Of the noise on observations of each slot, (slots, columns), float32: what is sensed, unless it is hidden.
+    """Return the noise's standard deviation in each slot's observations, (slots, columns), float32.
 
-    Goals, actions and what a point cloud replaces (``hidden``, columns of each slot) have none.
+    Goals, actions and columns that a point cloud replaces (``hidden``, of each slot) have no noise.
     """
     table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
     for row, layout, zero in zip(table, layouts, hidden, strict=True):

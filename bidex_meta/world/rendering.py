@@ -1,4 +1,4 @@
-"""Pictures of a row: its scene from a fixed camera, with its goal as a ghost if observations show it."""
+"""Pictures of an environment: its scene from a fixed camera, with its goal as a ghost if observations show it."""
 
 import threading
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,7 +41,7 @@ class DrawnGhost(NamedTuple):
 
 
 class Painter(threading.local):
-    """Draws rows of a world; renderers are cached. A copy starts without any: they cannot be copied.
+    """Draws environments of a world; renderers are cached. A copy starts without renderers: they cannot be copied.
 
     A renderer draws in the thread that made it alone. Each thread therefore has its own cache, which ends with it.
     """
@@ -52,47 +52,48 @@ class Painter(threading.local):
     def __reduce__(self) -> tuple[Any, ...]:
         return Painter, ()
 
-    def picture(self, world: "PartedWorld", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
-        """A picture of a row, shape (height, width, 3), uint8.
+    def picture(self, world: "PartedWorld", env_id: int, width: int, height: int, camera: str | None) -> np.ndarray:
+        """Draw an environment, shape (height, width, 3), uint8.
 
-        Raises BidexError for an unknown camera or row, too large a picture, or a machine that cannot draw.
+        Raises BidexError for an unknown camera or environment, too large a picture, or a machine that cannot draw.
         """
         name = "front" if camera is None else camera
         if not isinstance(name, str) or name not in CAMERAS:
             raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {shortened(name)}.")
-        if not 0 <= row < world.num_envs:
-            raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
-        engine, engine_row, scene = simulation(world, row)
-        return self._draw(world, row, name, (width, height), scene, engine.placement()[engine_row])
+        if not 0 <= env_id < world.num_envs:
+            raise BidexError(f"Expected an env_id from 0 to {world.num_envs - 1}, got {env_id}.")
+        engine, engine_row, scene = simulation(world, env_id)
+        return self._draw(world, env_id, name, (width, height), scene, engine.placement()[engine_row])
 
     def pictures(self, world: "PartedWorld", size: int) -> torch.Tensor:
-        """Square pictures of all rows by their classes' own cameras, (num_envs, size, size, 3), uint8, on the CPU."""
-        found = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8)
+        """Draw all environments by their classes' own cameras, (num_envs, size, size, 3), uint8, on the CPU."""
+        pictures = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8)
         for part in world.parts:
-            placement, rows = part.group.engine.placement().cpu(), part.group.rows.tolist()
+            placement = part.group.engine.placement().cpu()
+            env_ids = part.group.env_ids.tolist()
             for member in part.group.members:
                 for at in range(member.engine_rows.start, member.engine_rows.stop):
-                    picture = self._draw(world, rows[at], "front", (size, size), member.scene, placement[at])
-                    found[rows[at]] = torch.from_numpy(picture)
-        return found
+                    picture = self._draw(world, env_ids[at], "front", (size, size), member.scene, placement[at])
+                    pictures[env_ids[at]] = torch.from_numpy(picture)
+        return pictures
 
     def _draw(
         self,
         world: "PartedWorld",
-        row: int,
+        env_id: int,
         camera: str,
         size: tuple[int, int],
         scene: "Scene",
         placement: torch.Tensor,
     ) -> np.ndarray:
-        renderer, data = self._renderer(scene.dressed, (int(world.task_id[row]), *size))
+        renderer, data = self._renderer(scene.dressed, (int(world.task_id[env_id]), *size))
         pose(scene.dressed, data, placement)
-        renderer.update_scene(data, _camera(world, row, camera))
-        add_ghosts(ghosts(world, row), renderer.scene)
+        renderer.update_scene(data, _camera(world, env_id, camera))
+        add_ghosts(ghosts(world, env_id), renderer.scene)
         return renderer.render()
 
     def _renderer(self, model: mujoco.MjModel, key: tuple[int, int, int]) -> tuple[mujoco.Renderer, mujoco.MjData]:
-        """That of a slot (its rows have one model) and a size, width and height."""
+        """Return the renderer of a slot (its environments have one model) and a size, width and height."""
         if key not in self._renderers:
             gl_backend.prepare()
             most = model.vis.global_.offwidth, model.vis.global_.offheight
@@ -115,30 +116,30 @@ class Painter(threading.local):
             self._renderers.popitem()[1][0].close()
 
 
-def _camera(world: "PartedWorld", row: int, name: str) -> mujoco.MjvCamera:
+def _camera(world: "PartedWorld", env_id: int, name: str) -> mujoco.MjvCamera:
     view = mujoco.MjvCamera()
-    task = world.slots[int(world.task_id[row])].task_class
+    task = world.slots[int(world.task_id[env_id])].task_class
     view.lookat[:] = task.camera_target
     view.distance = task.camera_distance
     view.azimuth, view.elevation = CAMERAS[name] or task.camera_angle
     return view
 
 
-def simulation(world: "PartedWorld", row: int) -> "tuple[Engine, int, Scene]":
-    """The engine that carries a row, its row there, and its scene."""
-    part, at = _part(world, row)
+def simulation(world: "PartedWorld", env_id: int) -> "tuple[Engine, int, Scene]":
+    """Return the engine that carries an environment, its row there, and its scene."""
+    part, at = _part(world, env_id)
     scene = next(m.scene for m in part.group.members if m.engine_rows.start <= at < m.engine_rows.stop)
     return part.group.engine, at, scene
 
 
-def _part(world: "PartedWorld", row: int) -> "tuple[Part, int]":
-    """Return the part that has a row, and its row in the part's engine."""
-    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
-    return part, int((part.group.rows == row).nonzero()[0])
+def _part(world: "PartedWorld", env_id: int) -> "tuple[Part, int]":
+    """Return the part that has an environment, and its row in the part's engine."""
+    part = next(p for p in world.parts if bool((p.group.env_ids == env_id).any()))
+    return part, int((part.group.env_ids == env_id).nonzero()[0])
 
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) -> None:
-    """Puts everything that is drawn where a row of ``Engine.placement`` says."""
+    """Move everything that is drawn to where a row of ``Engine.placement`` puts it."""
     numbers = placement.double().cpu().numpy()
     data.qpos[:] = numbers[: model.nq]
     mocap = numbers[model.nq :].reshape(-1, 7)
@@ -147,14 +148,14 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
         part(model, data)
 
 
-def ghosts(world: "PartedWorld", row: int) -> list[DrawnGhost]:
-    """Return the goals of a row's task in its present state; none in a world that hides them.
+def ghosts(world: "PartedWorld", env_id: int) -> list[DrawnGhost]:
+    """Return the goals of an environment's task in its present state; none in a world that hides them.
 
     Every picture, film and view asks here, so that none tells what observations hide.
     """
     if world.hides_goals:
         return []
-    part, at = _part(world, row)
+    part, at = _part(world, env_id)
     rows = torch.tensor([at], device=part.group.engine.device)
     ((member, _, state),) = part.states(part.group.take(world.task_index), rows)
     found = []
@@ -165,7 +166,7 @@ def ghosts(world: "PartedWorld", row: int) -> list[DrawnGhost]:
 
 
 def add_ghosts(goals: list[DrawnGhost], scene: mujoco.MjvScene) -> None:
-    """Puts goals into a scene that is about to be drawn, translucent."""
+    """Add translucent goals to a scene that is about to be drawn."""
     rotation = np.zeros(9)
     for position, quaternion, size, colour in goals:
         mujoco.mju_quat2Mat(rotation, quaternion)

@@ -71,7 +71,7 @@ class EnvRecipe:
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
-        """The environment's class: the same object for equal recipes."""
+        """Return the environment's class: the same object for equal recipes."""
         return _make_class(self)
 
 
@@ -157,7 +157,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return self.task_class.episode_steps
 
     def seed(self, seed: int) -> list[int]:
-        """Starts the random numbers anew, as `reset(seed=...)` does: of starts, of the spaces and of wrappers."""
+        """Restart the random numbers, as `reset(seed=...)` does: of starts, of the spaces and of wrappers."""
         seed = whole_number("seed", seed, 0)
         super().reset(seed=seed)
         for space in (self.action_space, self.observation_space, self.goal_space):
@@ -166,7 +166,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @checked_arguments
     def set_task(self, task: AnyTask) -> None:
-        """Plays one of the benchmark's tasks of this class from the next reset on.
+        """Play one of the benchmark's tasks of this class from the next reset on.
 
         Raises BidexError for a task of another class or version, or with a variation of another size or range.
         """
@@ -187,9 +187,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self._given = task
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts an episode, with a seed the same one every time; observation (d,), float32, and an empty info.
+        """Start an episode, with a seed the same one every time; return observation (d,), float32, and an empty info.
 
-        Raises BidexError where no task was set, and for options, of which there are none.
+        Raises BidexError if no task was set, and for any options.
         """
         check_single_reset(seed, options)
         super().reset(seed=seed)
@@ -203,7 +203,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return _array(obs), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """One control step of 1/60 s under an action (a,) in [-1, 1].
+        """Make one control step of 1/60 s under an action (a,) in [-1, 1].
 
         Returns observation (d,), float32, reward, terminated (what was to be held is lost; with `terminate_on_success`
         also success), truncated (time is up, or physics broke), and info. In version 2 nothing is a success before the
@@ -221,16 +221,16 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return _array(obs), float(reward), lost, bool(truncated) and not lost, step_info
 
     def toggle_terminate_on_success(self, on: bool) -> None:
-        """Whether an episode ends at its first success; in version 2 there is none before the time limit."""
+        """Set whether an episode ends at its first success; in version 2 no success comes before the time limit."""
         self.terminate_on_success = true_or_false("on", on)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """A picture, shape (height, width, 3), uint8; None without a render mode."""
+        """Return a picture, shape (height, width, 3), uint8; None without a render mode."""
         width, height, camera = self._picture
         return None if self.render_mode is None else self._world.render(0, width, height, camera)
 
     def close(self) -> None:
-        """Frees the world."""
+        """Free the world."""
         self._world.close()
 
 

@@ -1,4 +1,4 @@
-"""How torch uses the machine: its threads, and the memory it gave back."""
+"""Torch's use of the machine: its threads, and memory that it has freed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,10 +8,10 @@ import torch
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Runs torch operations on one thread.
+    """Run torch operations on one thread.
 
     The world's arrays are small: handing them to other threads costs more than it saves, above all while the engine's
-    threads want the same cores (measured on two cores, MT4, 1024 rows: see docs/results/speed.md).
+    threads want the same cores (measured on two cores, MT4, 1024 environments: see docs/results/speed.md).
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -22,13 +22,13 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def set_up_torch(threads: int) -> None:
-    """Gives torch this many threads, and the process the memory habits of one that learns."""
+    """Give torch this many threads, and the process the memory settings of training."""
     torch.set_num_threads(threads)
     keep_freed_memory()
 
 
 def keep_freed_memory() -> None:
-    """Lets glibc keep up to 64 MB that were freed, for the next tensors; without effect where there is no glibc.
+    """Let glibc keep up to 64 MB that were freed, for the next tensors; without effect where there is no glibc.
 
     It returns what is free beyond twice the largest block it has freed, blocks above 32 MB apart. With small tensors
     every step then waits for pages: an inner step of the meta-learners took up to twice as long, an MT-PPO update 3 %

@@ -279,7 +279,7 @@ class World(BatchedWorld):
 
         def look(part: Part, rows: Tensor | None, rotation: Tensor | None) -> None:
             group = part.group
-            env_ids = group.rows if rows is None else group.rows[rows]
+            env_ids = group.env_ids if rows is None else group.env_ids[rows]
             states = list(part.states(group.take(self.task_index), rows))
             action = group.take(self._action) if rows is None else self._action[env_ids]
             seen = part.observe(states, action, rotation, rows)

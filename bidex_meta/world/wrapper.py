@@ -61,7 +61,7 @@ class WorldWrapper(VectorWorld):
         return self.world.step(action)
 
     def state_dict(self) -> State:
-        """The wrapped world's state: with or without the wrapper a run continues from it."""
+        """Return the wrapped world's state: a run continues from it with or without the wrapper."""
         return self.world.state_dict()
 
     def load_state_dict(self, state: State, /) -> None:
@@ -69,7 +69,7 @@ class WorldWrapper(VectorWorld):
         self.world.load_state_dict(state)
 
     def close(self) -> None:
-        """Frees the wrapped world."""
+        """Free the wrapped world."""
         self.world.close()
 
 
@@ -90,12 +90,12 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
         return self.world.pools
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Gives slots other pools; see ``PooledWorld``."""
+        """Give slots other pools; see ``PooledWorld``."""
         self.world.set_tasks(pools)
 
 
 class NumpyWorld(VectorEnv):
-    """What ``world.to_numpy()`` returns: NumPy arrays, for Gymnasium's vector wrappers.
+    """The result of ``world.to_numpy()``: NumPy arrays, for Gymnasium's vector wrappers.
 
     ``info`` has ``success``, ``unstable``, ... of every environment, and where one ended ``final_obs`` (an array of
     objects: observations, None in the others) and ``final_info``, whose ``episode`` has r, l, t, success, unscaled.
@@ -115,12 +115,12 @@ class NumpyWorld(VectorEnv):
         self.autoreset_mode, self.spec = world.metadata["autoreset_mode"], getattr(world, "spec", None)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts episodes; see ``VectorWorld.reset``."""
+        """Start episodes; see ``VectorWorld.reset``."""
         obs, info = self.world.reset(seed=seed, options=options)
         return _arrays(obs), {name: _arrays(value) for name, value in info.items()}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Takes actions (num_envs, a).
+        """Take actions (num_envs, a).
 
         Returns observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
         """
@@ -130,19 +130,19 @@ class NumpyWorld(VectorEnv):
         if ended.any():
             step_info = ended_info(step_info) | step_info  # a world's own has the time on the clock
             info |= {"final_obs": np.full(self.num_envs, None, dtype=object), "_final_obs": ended}
-            for row, obs in zip(np.flatnonzero(ended), _arrays(step_info["final_obs"])[ended], strict=True):
-                info["final_obs"][row] = obs
+            for env_id, obs in zip(np.flatnonzero(ended), _arrays(step_info["final_obs"])[ended], strict=True):
+                info["final_obs"][env_id] = obs
             info |= {name: _arrays(step_info[name]) for name in ("final_info", "_final_info")}
         obs, reward, terminated, truncated = map(_arrays, flags)
         return obs, reward, terminated & ended, truncated & ended, info
 
     def render(self) -> tuple[np.ndarray, ...]:
-        """A picture of each environment, (height, width, 3), uint8."""
+        """Return a picture of each environment, (height, width, 3), uint8."""
         world: Any = self.world
-        return tuple(world.render(env_id=row) for row in range(self.num_envs))
+        return tuple(world.render(env_id=env_id) for env_id in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Frees the world."""
+        """Free the world."""
         self.world.close()
 
 

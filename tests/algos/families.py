@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.agents import MetaLearningAgent, Timestep
-from bidex_meta.world.random import row_keys, uniform
+from bidex_meta.world.random import env_keys, uniform
 from tests.fake_world import FakePools
 
 
@@ -56,7 +56,7 @@ class PointGoals(FakePools):
     def _seed_rows(self, seed: int) -> None:
         super()._seed_rows(seed)
         pairs = zip(self.task_names, self.slot_env_ids, strict=True)
-        self._keys = torch.cat([row_keys(seed, name, r.stop - r.start, self.device) for name, r in pairs])
+        self._keys = torch.cat([env_keys(seed, name, r.stop - r.start, self.device) for name, r in pairs])
 
     def _start(self, mask: Tensor) -> None:
         start = 0.2 * uniform(self._keys, self.episodes.number, 2).float() - 0.1

@@ -103,7 +103,7 @@ def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_give
     obs, *_ = world.step(torch.zeros(8, 52))
     assert torch.equal(observed(world)[:, group(world, "points").where[0]], obs[:, group(world, "points").where[0]])
     before = world._obs.clone()
-    world._refresh(torch.arange(8) == int(world.parts[0].group.rows[-1]))
+    world._refresh(torch.arange(8) == int(world.parts[0].group.env_ids[-1]))
     assert torch.equal(world._obs, before)
 
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bidex_meta.world.starts as starts_module
-from bidex_meta.world.random import row_keys, threefry, uniform
+from bidex_meta.world.random import env_keys, threefry, uniform
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 
 CPU = torch.device("cpu")
@@ -31,7 +31,7 @@ def test_threefry_gives_the_published_answers(
 
 
 def test_uniform_numbers_look_uniform() -> None:
-    values = uniform(row_keys(0, "A", 2000, CPU), torch.arange(2000) % 7, 31)
+    values = uniform(env_keys(0, "A", 2000, CPU), torch.arange(2000) % 7, 31)
     assert values.shape == (2000, 31) and values.dtype == torch.float64
     assert float(values.min()) >= 0.0 and float(values.max()) < 1.0
     assert torch.equal(values, values.float().double())
@@ -44,21 +44,21 @@ def test_uniform_numbers_look_uniform() -> None:
 
 
 def test_rows_episodes_draws_seeds_and_names_differ() -> None:
-    keys = row_keys(0, "A", 100, CPU)
+    keys = env_keys(0, "A", 100, CPU)
     values = uniform(keys, torch.zeros(100, dtype=torch.int64), 20)
     assert values.unique().numel() > 1990
     assert (values != uniform(keys, torch.ones(100, dtype=torch.int64), 20)).float().mean() > 0.99
     for seed, name in ((1, "A"), (0, "B"), (10, "A")):
-        assert (row_keys(seed, name, 100, CPU) != keys).any(dim=1).all()
+        assert (env_keys(seed, name, 100, CPU) != keys).any(dim=1).all()
 
 
 @given(st.lists(st.integers(0, 99), min_size=1, max_size=20), st.integers(1, 31), st.integers(0, 10**6))
 def test_numbers_do_not_depend_on_the_other_rows_or_draws(rows: list[int], draws: int, episode: int) -> None:
-    keys, episodes = row_keys(3, "A", 100, CPU), torch.arange(100) + episode
+    keys, episodes = env_keys(3, "A", 100, CPU), torch.arange(100) + episode
     everything = uniform(keys, episodes, 31)
     chosen = torch.tensor(rows)
     assert torch.equal(uniform(keys[chosen], episodes[chosen], draws), everything[chosen][:, :draws])
-    assert torch.equal(row_keys(3, "A", 40, CPU), keys[:40])
+    assert torch.equal(env_keys(3, "A", 40, CPU), keys[:40])
 
 
 def test_how_many_episodes_are_drawn_ahead_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,7 +76,7 @@ def test_a_broken_row_is_told_and_starts_anew(world: World) -> None:
     part = world.parts[0]
     part.group.engine.qpos[1, 30] = torch.nan
     step = flat(world.step(random_actions(world, 1, seed=1)[0]))
-    broken = int(part.group.rows[1])
+    broken = int(part.group.env_ids[1])
     assert step["info/unstable"].tolist() == [row == broken for row in range(ROWS)]
     assert bool(step["truncated"][broken]) and all(bool(value.isfinite().all()) for value in step.values())
     assert not flat(world.step(random_actions(world, 1)[0]))["info/unstable"].any()
