@@ -25,6 +25,7 @@ from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
 from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, resume_command, say
+from bidex_meta.training.learner import NO_SOURCES, Sources
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
@@ -210,14 +211,10 @@ def _begin(
 
 def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
     """Return the learner with its data and teachers; a fresh one with the weights that it shall start from."""
-    learner = kind.make(world, config.learner, config.seed)
-    if kind.make.offline:
-        learner.learn_from(join(run_data.announced(config.dataset, "Reading", worlds), world))
-    if config.demonstrations:
-        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:", worlds)
-        learner.learn_from_demonstrations(join(demonstrations, world, every=False))
-    if config.teacher:
-        learner.learn_from_teachers(run_teachers.teachers_of(config, worlds, world))
+    sources = _sources(config, worlds, world)
+    # A learner from elsewhere that takes no sources need not have the argument.
+    more = {} if sources == NO_SOURCES else {"sources": sources}
+    learner = kind.make(world, config.learner, config.seed, **more)
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)
@@ -226,6 +223,21 @@ def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: V
         say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
         say_other_rules(start, worlds)
     return learner
+
+
+def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld) -> Sources:
+    """Return the data, demonstrations and teachers that a config names."""
+    data = None
+    demonstrations = None
+    teachers = None
+    if config.dataset:
+        data = join(run_data.announced(config.dataset, "Reading", worlds), world)
+    if config.demonstrations:
+        found = run_data.announced(config.demonstrations, "Demonstrations:", worlds)
+        demonstrations = join(found, world, every=False)
+    if config.teacher:
+        teachers = run_teachers.teachers_of(config, worlds, world)
+    return Sources(data, demonstrations, teachers)
 
 
 def _new_folder(config: AnyConfig, path: Path | None, worlds: Worlds, held: contextlib.ExitStack) -> RunFolder:

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import torch
 
     from bidex_meta.agents import Agent
+    from bidex_meta.data.joined import Joined
+    from bidex_meta.witness.teachers import Teachers
     from bidex_meta.world.contract import VectorWorld
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
@@ -39,11 +41,34 @@ class LearnerConfig(Checked):
         return 0
 
 
+@dataclass(frozen=True)
+class Sources:
+    """What a learner learns from beside its own experience; None: nothing of that kind."""
+
+    data: "Joined | None" = None
+    """Transitions of data sets, for offline learners."""
+    demonstrations: "Joined | None" = None
+    """Transitions to imitate while learning by playing."""
+    teachers: "Teachers | None" = None
+    """Policies that label the states that the learner visits."""
+
+    def check(self, learner: str, *taken: str, needed: str | None = None) -> None:
+        """Raise BidexError for a source that is not among those ``taken`` by name, or if the ``needed`` one is missing."""
+        for name, value in vars(self).items():
+            if value is not None and name not in taken:
+                raise BidexError(f"{learner}: learns from no {name}. Leave them out of its sources.")
+        if needed is not None and getattr(self, needed) is None:
+            raise BidexError(f"{learner}: has no {needed} to learn from. Pass sources=Sources({needed}=...).")
+
+
+NO_SOURCES = Sources()
+
+
 class Learner(ABC):
     """Base of all learners, of a world in the mode that :meth:`autoreset_mode` returns.
 
     ``config`` is an instance of the dataclass of its presets; ``seed`` is of everything random, the world's first reset
-    too.
+    too. Learners that set ``offline``, ``imitates`` or ``taught`` take a fourth argument, ``sources``.
     """
 
     name: ClassVar[str] = "learner"
@@ -59,10 +84,9 @@ class Learner(ABC):
     independent_adaptation: ClassVar[bool] = False
     """Whether each environment adapts from its own episodes alone, even where several play the same task."""
     offline: ClassVar[bool] = False
-    """Whether it learns from data sets (:meth:`learn_from`) and never steps the world."""
+    """Whether it learns from data sets (``Sources.data``) and never steps the world."""
     imitates: ClassVar[bool] = False
-    """Whether it may take demonstrations and teachers while it learns by playing (:meth:`learn_from_demonstrations`,
-    :meth:`learn_from_teachers`)."""
+    """Whether it may take demonstrations and teachers while it learns by playing (``Sources``)."""
     taught: ClassVar[bool] = False
     """Whether teachers are all that it learns from: it plays, they label what it comes to."""
     per_process: tuple[str, ...] = ()
@@ -109,18 +133,6 @@ class Learner(ABC):
     @abstractmethod
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
         """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
-
-    def learn_from(self, data: Any) -> None:
-        """Takes the transitions to learn from (``bidex_meta.data.joined.Joined``), before anything else."""
-        raise BidexError(f"{self.name}: learns by playing, not from data sets.")
-
-    def learn_from_demonstrations(self, data: Any) -> None:
-        """Takes transitions to imitate (likewise), before the first iteration and before a checkpoint is loaded."""
-        raise BidexError(f"{self.name}: imitates no demonstrations.")
-
-    def learn_from_teachers(self, teachers: Any) -> None:
-        """Takes who labels (``bidex_meta.witness.teachers.Teachers``), likewise."""
-        raise BidexError(f"{self.name}: learns from no teachers.")
 
     def start_from(self, policy: State) -> None:
         """Takes the policy of another run's checkpoint in the place of fresh weights."""

@@ -11,6 +11,7 @@ from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import ALGOS, learner_kind
+from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import Passing, PointClass, PointGoals
@@ -55,14 +56,16 @@ class Case:
         return PointGoals(2 * rows, classes=classes, autoreset_mode=mode, **broken)
 
     def make(self, seed: int = 0, world: Any = None) -> Any:
-        learner = learner_kind(self.algo).make(self.world() if world is None else world, self.config, seed)
-        if learner.offline:
-            learner.world.reset(seed=0)
+        make = learner_kind(self.algo).make
+        world = self.world() if world is None else world
+        sources: dict[str, Any] = {}
+        if make.offline:
+            world.reset(seed=0)
             still = noisy(lambda obs: torch.zeros(len(obs), 2), 0.4)
-            learner.learn_from(as_data(played(opposite_bandits(rows=4), still, 20)))
-        if learner.taught:
-            learner.learn_from_teachers(still_teachers(learner.world))
-        return learner
+            sources["data"] = as_data(played(opposite_bandits(rows=4), still, 20))
+        if make.taught:
+            sources["teachers"] = still_teachers(world)
+        return make(world, self.config, seed, Sources(**sources)) if sources else make(world, self.config, seed)
 
     def trained(self, world: Any = None) -> Any:
         learner = self.make(world=world)

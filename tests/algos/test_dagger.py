@@ -11,6 +11,7 @@ from bidex_algos.imitation.dagger import DAgger, DAggerConfig
 from bidex_algos.labelled import Labelled
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.problems import Track
 from tests.algos.ranks import resumed
@@ -45,11 +46,10 @@ class Oracle(Constant):
 
 
 def taught(world: Any, config: DAggerConfig, *policies: Any, rows: list[Tensor] | None = None) -> DAgger:
-    learner = DAgger(world, config, seed=0)
     rows = rows or [(world.task_id == task).nonzero().squeeze(1) for task in range(len(policies))]
     width = world.single_observation_space.shape[0]
-    learner.learn_from_teachers(Teachers(world, [Tutor(*pair, width) for pair in zip(policies, rows, strict=True)]))
-    return learner
+    tutors = [Tutor(*pair, width) for pair in zip(policies, rows, strict=True)]
+    return DAgger(world, config, 0, Sources(teachers=Teachers(world, tutors)))
 
 
 def two_tasks() -> ToyWorld:
@@ -168,9 +168,8 @@ class Following(Teachers):
 def test_with_teachers_that_follow_a_resumed_run_begins_new_episodes_in_all_rows() -> None:
     def make() -> DAgger:
         world = two_tasks()
-        learner = DAgger(world, SMALL, seed=0)
-        learner.learn_from_teachers(Following(world, [Tutor(Constant(0.3, 0.3), torch.arange(16), 3)]))
-        return learner
+        teachers = Following(world, [Tutor(Constant(0.3, 0.3), torch.arange(16), 3)])
+        return DAgger(world, SMALL, 0, Sources(teachers=teachers))
 
     learner = make()
     learner.iterate()

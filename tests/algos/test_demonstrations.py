@@ -9,6 +9,7 @@ from torch.distributions import Normal
 
 from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig, imitation
 from bidex_meta.errors import BidexError
+from bidex_meta.training.learner import Sources
 from tests.algos.ranks import resumed
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
@@ -29,9 +30,7 @@ def shown(action: float = 0.4, seed_rows: int = 8, only: int | None = None) -> A
 
 
 def trained(config: MTPPOConfig, data: Any, iterations: int = 3, rewards: Any = None) -> tuple[MTPPO, dict[str, float]]:
-    learner = MTPPO(world(rewards), config, seed=3)
-    if data is not None:
-        learner.learn_from_demonstrations(data)
+    learner = MTPPO(world(rewards), config, 3, Sources(demonstrations=data))
     told = {}
     for _ in range(iterations):
         told = learner.iterate()
@@ -122,9 +121,7 @@ def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int)
     config = replace(SMALL, demonstration_cloning=cloning, critic_first=12 * cloning)
 
     def make(seed: int, rows: int = 8) -> MTPPO:
-        learner = MTPPO(world(), config, seed)
-        learner.learn_from_demonstrations(shown(seed_rows=rows))
-        return learner
+        return MTPPO(world(), config, seed, Sources(demonstrations=shown(seed_rows=rows)))
 
     learner, _ = resumed(make, iterations=2)
     assert "demonstrated" in learner.per_process and "demonstrated" not in MTPPO.per_process

@@ -31,6 +31,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.training import attendance, distributed
+from bidex_meta.training.learner import Sources
 from bidex_meta.training.runner import checkpoint, resume, train
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals
@@ -187,17 +188,15 @@ def rl2(goals: int = 8, config: Any = RECURRENT, kind: type[RL2] = RL2) -> RL2:
 
 def dagger() -> DAgger:
     world = opposite_bandits(rows=4)
-    learner = DAgger(world, TAUGHT, seed=0)
-    learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(8), 3)]))
-    return learner
+    teachers = Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(8), 3)])
+    return DAgger(world, TAUGHT, 0, Sources(teachers=teachers))
 
 
 def icl() -> ICL:
     classes = (PointClass("Short", steps=4, count=3), PointClass("Long", steps=7, count=8))
     world = PointGoals(6, classes=classes)
-    learner = ICL(world, CONTEXT, seed=0)
-    learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(6), 4)]))
-    return learner
+    teachers = Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(6), 4)])
+    return ICL(world, CONTEXT, 0, Sources(teachers=teachers))
 
 
 def pearl() -> PEARL:

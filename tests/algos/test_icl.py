@@ -12,6 +12,7 @@ from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.evidence import BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_meta.errors import BidexError
+from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 
@@ -48,11 +49,9 @@ class Knowing:
 
 
 def taught(world: PointGoals, config: ICLConfig = SMALL, rows: Tensor | None = None) -> ICL:
-    learner = ICL(world, config, seed=0)
     knowing: Any = Knowing(world)
     rows = torch.arange(world.num_envs) if rows is None else rows
-    learner.learn_from_teachers(Teachers(world, [Tutor(knowing, rows, 4)], privileged=knowing))
-    return learner
+    return ICL(world, config, 0, Sources(teachers=Teachers(world, [Tutor(knowing, rows, 4)], privileged=knowing)))
 
 
 def evaluated(agent: Any, world: PointGoals) -> float:

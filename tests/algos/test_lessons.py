@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.ranks import resumed
 from tests.algos.test_dagger import Constant, Following
@@ -27,11 +28,13 @@ def needle(action: Tensor) -> Tensor:
 
 def skilled(world: ToyWorld, config: MTPPOConfig, taught: bool, seed: int = 0, kind: Any = Teachers) -> MTPPO:
     """One that solves the first task from its start, with a teacher of this task alone or without."""
-    learner = MTPPO(world, config, seed)
+    sources = Sources()
+    if taught:
+        tutor = Tutor(Constant(0.5, 0.5), torch.arange(world.num_envs // 2), 3)
+        sources = Sources(teachers=kind(world, [tutor]))
+    learner = MTPPO(world, config, seed, sources)
     with torch.no_grad():
         learner.policy.actor.mean.output_bias.fill_(0.5)
-    if taught:
-        learner.learn_from_teachers(kind(world, [Tutor(Constant(0.5, 0.5), torch.arange(world.num_envs // 2), 3)]))
     return learner
 
 
@@ -87,8 +90,7 @@ def test_without_updates_it_is_mt_ppo_bit_for_bit(surgery: str) -> None:
 
 def test_teachers_are_asked_in_each_step_and_begin_with_each_episode() -> None:
     world, teacher = ToyWorld([needle, nearness(-0.5)], rows=4, unstable=((3, 0),)), Constant(0.5, 0.5)
-    learner = MTPPO(world, SMALL, seed=0)
-    learner.learn_from_teachers(Teachers(world, [Tutor(teacher, torch.arange(4), 3)]))
+    learner = MTPPO(world, SMALL, 0, Sources(teachers=Teachers(world, [Tutor(teacher, torch.arange(4), 3)])))
     for _ in range(2):
         learner.iterate()
     ended = int(world.episodes.number[:4].sum()) - int(learner.rollout.ended[-1, :4].sum())  # before the last step

@@ -9,6 +9,7 @@ import torch
 
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness
@@ -43,13 +44,15 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
         mode, bandits = kind.make.autoreset_mode(config), [nearness(0.5), nearness(-0.5)]
         world = PointGoals(16, autoreset_mode=mode) if kind.make.adapts else ToyWorld(bandits, rows=8)
-        learner = kind.make(world, config, seed=0)
+        sources: dict[str, Any] = {}
         if known.get("demonstration_weight") or kind.make.offline:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
-            (learner.learn_from if kind.make.offline else learner.learn_from_demonstrations)(data)
+            sources["data" if kind.make.offline else "demonstrations"] = data
         if kind.make.taught or known.get("teacher_updates"):
             rows, width = torch.arange(world.num_envs), world.single_observation_space.shape[0]
-            learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)]))
+            sources["teachers"] = Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)])
+        more = {"sources": Sources(**sources)} if sources else {}
+        learner = kind.make(world, config, 0, **more)
         for _ in range(3):
             found = learner.iterate()
         names = "|".join(map(re.escape, world.task_names))

@@ -25,6 +25,7 @@ from bidex_meta.data import open_dataset
 from bidex_meta.data.joined import Joined, join
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.run_data import implied, task_seed
+from bidex_meta.training.learner import Sources
 from bidex_meta.worlds import Worlds
 
 ALGOS = ("td3bc", "iql")
@@ -64,8 +65,7 @@ def against(
             for seed in range(seeds):
                 kind = learner_kind(algo)
                 config = replace(kind.presets["paper"], updates_per_iteration=min(updates, 1000))
-                learner = kind.make(world, config, seed)
-                learner.learn_from(data)
+                learner = kind.make(world, config, seed, Sources(data))
                 while learner.env_steps < updates:
                     learner.iterate()
                 ours.append(judge(learner))

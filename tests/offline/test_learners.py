@@ -15,6 +15,7 @@ from bidex_algos.offline.iql import IQL, IQLConfig
 from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
+from bidex_meta.training.learner import Sources
 from tests.algos.problems import PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.offline.stored import as_data, noisy, played
 
@@ -36,8 +37,7 @@ valued = pytest.mark.parametrize("name", ["td3bc", "iql", "bcq"])
 
 def learned(name: str, world: Any, data: Joined, iterations: int, **options: Any) -> Any:
     kind, config = SMALL[name]
-    learner = kind(world, replace(config, **options), seed=0)
-    learner.learn_from(data)
+    learner = kind(world, replace(config, **options), 0, Sources(data))
     for _ in range(iterations):
         learner.iterate()
     return learner
@@ -168,9 +168,10 @@ def test_bcq_target_and_divergence_against_plain_ones(point: tuple[Joined, float
 def test_a_checkpoint_of_other_data_is_refused() -> None:
     world, data = bad_bandit()
     learner = learned("iql", world, data, 1)
-    other = IQL(world, SMALL["iql"][1], seed=0)
-    other.learn_from(replace(data, rewards=data.rewards + 1.0))
+    other = IQL(world, SMALL["iql"][1], 0, Sources(replace(data, rewards=data.rewards + 1.0)))
     with pytest.raises(BidexError, match="data have rewards"):
         other.load_state_dict(learner.state_dict())
-    with pytest.raises(BidexError, match="Call learn_from first"):
-        BC(world, SMALL["bc"][1], seed=0).iterate()
+    with pytest.raises(BidexError, match="bc: has no data to learn from"):
+        BC(world, SMALL["bc"][1], seed=0)
+    with pytest.raises(BidexError, match="bc: learns from no demonstrations"):
+        BC(world, SMALL["bc"][1], 0, Sources(data, demonstrations=data))

@@ -11,11 +11,9 @@ from bidex_algos.nets.networks import Activation, Autocast, Layers
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, world_size
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
 from bidex_meta.utils.validation import Count, NonNegative, Positive, Whole
-from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -71,20 +69,17 @@ class DAgger(Learner):
     policy: GaussianPolicy
     policy_of = staticmethod(gaussian_policy)
 
-    def __init__(self, world: VectorWorld, config: DAggerConfig, seed: int):
+    def __init__(self, world: VectorWorld, config: DAggerConfig, seed: int, sources: Sources = NO_SOURCES):
+        sources.check(self.name, "teachers", needed="teachers")
         super().__init__(world, config, seed)
         self.low_precision, self.obs = self.policy.low_precision, None
         self.teacher_plays = torch.zeros(world.num_envs, dtype=torch.bool, device=self.device)
         self.lessons = Lessons(world, self.policy, config.learning_rate, config.max_grad_norm)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
-
-    def learn_from_teachers(self, teachers: Teachers) -> None:
-        """Takes who labels; before the first iteration and before a checkpoint is loaded."""
-        self.lessons.begin(teachers, self.config.samples, self.config.rollout_steps, self.config.batch_size)
+        assert sources.teachers is not None
+        self.lessons.begin(sources.teachers, config.samples, config.rollout_steps, config.batch_size)
 
     def _iterate(self) -> dict[str, float]:
-        if self.lessons.data is None:
-            raise BidexError(f"{self.name}: has nobody to learn from. Call learn_from_teachers first.")
         share, unstable = self._teachers_share(), torch.zeros((), dtype=torch.int64, device=self.device)
         with self._collecting():
             if self.obs is None:

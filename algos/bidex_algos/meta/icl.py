@@ -26,9 +26,8 @@ from bidex_algos.nets.networks import Activation, Layers
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
-from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, pool_moments, sum_gradients, world_size
-from bidex_meta.training.learner import LearnerConfig, Parts, State
+from bidex_meta.training.learner import NO_SOURCES, LearnerConfig, Parts, Sources, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
@@ -82,14 +81,17 @@ class ICL(TrialLearner):
     per_process = ("generator", "episodes", "data")
     config: ICLConfig
     policy: BeliefPolicy
-    data: TaughtTrials | None = None
+    data: TaughtTrials
 
-    def __init__(self, world: PooledWorld, config: ICLConfig, seed: int):
+    def __init__(self, world: PooledWorld, config: ICLConfig, seed: int, sources: Sources = NO_SOURCES):
+        sources.check(self.name, "teachers", needed="teachers")
         super().__init__(world, config, seed)
         self.every_pool = dict(zip(world.task_names, world.pools, strict=True))
         self.pools.clear()  # tasks are mixed instead of taking turns
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
+        assert sources.teachers is not None
+        self._begin_lessons(sources.teachers)
 
     @classmethod
     def _make_policy(
@@ -123,9 +125,9 @@ class ICL(TrialLearner):
         policy.load_state_dict(agent.policy.state_dict())
         return MemoryAgent(policy)
 
-    def learn_from_teachers(self, teachers: Teachers) -> None:
-        """Takes who labels; before the first iteration and before a checkpoint is loaded."""
-        self.teachers, cfg = teachers, self.config
+    def _begin_lessons(self, teachers: Teachers) -> None:
+        self.teachers = teachers
+        cfg = self.config
         rows = teachers.known.nonzero().squeeze(1)
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows, self.first = rows, self.count.cumsum(0) - self.count
@@ -136,8 +138,6 @@ class ICL(TrialLearner):
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
-        if data is None:
-            raise BidexError(f"{self.name}: has nobody to learn from. Call learn_from_teachers first.")
         pupil = _Pupil(self, data)
         self._play(data.trials, pupil)
         data.keep()

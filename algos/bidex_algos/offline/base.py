@@ -21,7 +21,7 @@ from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
@@ -121,7 +121,7 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
 
 
 class Offline(Learner):
-    """A learner from data. ``learn_from`` comes before the first iteration and before a checkpoint is loaded.
+    """A learner from data (``Sources.data``).
 
     ``generator`` draws transitions alone, so that learners of one seed see the same ones, ``noise`` all else. A batch
     has ``batch_per_task`` of each task, task after task (``task_of_draw``).
@@ -133,7 +133,8 @@ class Offline(Learner):
     critic: Critics
     target_critic: Critics
 
-    def __init__(self, world: VectorWorld, config: Any, seed: int):
+    def __init__(self, world: VectorWorld, config: Any, seed: int, sources: Sources = NO_SOURCES):
+        sources.check(self.name, "data", needed="data")
         super().__init__(world, config, seed)
         self.low_precision = use_bfloat16(config.autocast, self.device)
         self.noise = torch.Generator(self.device).manual_seed(seed ^ 0x5EED)
@@ -146,17 +147,19 @@ class Offline(Learner):
             self.target_critic = copy.deepcopy(self.critic)
             self.adams["critic"] = self._adam(self.critic.parameters(), config.critic_learning_rate)
             self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
-        self._batches: Batches | None = None
+        assert sources.data is not None
+        self._batches = self._read(sources.data)
 
-    def learn_from(self, data: Joined) -> None:
-        """Takes the transitions to learn from, in the world's form, and what they say of observations and returns."""
+    def _read(self, data: Joined) -> Batches:
+        """Return the batches of transitions, and take their statistics of observations and returns."""
         tasks = self.world.num_tasks
-        self._batches = Batches(data, tasks, self.batch_per_task, self.device)
-        for chunk in self._batches.chunks():
+        batches = Batches(data, tasks, self.batch_per_task, self.device)
+        for chunk in batches.chunks():
             self.policy.observations.update(chunk)
         if self.num_critics and self.config.per_task_rewards:
             gamma = discounts(self.world, self.config.gamma, torch.arange(tasks, device=self.device))
             self.reward_scale = return_deviation(data, tasks, gamma).to(self.device)
+        return batches
 
     @abstractmethod
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
@@ -175,8 +178,6 @@ class Offline(Learner):
         return {}
 
     def _iterate(self) -> dict[str, float]:
-        if self._batches is None:
-            raise BidexError(f"{self.name}: has no data to learn from. Call learn_from first.")
         sums: dict[str, Tensor] = {}
         counts: dict[str, int] = {}
         for places in self._batches.draw(self.config.updates_per_iteration, self.generator):
@@ -224,11 +225,11 @@ class Offline(Learner):
         return {**critics, **self._own_parts(), "adams": self.adams, **rest}
 
     def _place(self) -> State:
-        return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}
+        return super()._place() | {"data": dict(self._batches.fingerprint)}
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
-        here = self._batches and self._batches.fingerprint
+        here = self._batches.fingerprint
         if here and state["data"] and here != state["data"]:
             differ = next(name for name in here if here[name] != state["data"].get(name))
             raise BidexError(

@@ -20,7 +20,7 @@ from bidex_algos.nets.policy import DeterministicActor
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.replay import Transitions
-from bidex_meta.training.learner import Parts
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
@@ -141,8 +141,8 @@ class BCQ(Offline):
     policy: BCQPolicy
     policy_of = BCQPolicy
 
-    def __init__(self, world: VectorWorld, config: BCQConfig, seed: int):
-        super().__init__(world, config, seed)
+    def __init__(self, world: VectorWorld, config: BCQConfig, seed: int, sources: Sources = NO_SOURCES):
+        super().__init__(world, config, seed, sources)
         self.target_actor = copy.deepcopy(self.policy.actor)
         self.adams["model"] = self._adam(self.policy.model.parameters(), config.vae_learning_rate)
 

@@ -17,7 +17,7 @@ from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.replay import Transitions
-from bidex_meta.training.learner import Parts
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -59,8 +59,8 @@ class IQL(Offline):
     policy: GaussianPolicy
     policy_of = staticmethod(partial(gaussian_policy, make=BoundedMean))
 
-    def __init__(self, world: VectorWorld, config: IQLConfig, seed: int):
-        super().__init__(world, config, seed)
+    def __init__(self, world: VectorWorld, config: IQLConfig, seed: int, sources: Sources = NO_SOURCES):
+        super().__init__(world, config, seed, sources)
         self.value = self._critics(self.inputs, self.critic.heads, 1)
         self.adams["value"] = self._adam(self.value.parameters(), config.critic_learning_rate)
         self.log_bounds = [float(torch.tensor(std).log()) for std in config.std_range]

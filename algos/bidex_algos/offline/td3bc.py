@@ -14,7 +14,7 @@ from bidex_algos.nets.networks import autocast
 from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
 from bidex_algos.replay import Transitions
-from bidex_meta.training.learner import Parts
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
@@ -43,8 +43,8 @@ class TD3BC(BC):
     config: TD3BCConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     num_critics = 2
 
-    def __init__(self, world: VectorWorld, config: TD3BCConfig, seed: int):
-        super().__init__(world, config, seed)
+    def __init__(self, world: VectorWorld, config: TD3BCConfig, seed: int, sources: Sources = NO_SOURCES):
+        super().__init__(world, config, seed, sources)
         self.target_actor = copy.deepcopy(self.policy.actor)
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:

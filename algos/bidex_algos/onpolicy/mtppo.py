@@ -22,9 +22,8 @@ from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, own_seed, sum_gradients, world_size
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
-from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.graphs import GraphCache, cuda_graph
 
@@ -172,7 +171,8 @@ class MTPPO(OnPolicy):
     demonstrations: Demonstrations | None = None
     lessons: Lessons | None = None
 
-    def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
+    def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int, sources: Sources = NO_SOURCES):
+        sources.check(self.name, "demonstrations", "teachers")
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
         self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
@@ -185,6 +185,15 @@ class MTPPO(OnPolicy):
         self.balance = balances[config.gradient_surgery]()
         alone = self.device.type == "cuda" and self.balance is None and world_size() == 1
         self._graphs = GraphCache(dict, lambda _: None, cuda_graph) if alone else None
+        if sources.demonstrations is not None:
+            self._graphs = None  # the weight of demonstrations is no tensor
+            self.demonstrations = Demonstrations(sources.demonstrations, config, seed, self.device)
+            self.per_process = (*self.per_process, "demonstrated")
+        if sources.teachers is not None:
+            self.lessons = Lessons(world, self.policy, config.teacher_learning_rate, config.max_grad_norm)
+            self.lessons.begin(sources.teachers, config.teacher_samples, config.rollout_steps, config.teacher_batch)
+            self.per_process = (*self.per_process, "data")
+            self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def start_from(self, policy: State) -> None:
         """As in the base; deviations begin within ``std_range``, an adaptive step size at its least.
@@ -205,20 +214,6 @@ class MTPPO(OnPolicy):
     def _forget_graphs(self) -> None:
         if self._graphs is not None:
             self._graphs.forget()
-
-    def learn_from_demonstrations(self, data: Joined) -> None:
-        """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
-        self._graphs = None  # the weight of demonstrations is no tensor
-        self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
-        self.per_process = (*self.per_process, "demonstrated")
-
-    def learn_from_teachers(self, teachers: Teachers) -> None:
-        """Takes who labels the states that the policy comes to, likewise."""
-        cfg = self.config
-        self.lessons = Lessons(self.world, self.policy, cfg.teacher_learning_rate, cfg.max_grad_norm)
-        self.lessons.begin(teachers, cfg.teacher_samples, cfg.rollout_steps, cfg.teacher_batch)
-        self.per_process = (*self.per_process, "data")
-        self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
