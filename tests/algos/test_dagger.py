@@ -188,8 +188,8 @@ def test_with_policies_it_goes_on_bit_for_bit() -> None:
 
 
 def test_without_teachers_or_with_others_it_is_refused() -> None:
-    with pytest.raises(BidexError, match="nobody to learn from"):
-        DAgger(two_tasks(), SMALL, seed=0).iterate()
+    with pytest.raises(BidexError, match="no teachers to learn from"):
+        DAgger(two_tasks(), SMALL, seed=0)
     learner = taught(two_tasks(), SMALL, Constant(0.3, 0.3))
     learner.iterate()
     with pytest.raises(BidexError, match="data set keeps"):

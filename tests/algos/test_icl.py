@@ -114,7 +114,7 @@ def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
 
 
 def test_belief_is_bayes_rule_over_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = ICL(PointGoals(2), SMALL, seed=0).policy
+    policy = taught(PointGoals(2)).policy
     candidates = policy.actor.candidates
     assert candidates.abs().max() <= 1.0 and torch.cdist(candidates, candidates).fill_diagonal_(9.0).min() > 0.1
     obs, reward = (
@@ -145,7 +145,7 @@ def test_a_loaded_policy_acts_on_the_belief_that_is_passed() -> None:
         def believed(self, state: Tensor) -> Tensor:
             return torch.tensor([[0.3, -0.4]]).expand(len(state), -1)
 
-    learner = ICL(PointGoals(2), SMALL, seed=0)
+    learner = taught(PointGoals(2))
     policy = ICL.load_policy(learner.policy_state_dict(), belief=Sure()).policy
     assert isinstance(policy, BeliefPolicy) and policy.fresh_memory(3).state.shape == (3, 1)
     obs = torch.randn(3, policy.inputs.width - policy.num_actions - 3)
@@ -175,5 +175,5 @@ def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypa
 
 
 def test_it_learns_from_nobody_until_it_has_teachers() -> None:
-    with pytest.raises(BidexError, match="nobody to learn from"):
-        ICL(PointGoals(8), SMALL, seed=0).iterate()
+    with pytest.raises(BidexError, match="no teachers to learn from"):
+        ICL(PointGoals(8), SMALL, seed=0)
