@@ -1,4 +1,4 @@
-"""``bidex-meta pull``: a policy or a data set from a hub or a folder."""
+"""``bidex-meta pull``: fetch a policy or a data set from a hub or a folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _name_suite(run: RunFolder, out: Path) -> None:
-    """Let a config name the suite's file that was published with the run, by its whole path."""
+    """Make a config name the suite's file that was published with the run, by its full path."""
     config = run.config()
     if config.suite is not None and config.suite in [path.name for path in run.path.glob(SUITES)]:
         run.change_config(replace(config, suite=str(out / config.suite)))
