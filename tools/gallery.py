@@ -152,7 +152,7 @@ def _mask(task: TaskClass) -> str:
 
 
 def masked(task: TaskClass) -> tuple[list[str], list[str]]:
-    """Return the components of a variation that only goal entries show: those of the reward, and those of only success.
+    """Return the components of a variation that only goal entries show, by reward and by success only.
 
     The parts of a task that a component changes are replaced by NaN: every value that becomes NaN depends on the
     component. A fixture's place is not returned, because other entries show that place.

@@ -1,4 +1,4 @@
-"""``bidex-meta compare``: several runs beside each other, intervals over seeds."""
+"""``bidex-meta compare``: compare several runs, with intervals over seeds."""
 
 import json
 from collections.abc import Sequence

@@ -43,7 +43,7 @@ class ExportFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Export, check and print where the file is."""
+    """Export, check and print the file's path."""
     flags = parse(ExportFlags, arguments, "export")
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
         source = root = absolute(flags.name.removeprefix(FOLDER))
     else:
         source = Path(called("snapshot_download", flags.name, allow_patterns=list(wanted)))
-        root = source.parents[1]  # a snapshot in the cache links to the files beside all snapshots
+        root = source.parents[1]  # a snapshot in the cache links to files next to the snapshots' folder
     files = files_of(source, wanted, root)
     if not {"config.json", "data/metadata.json"} & files.keys():
         raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")

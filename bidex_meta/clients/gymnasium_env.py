@@ -15,8 +15,8 @@ from bidex_meta.world.episodes import check_single_reset
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
-    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`; without it the tasks are those of seed 0, and
-    the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
+    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Without `seed` the tasks are those of seed 0,
+    and the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
     other than None and `"rgb_array"`.
     """
 

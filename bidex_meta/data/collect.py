@@ -70,7 +70,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is, by policy; computed from its parts alone."""
+    """Progress of a collection by policy, computed only from the collection's parts."""
 
     rounds: int  # parts that are there
     steps: list[int]  # transitions of each policy

@@ -127,7 +127,7 @@ class Dataset:
         self._sealed = {folder / part_files.METADATA: sealed}
 
     def check_digests(self) -> list[str]:
-        """Read all files and return the names of those without a digest; raise BidexError if a file has changed."""
+        """Read all files and return the names of files without a digest; raise BidexError if a file has changed."""
         if "bidex" not in self.content:
             return [part_files.METADATA, part_files.MAIN]
         for path in (*self._paths, self.folder / part_files.MAIN):

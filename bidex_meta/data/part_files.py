@@ -35,7 +35,7 @@ Json = dict[str, Any]
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
 FORMAT = 1  # increased when older code can no longer read the files
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 3800  # bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes
+EPISODE_BYTES = 3800  # overhead of an episode in HDF5, bytes: measured 3,675 with five attributes
 ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
 ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""

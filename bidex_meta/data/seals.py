@@ -18,7 +18,7 @@ BLOCK = 512  # bytes of the user block: the least that HDF5 accepts
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
-_MARK = "sealed"  # entry in the metadata beside the digest: one flipped bit cannot remove both
+_MARK = "sealed"  # second entry in the metadata: one flipped bit cannot remove both this entry and the digest
 
 
 def block(file: IO[bytes]) -> bytes:

@@ -152,7 +152,7 @@ class Planner:
         std = torch.full_like(mean, cfg.std)
         for _ in range(rounds):
             knots = self._sample(mean, std, elites)
-            # Each sequence meets one copy of the state, drawn anew every round.
+            # Each sequence starts from one copy of the state; every round draws the copies again.
             knots = knots[torch.randperm(len(knots), generator=self._generator)]
             scores, won = self._try(states, knots)
             order = scores.argsort(descending=True)
