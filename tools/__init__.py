@@ -1,1 +1,1 @@
-"""What maintainers alone run, from a checkout: ``python -m tools.NAME``. Not in the wheel; no package imports it."""
+"""Tools for maintainers, run from a checkout: ``python -m tools.NAME``. The wheel does not contain these tools."""

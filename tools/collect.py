@@ -1,6 +1,6 @@
-"""``python -m tools.collect RUN... --into results/data/STUDY.json``: what the repository keeps of evaluated runs.
+"""``python -m tools.collect RUN... --into results/data/STUDY.json``: store evaluated runs in the repository.
 
-The file holds all runs of a study, without weights, as :mod:`bidex_meta.runs.stored` reads it.
+The file holds all runs of a study, without weights, in the form that :mod:`bidex_meta.runs.stored` reads.
 """
 
 import math
@@ -39,7 +39,7 @@ _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval"
 def collect(
     runs: tyro.conf.Positional[tuple[Path, ...]], into: Path, out: Path = Path("runs"), arm: str | None = None
 ) -> None:
-    """Add runs to the file of a study, and print their names; all of them or none.
+    """Add all runs, or none, to the file of a study, and print the runs' names.
 
     Args:
         runs: Run folders, or the files of sweeps, of which the runs that have ended are taken.
@@ -70,15 +70,15 @@ def collect(
 
 
 def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dict[str, Any]:
-    """What is kept of an evaluated run.
+    """Return the entry of an evaluated run in the file of a study.
 
     Args:
         folder: The run.
-        arm: What its study calls it, without the seed; None: see :func:`arm_of`.
-        parameters: Number of the policy's parameters; None where it is not known.
+        arm: The run's name in its study, without the seed; None: see :func:`arm_of`.
+        parameters: Number of the policy's parameters; None if unknown.
 
     Raises:
-        BidexError: It is not evaluated, its evaluation is of another run or of fewer steps, or its commit is not
+        BidexError: The run is not evaluated, its evaluation is of another run or of fewer steps, or its commit is not
             known.
     """
     config, evaluation = folder.config().to_json(), folder.evaluation()
@@ -101,7 +101,7 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dic
 
 
 def arm_of(path: Path, config: dict[str, Any]) -> str:
-    """The name of a run's folder without suite and seed; its learner where nothing but a date is left."""
+    """Return the name of a run's folder without suite and seed; if only a date is left, return the learner's name."""
     subject = Path(str(config["suite"] or short_name(config["task"]))).stem
     name = re.sub(r"[-_ ]*(s|seed)[-_]?\d+$", "", path.resolve().name, flags=re.IGNORECASE)
     if name.casefold().startswith(subject.casefold()):
@@ -110,7 +110,7 @@ def arm_of(path: Path, config: dict[str, Any]) -> str:
 
 
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
-    """Run folders; of a sweep those of its ended runs, with the names of their arms."""
+    """Return run folders; for a sweep, the folders of the ended runs, with the names of their arms."""
     if path.suffix != ".toml":
         return [(path, None)]
     runs = read_sweep(path, out).runs
@@ -127,7 +127,7 @@ def _is_another(known: dict[str, Any], config: dict[str, Any]) -> bool:
 
 
 def _parameters(folder: RunFolder) -> int | None:
-    """Parameters of the newest policy, without the critic; None of what is no module of torch."""
+    """Count the parameters of the newest policy, without the critic; return None if there is no torch module."""
     agent, _ = load_policy(folder, "cpu")
     module = agent if isinstance(agent, nn.Module) else getattr(agent, "policy", None)
     return sum(each.numel() for each in module.parameters()) if isinstance(module, nn.Module) else None
@@ -136,7 +136,7 @@ def _parameters(folder: RunFolder) -> int | None:
 def _check(
     folder: RunFolder, evaluation: dict[str, Any], rows: Sequence[dict[str, Any]], versions: dict[str, Any]
 ) -> None:
-    """Refuses a run whose table nobody could trust or repeat."""
+    """Raise BidexError for a run whose table nobody could trust or repeat."""
     if not rows:
         raise BidexError(f"{folder.metrics_path} holds nothing: not a run that has trained. Name another.")
     steps = min(evaluation.get("steps", rows[-1]["step"]), rows[-1]["step"])
@@ -165,7 +165,7 @@ def _check(
 
 
 def _suite(name: str | None) -> dict[str, Any] | None:
-    """Name and version of a suite; the whole file where it is not a shipped one."""
+    """Return name and version of a suite; also the whole file if the suite is not a shipped one."""
     if name is None:
         return None
     if not name.endswith(".toml"):
@@ -175,7 +175,7 @@ def _suite(name: str | None) -> dict[str, Any] | None:
 
 
 def _engine(config: dict[str, Any]) -> str:
-    """The engine that stepped the run; ``auto`` by its device, as in ``bidex_meta.engine.choice``."""
+    """Return the engine that stepped the run; the device decides ``auto``, as in ``bidex_meta.engine.choice``."""
     engine = config.get("engine", "auto")
     return engine if engine != "auto" else "warp" if str(config.get("device", "cpu")).startswith("cuda") else "c"
 
@@ -197,7 +197,7 @@ def _only(classes: dict[str, Any], measures: Sequence[str]) -> dict[str, Any]:
 
 
 def _curves(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
-    """Columns by tag: means over stretches of about equal length, with the step and training time at their ends."""
+    """Return columns by tag: means over intervals of about equal length, with step and training time at their ends."""
     count = min(POINTS, len(rows))
     edges = [len(rows) * i // count for i in range(count + 1)]
     parts = [rows[low:high] for low, high in pairwise(edges)]
@@ -215,7 +215,7 @@ def _mean(part: Sequence[dict[str, Any]], tag: str) -> float | None:
 
 
 def _rounded(value: Any, digits: int) -> Any:
-    """Numbers rounded to significant digits, in whatever holds them."""
+    """Round all numbers in a nested value to significant digits."""
     if isinstance(value, dict):
         return {name: _rounded(each, digits) for name, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""``python -m tools.experts RUN...``: the best policy that solves each class, the 100 of the normalised score."""
+"""``python -m tools.experts RUN...``: find the best policy that solves each class; its normalised score is 100."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ _SOLVES = 0.5
 
 
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:
-    """Print, and store, per class the best of its replayed witness, its script and the given runs, if that solves it.
+    """Print and store, for each class, the best of its witness, its script and the runs, if the best solves the class.
 
     Example: python -m tools.experts results/data/experts.json --out assets/references/expert.json
 
@@ -35,11 +35,13 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
 
 
 def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[str, Any]]:
-    """Return and source of the best policy of each class that solves at least half of its tasks; without one, none.
+    """Find return and source of the best policy of each class among those that solve at least half of the tasks.
+
+    A class without such a policy is left out.
 
     Args:
         names: The classes.
-        runs: Evaluated runs: their folders, or what ``collect`` has kept of them.
+        runs: Evaluated runs: their folders, or their entries that ``collect`` has stored.
 
     Raises:
         BidexError: A run has no evaluation, or plays a class with fixed bases.
@@ -56,7 +58,7 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[s
 
 
 def _of_run(run: Run) -> list[tuple[str, dict[str, Any]]]:
-    """What a run's evaluation says of its classes: the mean over all tasks."""
+    """Return the results of a run's classes from its evaluation, as means over all tasks."""
     config = run.config()
     source = Worlds.open(config.to_json())
     if not source.moving_bases:

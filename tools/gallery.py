@@ -1,4 +1,4 @@
-"""``python -m tools.gallery`` (``make gallery``) generates the page of all task classes from their code."""
+"""``python -m tools.gallery`` (``make gallery``): generate the page of all task classes from their code."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -68,7 +68,7 @@ def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 2
 
 
 def text() -> str:
-    """The page: one section per class."""
+    """Return the page's text: one section per class."""
     random = references.load("random")
     return "\n".join((_HEAD, *(_section(registry.get(name, True), random.get(name)) for name in registry.names())))
 
@@ -85,14 +85,14 @@ def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
 
 
 def moments(first_success: int, steps: int) -> list[int]:
-    """Frames of a witness that the page shows; frame i is the state after i steps."""
+    """Return the frames of a witness that the page shows; frame i is the state after i steps."""
     solved = first_success + 1
     return [0, round(solved / 3), round(2 * solved / 3), solved, steps]
 
 
 def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
-    """The shown frames side by side, (height, STRIP * width, 3) uint8."""
-    first = replay(name, witness).first_success  # what its file says may be of older physics
+    """Draw the shown frames side by side, (height, STRIP * width, 3) uint8."""
+    first = replay(name, witness).first_success  # the file's value may be from older physics
     if first is None:
         raise BidexError(f"The witness of {name} does not succeed any more. Search it anew.")
     wanted = moments(first, len(witness.actions))
@@ -102,7 +102,7 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
 
 
 def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
-    """Three tasks of version 2 side by side, (height, 3 * width, 3) uint8: at the end of the script, else the start."""
+    """Draw three tasks of version 2 side by side, (height, 3 * width, 3) uint8: after the script, else at the start."""
     world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
     obs, _ = world.reset(seed=0)
     rows, solved = [0, 1, 2], torch.ones(50, dtype=torch.bool)
@@ -152,10 +152,10 @@ def _mask(task: TaskClass) -> str:
 
 
 def masked(task: TaskClass) -> tuple[list[str], list[str]]:
-    """Return the components of a variation that only goal entries show, of the reward and of success alone.
+    """Return the components of a variation that only goal entries show, by reward and by success only.
 
-    What a component changes of a task is replaced by NaN: whatever becomes NaN depends on it. A fixture's place is
-    not among them, because other entries show it.
+    The parts of a task that a component changes are replaced by NaN: every value that becomes NaN depends on the
+    component. A fixture's place is not returned, because other entries show that place.
     """
     scene, space = compile_scene(task), task.variation_space
     data = mujoco.MjData(scene.model)
@@ -191,7 +191,7 @@ def _any_nan(values: Iterable[Tensor]) -> bool:
 
 
 class _Comparisons(TorchFunctionMode):
-    """Collects all tensors that are compared: a comparison with NaN is False, and would not show it."""
+    """Collects all compared tensors, because a comparison with NaN returns False and would hide the NaN."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""``python -m tools.ladder RUN``: the lines between which a learner that infers hidden goals stands."""
+"""``python -m tools.ladder RUN``: measure the bounds of a learner that infers hidden goals."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ _CANDIDATES, _EXACT = 128, 0.02
 def ladder(
     run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
 ) -> None:
-    """Success of each class on unseen tasks, of a run of icl and of the same actor with other knowledge of the goal.
+    """Measure success per class on unseen tasks, of a run of icl and of its actor with other knowledge of the goal.
 
     Example: python -m tools.ladder runs/ml1-v2/ML1-v2-icl-seed0 --out results/data/ml1-v2-ladder-seed0.json
 
@@ -70,7 +70,7 @@ def ladder(
 
 
 def success(evaluation: MetaEvaluation) -> dict[str, list[float]]:
-    """Of each class before and after each shot."""
+    """Return the success of each class before and after each shot."""
     return {name: [each.classes[name].success for each in evaluation.by_shot] for name in evaluation.before.classes}
 
 

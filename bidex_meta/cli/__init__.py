@@ -1,4 +1,4 @@
-"""The command ``bidex-meta``: finds the subcommand, calls it, and turns errors into one line.
+"""The command ``bidex-meta``: find the subcommand, call it, and turn errors into one line.
 
 Nothing heavy is imported here: each subcommand is a module of this package with a function ``main(arguments)``,
 imported when it is called.
@@ -25,12 +25,12 @@ from bidex_meta.utils.waiting import tell, watched
 
 _MEANT = {"train": "run", "test": "evaluate", "learn": "run", "fit": "run", "view": "play", "watch": "play"}
 _MEANT |= {"show": "render", "film": "render", "video": "render", "download": "pull", "upload": "push"}
-"""Names that other programs have for these commands."""
-_LONGEST = 2000  # letters of an error: what was given may be any text
+"""Names that other programs use for these commands."""
+_LONGEST = 2000  # most letters of an error message, which may quote any input
 
 
 class Command(NamedTuple):
-    """Where a subcommand lives and what it does."""
+    """Module and summary of a subcommand."""
 
     module: str
     summary: str
@@ -64,12 +64,12 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of what follows ``bidex-meta``, the process's own by default, and return the exit code.
+    """Run the command line that follows ``bidex-meta``, by default the process's own, and return the exit code.
 
-    0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the system refuses (a
-    full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, 141 where nobody reads stderr any more,
-    128 and the number of SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM after that (0 where training saved and ended at SIGTERM).
-    A subcommand may raise SystemExit.
+    The exit code is 1 if training diverged or a run differs from its record, 2 for bad input or if the system refuses
+    something (a full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, and 141 if nobody reads
+    stderr any more. After SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM it is 128 plus the signal's number, or 0 if training
+    saved and ended at SIGTERM. Otherwise it is 0. A subcommand may raise SystemExit.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 return _dispatch(given)
             finally:
-                sys.stdout.flush()  # at Python's own end nobody would catch that it cannot be written
+                sys.stdout.flush()  # when Python exits, nobody would catch a failing write
     except BidexError as error:
         return _failed(str(error), EXIT_BAD_INPUT, debug)
     except FloatingPointError as error:
@@ -94,13 +94,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
-        # A reader of results alone has seen enough (`| head`); without one of stderr work may have been broken off.
+        # A reader that closes only stdout has seen enough (`| head`). If stderr is closed, work may have been aborted.
         code = errors.EXIT_UNREAD if unread(sys.stderr) else 0
-        silence(sys.stdout)  # Python complains otherwise when it flushes at its end
+        silence(sys.stdout)  # otherwise Python complains when it flushes at exit
         silence(sys.stderr)
         return code
     except OSError as error:
-        silence(sys.stdout)  # what it could not write it would try again at its end
+        silence(sys.stdout)  # otherwise Python retries the failed write at exit
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
     except (Exception, SystemExit) as error:
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM or one of ``notices()`` came: everything is cleaned up as after Ctrl-C."""
+    """SIGTERM or one of ``notices()`` was received; the cleanup is the same as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -120,8 +120,8 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and it is said why."""
-    # Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
+    """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and the reason is printed."""
+    # With several processes signals stay as they are: a collective operation waits outside Python and delays handlers.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
         return
@@ -140,10 +140,10 @@ def _signals_raise() -> Iterator[None]:
 
 
 class _OnStderr(logging.Handler):
-    """Prints what the library logs, a record a line."""
+    """Prints the library's log records, one per line."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record; raise BrokenPipeError if nobody reads stderr, where logging's own handler goes on."""
+        """Print a record; raise BrokenPipeError if nobody reads stderr (logging's own handler would go on)."""
         tell(record.getMessage())
 
 
@@ -166,12 +166,12 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _failed(reason: str, code: int, debug: bool) -> int:
-    """Says why, on one line; within an ``except`` whose error ``--debug`` shows."""
+    """Print the reason on one line and return the code; with ``debug``, raise the error of the caller's ``except``."""
     if debug:
         raise
     message = one_line(reason)
     if len(message) > _LONGEST:
-        message = f"{message[: _LONGEST - 300]} ... {message[-200:]}"  # the end says how to mend it
+        message = f"{message[: _LONGEST - 300]} ... {message[-200:]}"  # the end says how to fix the error
     with contextlib.suppress(OSError):  # nobody may read it
         print(f"bidex-meta: {message}", file=sys.stderr)
     return code
@@ -180,7 +180,7 @@ def _failed(reason: str, code: int, debug: bool) -> int:
 def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
         try:
-            word.encode()  # Python gives bytes as surrogates, which go into no config, log or event file
+            word.encode()  # Python decodes other bytes as surrogates, which no config, log or event file can hold
         except UnicodeEncodeError:
             raise BidexError(
                 f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."

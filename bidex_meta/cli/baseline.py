@@ -1,4 +1,4 @@
-"""``bidex-meta baseline``: the references of the normalised score."""
+"""``bidex-meta baseline``: measure the references of the normalised score."""
 
 import json
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ class BaselineFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, print, and store where it was asked."""
+    """Measure, print, and store if ``--out`` is given."""
     flags = parse(BaselineFlags, arguments, "baseline")
     what = known_name("baseline", flags.what, _POLICIES)
     if flags.out is not None:
@@ -98,7 +98,7 @@ def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
 
 
 def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
-    """Each class that has a script."""
+    """Evaluate the scripts of all classes that have one."""
     scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
     names = [name for name in worlds.task_classes() if name in scripts]
     if not names:

@@ -1,4 +1,4 @@
-"""``bidex-meta bench world``: the speed of a suite's world on this machine."""
+"""``bidex-meta bench world``: measure the speed of a suite's world on this machine."""
 
 import json
 import statistics
@@ -56,11 +56,11 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def world_speed(flags: BenchFlags) -> Json:
-    """Medians of environment steps per second of the whole world and of bare engines, in turns within one process.
+    """Measure environment steps per second of the whole world and of bare engines, in turns within one process.
 
-    The engines of a second world are stepped bare: the same states, controls, threads, sensors and substeps. They
-    follow the first world's resets outside the clock, so both do the same physics. ``ratio`` is the median of ratios;
-    ``groups`` has the number of environments in each engine batch.
+    The results are medians; ``ratio`` is the median of ratios. The bare engines are those of a second world, with the
+    same states, controls, threads, sensors and substeps. Outside the timed region the bare engines follow the first
+    world's resets, so both do the same physics. ``groups`` has the number of environments in each engine batch.
     """
     import torch
 
@@ -84,7 +84,7 @@ def world_speed(flags: BenchFlags) -> Json:
 
 
 def paired_steps(full: "World", bare: "World", steps: int, generator: "Generator") -> tuple[float, float]:
-    """Seconds that a world and the bare engines of its twin take for the same random steps."""
+    """Return the seconds that a world and the bare engines of its twin take for the same random steps."""
     import torch
 
     def now() -> float:

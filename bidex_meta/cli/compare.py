@@ -1,4 +1,4 @@
-"""``bidex-meta compare``: several runs beside each other, intervals over seeds."""
+"""``bidex-meta compare``: compare several runs, with intervals over seeds."""
 
 import json
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ def _row(group: Group, first: Group) -> Json:
 
 
 def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of groups of runs beside each other, each measured against the first."""
+    """Return columns and rows of a table with one row per group of runs, each compared with the first group."""
     columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
     rows = []
     for group in groups:
@@ -79,7 +79,7 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 
 
 def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of each class by name, a row a group: the mean over seeds, and the seeds' range."""
+    """Return columns and rows of a table with one row per class and group: mean over seeds, and range of seeds."""
     rows = []
     for name in dict.fromkeys(name for group in groups for name in group.classes):
         for group in groups:
@@ -93,5 +93,5 @@ def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 
 
 def _spread(values: np.ndarray, form: str) -> str:
-    """The mean of values, and the least and the largest."""
+    """Format the mean, the least and the largest of values."""
     return f"{values.mean():{form}} [{values.min():{form}} to {values.max():{form}}]"

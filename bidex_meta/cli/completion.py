@@ -29,7 +29,7 @@ class CompletionFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the script. Flags of ``run`` that are the learner's are MT-PPO's."""
+    """Print the script; the learner flags of ``run`` are those of MT-PPO."""
     shell = parse(CompletionFlags, arguments, "completion").shell
     from bidex_meta.cli import COMMANDS
     from bidex_meta.tasks.objects.held import EGG, shelf
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
 
         def takes(flags: object) -> None: ...
 
-        # tyro reads flags from a function's annotations; a name of its own would stand before every flag.
+        # tyro reads flags from a function's annotations; a non-empty name would become a prefix of every flag.
         takes.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
         takes.__defaults__ = None if found.default is None else (found.default,)
         app.command(name=name, help=command.summary)(takes)
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
         app.cli(prog="bidex-meta", args=["--tyro-print-completion", shell])
     for line in script.getvalue().splitlines():
         if line.startswith("COMPLETION_SPEC = "):
-            # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
+            # tyro's script has one line per completion, but keeps the line breaks of help texts.
             line = re.sub(r"\\+n", " ", line)
             for flag, names in choices.items():
                 line = re.sub(

@@ -1,4 +1,4 @@
-"""``bidex-meta control``: is it the task's own data that adaptation learns from?"""
+"""``bidex-meta control``: test if adaptation learns from the task's own data."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ class ControlFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play all arms of all runs and print a table of each class, or JSON."""
+    """Play all arms of all runs and print a table per class, or JSON."""
     flags = parse(ControlFlags, arguments, "control")
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
-    """An arm a row."""
+    """Print a table with one row per arm."""
     caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
     )
@@ -90,7 +90,7 @@ def _plain(arm: Json) -> Json:
 
 
 def _check(folders: Sequence[RunFolder]) -> None:
-    """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
+    """Raise BidexError unless all runs adapt, have the same classes in both splits, and differ only in the seed."""
     check_alike(folders)
     first = run_kind(folders[0].config())
     seeds: dict[int, Path] = {}

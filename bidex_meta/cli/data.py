@@ -1,4 +1,4 @@
-"""``bidex-meta data``: lists, describes and checks data sets."""
+"""``bidex-meta data``: list, describe and check data sets."""
 
 import json
 import sys
@@ -36,7 +36,7 @@ class DataFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print a table or JSON; exit code 1 where a check found something wrong."""
+    """Print a table or JSON; exit with code 1 if a check found a fault."""
     flags = parse(DataFlags, arguments, "data")
     what = known_name("data command", flags.what, _ACTIONS)
     if (what == "list") == bool(flags.name):

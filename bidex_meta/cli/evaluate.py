@@ -1,4 +1,4 @@
-"""``bidex-meta evaluate``: how good a trained run is."""
+"""``bidex-meta evaluate``: measure success and return of a trained run."""
 
 import json
 from collections.abc import Sequence

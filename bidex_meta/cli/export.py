@@ -1,4 +1,4 @@
-"""``bidex-meta export``: a run's policy as one ONNX file, checked against torch."""
+"""``bidex-meta export``: write a run's policy as one ONNX file, checked against torch."""
 
 import json
 import logging
@@ -22,8 +22,8 @@ from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.worlds import Worlds
 
 TOLERANCE = 1e-5
-"""How far an action of the file may be from torch's."""
-_ROWS = 256  # of the check; the export itself sees another number
+"""Largest allowed difference of an action from torch's."""
+_ROWS = 256  # rows of the check; the export itself uses another number of rows
 _SHAPE = dict[str, Any]
 
 
@@ -43,7 +43,7 @@ class ExportFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Export, check and print where the file is."""
+    """Export, check and print the file's path."""
     flags = parse(ExportFlags, arguments, "export")
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
@@ -70,8 +70,9 @@ def main(arguments: Sequence[str]) -> None:
 def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float, float]:
     """Return a policy as the bytes of an ONNX file, which computes in float32, and two largest differences of actions.
 
-    The first is to torch's in float32, the second to those of the policy as it was given, which may compute in
-    bfloat16. ``shape`` is as in a checkpoint. Raises BidexError where torch cannot export it or the first is large.
+    The first difference is to torch's actions in float32. The second difference is to the actions of the policy as it
+    was given, which may compute in bfloat16. ``shape`` is as in a checkpoint. BidexError is raised if torch cannot
+    export the policy or the first difference is larger than TOLERANCE.
     """
     import onnxruntime
     import torch
@@ -83,7 +84,7 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     as_played = network.eval_action(obs).numpy()
     low_precision = getattr(network, "low_precision", False)
     network.low_precision = False
-    # Another library's product, by the size of a batch, which is left open here.
+    # mkldnn would choose a matrix product by the size of a batch, which the export leaves open.
     with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
         try:
             content = _onnx(network, _observations(2, shape), metadata)
@@ -111,7 +112,7 @@ def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
             self.policy = policy
 
         def forward(self, observations: torch.Tensor) -> torch.Tensor:
-            # Some products of no rows end onnxruntime's process by SIGFPE, so there is always one row more.
+            # Some products of zero rows crash onnxruntime's process by SIGFPE, so one row is always added.
             padded = torch.cat([observations, observations.new_zeros(1, observations.shape[1])])
             return self.policy.eval_action(padded)[:-1]
 
@@ -125,12 +126,12 @@ def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
         raise TypeError("torch.onnx.export returned no program")
     program.model.metadata_props.update(metadata)
     for node in program.model.graph.all_nodes():
-        node.metadata_props.clear()  # the lines of code that made it, with paths of this machine
+        node.metadata_props.clear()  # the metadata quote lines of code, with paths of this machine
     return program.model_proto.SerializeToString()
 
 
 def _observations(rows: int, shape: Json) -> Any:
-    """Random raw observations (rows, d), float32, with a task's one-hot where there is one."""
+    """Draw random raw observations (rows, d), float32, with a task's one-hot if the policy reads one."""
     import torch
 
     obs = torch.randn(rows, shape["observations"], generator=torch.Generator().manual_seed(0))
@@ -140,7 +141,7 @@ def _observations(rows: int, shape: Json) -> Any:
 
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
-    """What the file says of itself: texts by name, lists and tables as JSON."""
+    """Return the file's metadata: texts by name, lists and tables as JSON."""
     worlds, versions = Worlds.open(config.to_json()), folder.versions()
     facts = {
         "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,

@@ -1,4 +1,4 @@
-"""``bidex-meta list``: what there is."""
+"""``bidex-meta list``: list suites, tasks, hidden parts of tasks, algos or objects."""
 
 import ast
 import importlib.util
@@ -33,7 +33,7 @@ class ListFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print a table or JSON, one row for each."""
+    """Print a table or JSON, one row per entry."""
     flags = parse(ListFlags, arguments, "list")
     kinds = {"suites": listed, "tasks": _tasks, "hidden": _hidden, "algos": _algos, "objects": _objects}
     rows = kinds[known_name("list", flags.what, kinds)]()
@@ -81,7 +81,7 @@ def _statements(module: str) -> dict[str, ast.AST]:
 
 
 def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
-    """By name the class, the value, or the import that it comes from."""
+    """Map each bound name to its class, its value, or the import that it comes from."""
     found: dict[str, ast.AST] = {}
     for node in body:
         match node:
@@ -99,7 +99,7 @@ def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
 
 
 def _found(module: str, name: str) -> tuple[str, ast.AST | None]:
-    """What is bound to a name, and in which module."""
+    """Follow imports of a name; return the module that binds the name, and the bound class or value."""
     node = _statements(module).get(name)
     return _found(node.module or "", name) if isinstance(node, ast.ImportFrom) else (module, node)
 
@@ -110,7 +110,7 @@ def _docstring(module: str, name: str) -> str:
 
 
 def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | None]:
-    """The value that a class or the nearest that it derives from has, and in which module."""
+    """Return the module and the value of an attribute of a class or of its nearest base class that has the value."""
     module, node = _found(module, name)
     if not isinstance(node, ast.ClassDef):
         return module, None
@@ -126,7 +126,7 @@ def _constant(module: str, name: str, attribute: str) -> object:
 
 
 def _keys(module: str, node: ast.AST | None) -> list[str]:
-    """Keys of a dictionary that is written out, named, or a union."""
+    """Return the keys of a dictionary literal, a named dictionary, or a union of dictionaries."""
     match node:
         case ast.Dict(keys):
             return [key.value for key in keys if isinstance(key, ast.Constant) and isinstance(key.value, str)]

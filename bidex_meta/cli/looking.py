@@ -1,4 +1,4 @@
-"""Worlds and policies that commands look at: pictures, films, the viewers."""
+"""Worlds and policies for commands that show them: pictures, films, the viewers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,10 @@ from bidex_meta.worlds import Worlds, WorldsConfig
 
 
 def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
-    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder, which must fit it."""
+    """Return the agent that acts in a shown world: ``zero``, ``random``, or the policy of a run folder.
+
+    Raises BidexError if the policy does not fit the world.
+    """
     if policy == "zero":
         return ZeroAgent(world.action_space)
     if policy == "random":
@@ -38,9 +41,9 @@ def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Age
 
 
 def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
-    """The worlds in which a policy is looked at, the class of each slot, and the class to look at.
+    """Return the worlds in which a policy is shown, the class of each slot, and the class to show.
 
-    Those of its run, or of the suite or the task that is named.
+    The worlds are those of the named suite or task, else of the policy's run.
     """
     if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
@@ -54,7 +57,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     worlds = Worlds.open(config)
-    slots, classes = slots_of(worlds), worlds.task_classes()  # which refuses what is not of ours
+    slots, classes = slots_of(worlds), worlds.task_classes()  # raises BidexError for worlds that are not ours
     if flags.actor not in ("zero", "random"):
         say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
     task = name_among(name_with_object(flags.task, flags.object), classes) if flags.task else slots[0]

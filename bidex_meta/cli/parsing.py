@@ -1,4 +1,4 @@
-"""Flags to dataclasses by tyro, with every complaint on one line."""
+"""Parse flags into dataclasses by tyro, with every error message on one line."""
 
 import contextlib
 import dataclasses
@@ -20,7 +20,7 @@ Options = TypeVar("Options")
 
 
 class FlagsFound(Exception):
-    """Reports the flags of a command in place of parsing them; only ``flags_of`` asks for it."""
+    """Reports the flags of a command instead of parsing them; only ``flags_of`` requests this."""
 
     def __init__(self, options: type, default: object) -> None:
         self.options, self.default = options, default
@@ -30,9 +30,9 @@ _asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False
 
 
 def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] = ()) -> FlagsFound:
-    """The dataclass of the flags of a subcommand's ``main``, and the default of it where it has one of its own.
+    """Return the dataclass of the flags of a subcommand's ``main``, and its default if the command has its own.
 
-    ``arguments`` are those that the flags may depend on, e.g. ``--algo``.
+    ``arguments`` are the words that the flags may depend on, e.g. ``--algo``.
     """
     token = _asked_for_flags.set(True)
     try:
@@ -72,15 +72,15 @@ class LookFlags:
 
     @property
     def actor(self) -> str:
-        """The policy, however it was named."""
+        """The policy, named by RUN or by --policy."""
         return self.policy if self.run is None else str(self.run)
 
 
 def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:
-    """The flags of a subcommand, of a dataclass whose docstring opens with a sentence and an example.
+    """Parse the flags of a subcommand into a dataclass, whose docstring opens with a sentence and an example.
 
-    ``default`` has the values of flags that are not given. Raises BidexError where a flag is unknown (with the nearest
-    one) or a value bad, SystemExit after printing the help text.
+    ``default`` has the values of flags that are not given. BidexError is raised if a flag is unknown (the message names
+    the nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
     """
     if _asked_for_flags.get():
         raise FlagsFound(options, default)
@@ -103,12 +103,12 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
-    """The value of ``flag`` before the real parse, which may need it to know its own defaults; of several the last."""
+    """Return the last value of ``flag`` before the full parse, whose defaults may depend on this value."""
     return next(reversed(peek_all(arguments, flag)), None)
 
 
 def peek_all(arguments: Sequence[str], flag: str) -> list[str]:
-    """As ``peek``, the values of a flag that may be given several times, in their order."""
+    """Return, as ``peek``, all values of a flag that may be given several times, in the given order."""
     pairs = zip_longest(arguments, arguments[1:])
     found = [value if word == flag else word.partition("=")[2] for word, value in pairs if word.split("=")[0] == flag]
     return [value for value in found if value]
@@ -125,13 +125,13 @@ def _refuse(word: str, options: Any, command: str) -> NoReturn:
 
 
 def _near(flag: str, known: list[str]) -> list[str]:
-    """Flags of the same last part (``--gamma``), of words that begin with its letters (``--lr``), or spelt alike."""
+    """Return flags with the same last part (``--gamma``), the same initials (``--lr``), or a similar spelling."""
     given = flag.lstrip("-").lower().replace("_", "-").rpartition(".")[2]
     last = {name: name.lstrip("-").rpartition(".")[2] for name in known}
     initials = {name: "".join(word[:1] for word in last[name].split("-")) for name in known}
     same = [name for name in known if last[name] == given]
     short = [name for name in known if initials[name] == given]
-    # Of critic-learning-rate and the like, where there is no plain learning-rate.
+    # --lr also matches names such as critic-learning-rate if there is no plain learning-rate.
     ending = [name for name in known if initials[name][-2:] == given]
     spelt = difflib.get_close_matches(flag.lower(), known, n=1, cutoff=0.5)
     by_last = difflib.get_close_matches(given, list(last.values()), n=1, cutoff=0.75)
@@ -139,7 +139,7 @@ def _near(flag: str, known: list[str]) -> list[str]:
 
 
 def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
-    """Every flag of a dataclass and of those it holds."""
+    """Yield every flag of a dataclass and of the dataclasses that it holds."""
     for field in dataclasses.fields(options):
         name = field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
@@ -150,9 +150,9 @@ def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
 
 
 def _one_line(box: str) -> str:
-    """The message in tyro's box: what stands between its title and the first rule."""
+    """Extract the message in tyro's box: the lines between the box's title and the first rule."""
     lines = [line.strip().strip("│").strip() for line in box.splitlines()]
-    # Where the terminal cannot draw, the title is a line of its own with a rule below, not part of the upper edge.
+    # If the terminal cannot draw boxes, the title is a separate line with a rule below, not part of the upper edge.
     start = next((i + 1 for i, line in enumerate(lines) if line and set(line) <= set("-")), 0)
     start = 1 if box.lstrip().startswith("╭") else start
     words: list[str] = []

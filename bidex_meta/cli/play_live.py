@@ -1,4 +1,4 @@
-"""``bidex-meta play``: a policy at work, live."""
+"""``bidex-meta play``: show a policy live."""
 
 import contextlib
 import sys
@@ -33,7 +33,7 @@ class PlayFlags(LookFlags):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play until it is closed."""
+    """Play until the view is closed."""
     flags = parse(PlayFlags, arguments, "play")
     tour = not (flags.run or flags.task or flags.suite) and flags.policy == PlayFlags.policy
     if tour:
@@ -46,8 +46,8 @@ def main(arguments: Sequence[str]) -> None:
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     stage = Stage(world, agent, slots.index(task), flags.seed, tour)
     screen = _screen(flags, stage)
-    note("")  # what is on the screen moves
-    with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
+    note("")  # the moving picture on the screen shows that the command works
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C ends the view in the browser
         play(stage, screen, flags.seconds)
     world.close()
 

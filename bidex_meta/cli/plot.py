@@ -1,4 +1,4 @@
-"""``bidex-meta plot``: learning curves."""
+"""``bidex-meta plot``: draw learning curves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class PlotFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Draw the curves and print where they are."""
+    """Draw the curves and print the picture's path."""
     flags = parse(PlotFlags, arguments, "plot")
     runs = named_runs(flags.runs, "plot")
     if not (flags.adaptation or flags.evaluation):
@@ -48,14 +48,14 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRun]:
-    """Open the runs that a command was given. Raises BidexError if there is none, or a path is no run."""
+    """Open the runs that a command was given. Raises BidexError if there is no run, or a path is not a run."""
     if not paths:
         raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
     return [run for path in paths for run in open_runs(path)]
 
 
 def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:
-    """Where a command writes: as asked, else of this name into the run's folder or, of several runs, here."""
+    """Return the path to write: ``asked``, else ``name`` in the run's folder or, for several runs, here."""
     out = asked or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / name
     if asked is None:
         refuse_links(out)

@@ -1,4 +1,4 @@
-"""``bidex-meta pull``: a policy or a data set from a hub or a folder."""
+"""``bidex-meta pull``: fetch a policy or a data set from a hub or a folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
         source = root = absolute(flags.name.removeprefix(FOLDER))
     else:
         source = Path(called("snapshot_download", flags.name, allow_patterns=list(wanted)))
-        root = source.parents[1]  # a snapshot in the cache links to the files beside all snapshots
+        root = source.parents[1]  # a snapshot in the cache links to files next to the snapshots' folder
     files = files_of(source, wanted, root)
     if not {"config.json", "data/metadata.json"} & files.keys():
         raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _name_suite(run: RunFolder, out: Path) -> None:
-    """Let a config name the suite's file that was published with the run, by its whole path."""
+    """Make a config name the suite's file that was published with the run, by its full path."""
     config = run.config()
     if config.suite is not None and config.suite in [path.name for path in run.path.glob(SUITES)]:
         run.change_config(replace(config, suite=str(out / config.suite)))

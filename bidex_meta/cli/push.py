@@ -1,4 +1,4 @@
-"""``bidex-meta push``: a policy or a data set with its card, to a hub or a folder."""
+"""``bidex-meta push``: publish a policy or a data set with its card, on a hub or in a folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class PushFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the card, publish, print the command that pulls."""
+    """Write the card, publish, and print the command that pulls the publication."""
     flags = parse(PushFlags, arguments, "push")
     of_data = bool(files_of(flags.run, OF_DATA))
     if not flags.name.startswith(FOLDER) and of_data != flags.name.startswith(DATASETS):

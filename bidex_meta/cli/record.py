@@ -1,4 +1,4 @@
-"""``bidex-meta record``: data sets of whole episodes, for learners that train offline."""
+"""``bidex-meta record``: record data sets of whole episodes, for learners that train offline."""
 
 import contextlib
 import math
@@ -26,17 +26,17 @@ from bidex_meta.utils.validation import Environments, Seed, Threads
 from bidex_meta.witness.store import load_witness
 from bidex_meta.worlds import Worlds
 
-if TYPE_CHECKING:  # what loads torch is imported where it is called: --help needs none
+if TYPE_CHECKING:  # functions import the modules that load torch, because --help does not need torch
     from bidex_meta.agents import Agent
     from bidex_meta.data.collect import Actor, Progress
     from bidex_meta.world.contract import PooledWorld
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
-"""Kinds of data sets, and how many runs each takes."""
+"""Kinds of data sets, and the number of runs that each kind takes."""
 SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
 _USUAL_SIZE = 1_000_000
 _DEMONSTRATORS = {"witness": 32, "tasks": 200}  # environments of demonstrations by default, by ``starts``
-_MOST_HELD = 1_200_000_000  # bytes of running episodes beside the world
+_MOST_HELD = 1_200_000_000  # most bytes of running episodes, without the world
 _PATIENCE = 3  # rounds of demonstrations that may all fail
 _OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
 """Entries of a run's config that decide which tasks are played."""
@@ -98,14 +98,14 @@ class _Collection:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Record, or go on with a recording."""
+    """Record a data set, or resume a recording."""
     flags = parse(RecordFlags, arguments, "record")
     kind = known_name("kind of data set", flags.kind, RUNS)
     _check(flags, kind)
     if kind == "replay":
         _publish_replay(flags)
         return
-    part_files.hdf5()  # refuses it where it is not installed
+    part_files.hdf5()  # raises BidexError if h5py is not installed
     _record(flags, _demonstrations(flags) if kind == "demonstrations" else _episodes(flags, kind))
 
 
@@ -126,7 +126,7 @@ def _check(flags: RecordFlags, kind: str) -> None:
 
 
 def _record(flags: RecordFlags, collection: _Collection) -> None:
-    """Collects a data set, or goes on with it."""
+    """Collect a data set, or resume its collection."""
     from bidex_meta.data.collect import bytes_held, resumed_writer
     from bidex_meta.experiments.run_data import dataset_metadata
 
@@ -164,13 +164,13 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
 
 
 def _episodes(flags: RecordFlags, kind: str) -> _Collection:
-    """Episodes of uniform actions, or of runs' policies."""
+    """Return the collection of episodes of uniform actions, or of runs' policies."""
     from bidex_meta.data.collect import Actor, collect, progress
     from bidex_meta.world.threads import set_up_torch
 
     config = _config(flags)
     source = Worlds.open(config)
-    # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
+    # Sums depend on how torch splits them over threads, so a resumed collection keeps its number of threads.
     before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
     config["threads"] = flags.threads or before.get("threads") or usable_cores()
     set_up_torch(config["threads"])
@@ -179,7 +179,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
         actors, policies = map(list, zip(*(_actor(flags, path, config["device"]) for path in flags.runs), strict=True))
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
-    rows = flags.num_envs or tasks * math.ceil(200 / tasks)  # one per task; where tasks are few, several
+    rows = flags.num_envs or tasks * math.ceil(200 / tasks)  # one per task; several if there are few tasks
     size = flags.size or SIZE.get(kind, _USUAL_SIZE)
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
     plan |= config | {"starts": flags.seed}
@@ -190,12 +190,15 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
             say(f"Going on after {before:,} transitions in {out.parts} parts.")
         collect(world, actors, out, size, flags.seed, partial(_report, size, before))
 
-    # Where episodes may end early there are more of them: a third of the time limit is measured on falls.
+    # Episodes that may end early are shorter: falls end at about a third of the time limit (measured).
     return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
 
 
 def _report(size: int, before: int, now: "Progress", seconds: float) -> None:
-    """A line after each round; ``seconds`` and ``before``, in transitions, of when this process began."""
+    """Print a line after each round.
+
+    ``before`` is the number of transitions when this process began, ``seconds`` the time since then.
+    """
     done = sum(now.steps)
     speed = (done - before) / max(seconds, 1e-9)
     left = max(0, size - done) / max(speed, 1e-9)
@@ -207,7 +210,7 @@ def _report(size: int, before: int, now: "Progress", seconds: float) -> None:
 
 
 def _config(flags: RecordFlags) -> Json:
-    """The config of the source: the run's, or the flags'."""
+    """Return the config of the source: the run's, or the flags'."""
     if flags.runs:
         configs = []
         for run in flags.runs:
@@ -229,7 +232,7 @@ def _config(flags: RecordFlags) -> Json:
 
 
 def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
-    """A run's policy, and its metadata."""
+    """Load a run's policy; return its actor and its metadata."""
     from bidex_meta.data.collect import Actor, SamplingAgent
     from bidex_meta.experiments.policies import load_policy
 
@@ -245,7 +248,10 @@ def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
 
 
 def _demonstrations(flags: RecordFlags) -> _Collection:
-    """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
+    """Return the collection of successful replays of a class's witness or scripted policy.
+
+    Bases move, as in suites.
+    """
     from bidex_meta.data.collect import collect_successes, progress
     from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
     from bidex_meta.witness.scripts import script_of
@@ -260,7 +266,7 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
     witness = {} if flags.script else {name: load_witness(name)}
     if flags.script:
-        script_of(source.task_classes()[name])  # refuses a class without one
+        script_of(source.task_classes()[name])  # raises BidexError for a class without a script
     on_tasks = flags.starts == "tasks"
     drawn: Json = {"noise": flags.noise, **({"starts": "tasks"} if on_tasks else {"shift": flags.shift})}
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
@@ -296,7 +302,7 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
 
 
 def _publish_replay(flags: RecordFlags) -> None:
-    """Links or copies what a run recorded of its training into the data folder."""
+    """Link or copy the recording of a run's training into the data folder."""
     (run,) = flags.runs
     folder = RunFolder.open(run)
     config = folder.config()

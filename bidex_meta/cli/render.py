@@ -1,4 +1,4 @@
-"""``bidex-meta render``: what a task looks like, or what a policy does."""
+"""``bidex-meta render``: draw a picture of a task, or a film of a policy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class RenderFlags(LookFlags):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render and print where the file is."""
+    """Render and print the file's path."""
     flags = parse(RenderFlags, arguments, "render")
     out = flags.out
     if out is None:
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.tasks.base import CONTROL_RATE
 
     source, slots, task = looked_at(flags, all_slots=flags.tiled)
-    # One environment for each slot is enough to see one of them.
+    # One environment per slot is enough, because each slot is shown once.
     world = source.world("train", len(slots))
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     if flags.points:
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str]) -> None:
             film_tiles(agent, world, rows, steps, flags.seed, every, flags.large, **look),
             steps // every + 1,
         )
-    elif suffix == ".png":  # the last one alone
+    elif suffix == ".png":  # only the last frame
         frames, count = film_row(agent, world, rows[0], steps, flags.seed, None, **look), 1
     else:
         frames, count = film_row(agent, world, rows[0], steps, flags.seed, every, **look), steps // every + 1
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _with_clouds(world: Any) -> Any:
-    """The world with clouds in its pictures."""
+    """Wrap the world so that its pictures show point clouds."""
     from bidex_meta.evaluation.filming import CloudView
     from bidex_meta.world import PointsRule, World
 

@@ -1,6 +1,6 @@
-"""``bidex-meta report``: runs as one HTML page.
+"""``bidex-meta report``: write one HTML page about runs.
 
-Pictures and films stand in the file itself, so that it needs no network.
+The file contains its pictures and films, so that the page needs no network.
 """
 
 import base64
@@ -25,7 +25,7 @@ from bidex_meta.runs.stored import Run
 from bidex_meta.runs.video import FILMS
 from bidex_meta.utils.files import is_file, portable
 
-FILM_BYTES = 40_000_000  # films of a page together at most; what is above is named alone
+FILM_BYTES = 40_000_000  # most bytes of all films of a page; the page only names further films
 _SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
 
 
@@ -43,7 +43,7 @@ class ReportFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the page and print where it is."""
+    """Write the page and print its path."""
     flags = parse(ReportFlags, arguments, "report")
     runs = named_runs(flags.runs, "report")
     out = output(flags.out, runs, "report.html")
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def render(runs: Sequence[Run]) -> str:
-    """The page of some runs; BidexError where none has logged anything."""
+    """Render the page of some runs; raise BidexError if no run has logged anything."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     histories = read_histories(runs)
@@ -86,12 +86,12 @@ def _json(config: RunConfig) -> str:
 
 
 def _letter(place: int) -> str:
-    """A, B, ..., Z, AA, ...: labels tell all that differs, which is too much for a legend."""
+    """Return A, B, ..., Z, AA, ...: a legend needs short names, because labels list every difference."""
     return ("" if place < 26 else _letter(place // 26 - 1)) + chr(ord("A") + place % 26)
 
 
 def _names(histories: Sequence[tuple[str, History]]) -> dict[Path, str]:
-    """What each run is called on the page."""
+    """Return the name of each run on the page."""
     names: dict[Path, str] = {}
     for group, history in histories:
         for run in history.runs:
@@ -119,7 +119,7 @@ def _run(run: Run, name: str) -> Json:
 
 
 def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
-    """Tables of the groups' final evaluations, and why runs are missing; ``short`` has the groups' names."""
+    """Return tables of the groups' final evaluations, and why runs are missing; ``short`` has the groups' names."""
     evaluated = [run for run in runs if run.evaluated]
     found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
     try:
@@ -136,9 +136,9 @@ def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
 
 
 def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str]]:
-    """Name and picture of each run that ended with a meta-test."""
+    """Yield name and picture of each run that ended with a meta-test."""
     for run in filter(lambda run: run.evaluated, runs):
-        with suppress(BidexError):  # the final table says what is wrong with it
+        with suppress(BidexError):  # the final table reports the error
             found = run.evaluation()
             if found.get("splits"):
                 picture = _picture(lambda found=found, path=run.path: plots.draw_adaptation(found, path))
@@ -147,7 +147,7 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
 
 
 def _differences(runs: Sequence[Run], names: dict[Path, str]) -> Json:
-    """What of config and versions is not the same in all runs."""
+    """Return the entries of config and versions that are not the same in all runs."""
     columns = [flat(portable(run.config().to_json())) | flat({"versions": run.versions()}) for run in runs]
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
@@ -160,9 +160,9 @@ def _cell(value: object) -> str:
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
-    """Yield run, file and content of the newest film of each kind (its name before ``_<step>``); None if it is large.
+    """Yield run, file and content of the newest film of each kind (the name before ``_<step>``).
 
-    The content is a data address of a video or, of a WebP, of an image.
+    The content is a data address of a video or, for WebP, of an image; None if the film is too large.
     """
     room = FILM_BYTES
     for run in runs:
@@ -179,7 +179,7 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
 
 
 def _picture(draw: Callable[[], Any]) -> str | None:
-    """A figure as the address of an image; None where there is nothing to draw."""
+    """Return a figure as the data address of an image; None if there is nothing to draw."""
     try:
         return _data(plots.svg(draw()), "image/svg+xml")
     except BidexError:

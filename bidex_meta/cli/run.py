@@ -20,10 +20,10 @@ from bidex_meta.worlds import Worlds
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train and evaluate. After bad input nothing has been written.
+    """Train and evaluate. Bad input is reported before anything is written.
 
-    Raises SystemExit: 1 if another process was lost, 2 if another process has reported bad input, 128 and the number
-    of the signal that ended the training (0 for SIGTERM), after it has saved.
+    Raises SystemExit: 1 if another process was lost, 2 if another process has reported bad input, and, after a signal
+    has ended the training and training has saved, 128 plus the signal's number (no SystemExit for SIGTERM).
     """
     try:
         distributed.init_from_environment()
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> None:
     except Stopped as stop:
         command = resume_command(stop.folder.path, launch().count)
         say(f"Stopped after {stop.step:,} steps and saved. Continue: {command}")
-        # A batch system's SIGTERM asks for a checkpoint and gets it; the others break off whatever calls this too.
+        # A batch system's SIGTERM requests a checkpoint, which is saved now. Other signals also stop the caller.
         if stop.number != signal.SIGTERM:
             raise SystemExit(128 + stop.number) from None
         return

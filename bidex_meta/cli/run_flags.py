@@ -1,4 +1,4 @@
-"""The flags of ``bidex-meta run`` as a resolved config."""
+"""Read the flags of ``bidex-meta run`` as a resolved config."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -46,8 +46,8 @@ class RunFlags(Generic[LearnerSettings]):
 def run_flags(arguments: Sequence[str]) -> RunFlags:
     """Return the flags with a resolved and checked config.
 
-    The learner, its preset and the device decide the other flags and their defaults, so these are read first. Raises
-    BidexError for bad input.
+    The learner, its preset and the device decide the other flags and their defaults, so these three are read first.
+    BidexError is raised for bad input.
     """
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
@@ -58,7 +58,7 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     is_named = folder is not None or any(peek(arguments, f"--{name}") for name in ("suite", "task", "dataset"))
     config = replace(
         flags.config,
-        suite=flags.config.suite if is_named else None,  # which is refused, for it was not asked for
+        suite=flags.config.suite if is_named else None,  # a config without a named suite is refused
         dataset=default.dataset,
         demonstrations=flags.config.demonstrations or default.demonstrations,
         teacher=flags.config.teacher or default.teacher,
@@ -86,5 +86,5 @@ def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:
     if folder is not None:
         return resolve(replace(folder.config(), **given), str(folder.config_path))
     if not given.keys() & {"suite", "task", "dataset"}:
-        given["suite"] = _EXAMPLE  # without --help its absence is refused later
+        given["suite"] = _EXAMPLE  # only --help uses this suite: a run without one is refused later
     return resolve(RunConfig(**given))

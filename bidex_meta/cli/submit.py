@@ -1,4 +1,4 @@
-"""``bidex-meta submit``: an entry of the leaderboard, verified by playing the runs."""
+"""``bidex-meta submit``: write an entry of the leaderboard, verified by playing the runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
-    """Raises BidexError for runs that make no entry together."""
+    """Raise BidexError if the runs cannot form one entry."""
     for folder, config in zip(folders, configs, strict=True):
         if config.suite is None:
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
@@ -100,7 +100,7 @@ def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
 
 
 def _weights(folders: Sequence[RunFolder]) -> list[str]:
-    """Return the digests of the runs' policies; raises BidexError where two are equal, whatever their configs say."""
+    """Return the digests of the runs' policies; raise BidexError if two are equal, whatever their configs say."""
     digests: dict[str, Path] = {}
     for folder in folders:
         state, _ = checkpoint(folder, noted=True)
@@ -113,7 +113,7 @@ def _weights(folders: Sequence[RunFolder]) -> list[str]:
 
 
 def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
-    """Hours of training, the device and the commit that trained."""
+    """Return the hours of training, the device, and the commit that trained."""
     versions, config = folder.versions(), folder.config()
     git = versions.get("git") or {}
     commit = git.get("commit") and git["commit"][:10] + "+" * bool(git.get("dirty"))
@@ -123,7 +123,7 @@ def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
 
 
 def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Evaluation, Evaluation, int, Json]:
-    """Evaluations on own and on other tasks, the policy's steps, and the conditions."""
+    """Return the evaluations on own and on other tasks, the policy's steps, and the conditions."""
     config = stored.to_json()
     config |= {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": "auto"}
     worlds = Worlds.open(config)

@@ -1,7 +1,7 @@
-"""``bidex-meta sweep``: many runs from one file, so many at a time, resumed where they were stopped.
+"""``bidex-meta sweep``: start many runs from one file, several at a time, and resume stopped runs.
 
-On this machine runs are called by a pool of threads, each of which keeps to a core; on a cluster by submitit (extra
-``slurm``). Both call the same ``Job``, which begins a run or resumes it, and waits for its process.
+On this machine a pool of threads, each bound to a core, calls the runs; on a cluster submitit (extra ``slurm``) calls
+the runs. Both call the same ``Job``, which begins or resumes a run, and waits for the run's process.
 """
 
 import math
@@ -34,9 +34,9 @@ from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 from bidex_meta.utils.waiting import note
 
-COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # what a run's words are given to
+COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # a run's words are appended
 _STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
-"""Tells a run to save and end. It may get it from a batch system too; of SIGTERM the second would act at once."""
+"""Signal that makes a run save and end. A batch system may send it too; a second SIGTERM would kill the run."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class SweepFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Check everything, then run it; exit code 1 where a run has failed."""
+    """Check everything, then run the sweep; exit with code 1 if a run has failed."""
     flags = parse(SweepFlags, arguments, "sweep")
     sweep = read_sweep(flags.file, flags.out)
     cores = choose_cores(flags.cores, flags.workers)
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _configs(sweep: Sweep, file: Path) -> dict[tuple[str, ...], RunConfig]:
-    """The resolved config of each kind of run, by its words: seeds share it."""
+    """Return the resolved config of each kind of run, by the run's words; seeds share a config."""
     configs: dict[tuple[str, ...], RunConfig] = {}
     for run in sweep.runs:
         try:
@@ -106,7 +106,7 @@ def _configs(sweep: Sweep, file: Path) -> dict[tuple[str, ...], RunConfig]:
 
 
 class State(NamedTuple):
-    """How far a run has come."""
+    """Progress of a run."""
 
     run: PlannedRun
     state: Literal["done", "runs", "failed", "left"]
@@ -117,16 +117,16 @@ class State(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """Measured steps a second; 0 before the first line of metrics."""
+        """Measured steps per second; 0 before the first line of metrics."""
         return self.step / self.seconds if self.seconds else 0.0
 
 
 def state_of(run: PlannedRun) -> State:
-    """How far a run, of which the config is known, has come; BidexError where its folder has one of another config."""
+    """Return the progress of a run whose config is known; raise BidexError if its folder holds another config's run."""
     rows, evaluated = [], False
     if exists(run.folder.config_path):
         wanted = run.config if run.after is None else replace(run.config, start_from=str(run.after.resolve()))
-        # Seeds share a config; the machine may be another one.
+        # Seeds share a config, and the machine may have changed, so seed, threads and device are ignored.
         for name, there, here in run.folder.config().differences(wanted, ignored=("seed", "threads", "device")):
             raise BidexError(
                 f"{run.path} is a run of another config: {name} is {there} there, not {here}. Give the arm another "
@@ -142,19 +142,19 @@ def state_of(run: PlannedRun) -> State:
 
 
 class Job:
-    """A run as something to be called, by a thread or by submitit."""
+    """A run as a callable, for a thread or for submitit."""
 
     def __init__(self, run: PlannedRun, command: Sequence[str]) -> None:
         self.run, self.command, self.stopped = run, command, False
         self.process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> bool:
-        """Begin or resume the run and wait for its end; return False where a signal stopped it before.
+        """Begin or resume the run and wait for its end; return False if a signal stopped the run before.
 
-        Raises BidexError, the last line of its log, where it failed.
+        If the run failed, BidexError is raised with the last line of the run's log.
         """
         run = self.run
-        while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
+        while _locked(run) and not self.stopped:  # a process that a killed sweep has left still trains the run
             time.sleep(1.0)
         if state_of(run).state == "done":
             return True
@@ -163,7 +163,7 @@ class Job:
         words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
         with _beside(run, "log").open("ab") as log:
             one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
-            self.process = subprocess.Popen(  # Ctrl-C reaches the sweep alone, which then stops its runs
+            self.process = subprocess.Popen(  # Ctrl-C reaches only the sweep, which then stops its runs
                 [*self.command, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=one_thread,
                 start_new_session=True,
             )  # fmt: skip
@@ -179,17 +179,18 @@ class Job:
         return done
 
     def stop(self) -> None:
-        """Have the run save and end; does not wait for it."""
+        """Tell the run to save and end, without waiting for its end."""
         self.stopped = True
         if self.process is not None:
             self.process.send_signal(_STOP)
 
 
 class QueuedJob(Job):
-    """A job of a batch system, which goes back into the queue when its time is up before the run's end.
+    """A job of a batch system, which is queued again if its time is up before the run's end.
 
-    The signal before that interrupts the wait for the run's process, within which nothing can wait for it: a handler
-    would wait for ever. So ours tells the run to save and end, and submitit's is called when it has.
+    The batch system's signal arrives while this job waits for the run's process. A handler that waited for the same
+    process would block forever. Our handler therefore only tells the run to save and end; submitit's handler is called
+    after the run has ended.
     """
 
     def __call__(self) -> bool:
@@ -205,10 +206,10 @@ class QueuedJob(Job):
         handlers = {number: signal.signal(number, remember) for number in numbers}
         try:
             done = super().__call__()
-            if not asked and self.process is not None:  # the signal reached the run alone, or before it reached us
+            if not asked and self.process is not None:  # only the run received the signal, or received it before us
                 asked.append(_signal_of(self.process.returncode) or 0)
             requeue = handlers[requeueing]
-            # SIGTERM is no such request: it comes when somebody cancels the job.
+            # SIGTERM does not request requeueing: the batch system sends it when somebody cancels the job.
             if not done and callable(requeue) and {*BATCH_SIGNALS, requeueing}.intersection(asked):
                 requeue(requeueing, None)
             return done
@@ -217,26 +218,26 @@ class QueuedJob(Job):
                 signal.signal(number, handler)
 
     def checkpoint(self) -> Any:
-        """Return what submitit queues again; the run's process has ended by then."""
+        """Return the job that submitit queues again, after the run's process has ended."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(QueuedJob(self.run, self.command))
 
 
 def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[[str], None]) -> int:
-    """Runs everything in order, a run at a time on each core; returns how many have failed.
+    """Run all runs in order, one at a time on each core; return the number of failed runs.
 
-    A failure stops no other run but those that start from it, and so does a signal to a run, which counts as one here.
-    After Ctrl-C or SIGTERM of the sweep each run saves and stops.
+    A failed run stops only the runs that start from it. A run that a signal stopped counts as failed. After Ctrl-C or
+    SIGTERM of the sweep each run saves and stops.
     """
     waiting, failed, free = list(runs), dict[Path | None, str](), list(cores)
-    note("")  # runs take hours, and each begins and ends with a line
+    note("")  # runs take hours; a line is printed at the start and end of each run
     own: dict[Future[bool], Job] = {}
     jobs: list[Job] = []
 
     def bind() -> None:
         if (core := free.pop(0)) is not None:
-            os.sched_setaffinity(0, {core})  # of this thread, and of the processes that it starts
+            os.sched_setaffinity(0, {core})  # binds this thread, and the processes that it starts
 
     with ThreadPoolExecutor(len(cores), initializer=bind) as pool:
         try:
@@ -271,10 +272,10 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
 
 
 def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) -> dict[str, Any]:
-    """Hands runs to submitit's executor ``slurm``, or ``local``: processes of this machine, all at once.
+    """Submit runs to submitit's executor ``slurm``, or ``local``: processes of this machine, all at once.
 
-    ``parameters`` are the executor's, beside a day's time and a processor. What jobs print is in ``out/jobs/``.
-    Returns submitit's jobs by name; none of a run whose job of an earlier start waits or runs.
+    ``parameters`` are the executor's; the defaults are a time of one day and one processor. Jobs print into
+    ``out/jobs/``. Returns submitit's jobs by name, without the runs whose job of an earlier start waits or runs.
     """
     try:
         import submitit
@@ -285,7 +286,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
         executor = submitit.AutoExecutor(folder=folder, cluster=where)
         executor.update_parameters(**{"timeout_min": 24 * 60, "cpus_per_task": 1, **parameters})
         for run in runs:
-            number = _beside(run, "job")  # local jobs need none: the lock of the run's folder is enough
+            number = _beside(run, "job")  # local jobs need no number: the lock of the run's folder is enough
             if where == "slurm" and is_file(number):
                 job = submitit.SlurmJob(folder=folder, job_id=read_text(number, "a job's number").strip())
                 if not job.done(force_check=True):
@@ -300,7 +301,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
-    """A core for each worker, of those asked for (``1``, ``0,2-3``); None where the system binds no processes."""
+    """Return a core per worker, from those requested (``1``, ``0,2-3``); None if the system cannot bind processes."""
     linux = sys.platform == "linux"
     usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable
@@ -318,15 +319,15 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
 
 
 def _signal_of(code: int) -> int | None:
-    """Return the signal of a batch system that ended a run, which may have saved; None after any other end."""
-    if code == 0:  # a run that is not done saved at SIGTERM
+    """Return the batch system's signal that ended a run, which may have saved; None after any other end."""
+    if code == 0:  # an unfinished run that exits with 0 has saved at SIGTERM
         return signal.SIGTERM
     number = -code if code < 0 else code - 128
     return number if number in (*BATCH_SIGNALS, signal.SIGTERM) else None
 
 
 def _locked(run: PlannedRun) -> bool:
-    """Whether a process trains in a run's folder."""
+    """Return whether a process trains in a run's folder."""
     try:
         with run.folder.locked():
             return False
@@ -337,7 +338,7 @@ def _locked(run: PlannedRun) -> bool:
 
 
 def _beside(run: PlannedRun, kind: str) -> Path:
-    """A file beside a run's folder: ``log``, what it printed; ``failed``, why its last start did; ``job``, its id."""
+    """Return the path of a file next to a run's folder: ``log`` (output), ``failed`` (last error) or ``job`` (id)."""
     return run.path.with_name(f"{run.name}.{kind}")
 
 
@@ -347,7 +348,7 @@ def _last_line(path: Path) -> str:
 
 
 def _print(states: Sequence[State]) -> None:
-    """A line a run; hours left by its own speed, else by the mean on its suite, else by that of all."""
+    """Print a line per run; the hours left follow from the run's speed, else the suite's mean, else the mean of all."""
     speeds, rows, total = [(each.run.subject, each.speed) for each in states if each.speed], [], 0.0
     for each in states:
         alike = [speed for subject, speed in speeds if subject == each.run.subject] or [speed for _, speed in speeds]

@@ -1,4 +1,4 @@
-"""What commands print: tables for people, rows as JSON, and what they are at."""
+"""Print tables for people and rows as JSON."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from bidex_meta.evaluation.statistics import Interval
 from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 from bidex_meta.utils.streams import output_width
 
-Json = dict[str, Any]  # what JSON holds, or goes into it
+Json = dict[str, Any]  # an object of JSON
 NONE = "–"
 _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
@@ -28,10 +28,10 @@ _BROKEN = (
 
 @dataclass
 class Sheet:
-    """Rows under headers; where it is too wide for the terminal it leaves columns out, and says which.
+    """Rows under headers; a table that is too wide for the terminal leaves out columns, and names them.
 
     A number with its interval, ``0.7 [0.6, 0.8]`` under ``return [95 %]``, takes two columns. Intervals are left out
-    first, then the columns named in ``spare`` in this order, then the last ones. Names and numbers are never cut.
+    first, then the columns named in ``spare`` in this order, then the last columns. Names and numbers are never cut.
     """
 
     headers: Sequence[str]
@@ -48,7 +48,7 @@ class Sheet:
         self.styles.append(style)
 
     def printed(self, width: int) -> str:
-        """Lay the table out in ``width`` columns; in more, if its first two columns need more."""
+        """Lay the table out in ``width`` terminal columns, or in more if the first two table columns need more."""
         shown = self._columns()
         left_out: list[str] = []
         for column in sorted(shown[2:], key=self._first_to_go):
@@ -67,7 +67,7 @@ class Sheet:
         for number, style in enumerate(self.styles):
             table.add_row(*(Text(column.cells[number]) for column in shown), style=style or None)
         console = Console(width=max(width, _needed(shown)))
-        with console.capture() as text:  # rich would end the process where nobody reads it
+        with console.capture() as text:  # rich would end the process if nobody read the output
             console.print(table)
         return text.get()
 
@@ -115,7 +115,7 @@ class _Column:
 
     @property
     def least(self) -> int:
-        """The columns of a terminal that it needs: its cells, or of prose the longest word and some room."""
+        """Least width in terminal columns: the widest cell, or for prose the longest word and some room."""
         words = self.header.split()
         if self.is_prose:
             words += [word for cell in self.cells for word in cell.split()]
@@ -128,7 +128,7 @@ def _needed(columns: Sequence[_Column]) -> int:
 
 
 def _widths(columns: Sequence[_Column], width: int) -> list[int]:
-    """Return the columns' widths: the least ones, and of the room left each letter goes where most are wrapped."""
+    """Return the columns' widths: the least widths, plus the room left, which goes to the most wrapped columns."""
     widths = [column.least for column in columns]
     wanted = [max(map(len, [*column.cells, column.header]), default=1) for column in columns]
     for _ in range(width - _needed(columns)):
@@ -140,7 +140,7 @@ def _widths(columns: Sequence[_Column], width: int) -> list[int]:
 
 
 def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.", spare: Sequence[str] = ()) -> None:
-    """Rows of equal keys as JSON, or as a table headed by them; ``otherwise`` in place of a table of none."""
+    """Print rows of equal keys as JSON, or as a table headed by the keys; print ``otherwise`` if there are no rows."""
     if as_json:
         print(json.dumps(rows, indent=2))
     elif rows:
@@ -153,9 +153,10 @@ def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.",
 def evaluation_table(
     title: str, policy: Evaluation, random: Evaluation | None = None, gains: Gains | None = None
 ) -> Sheet:
-    """Success, return and score per class; beside those of a random policy with the difference; what adaptation gained.
+    """Return a table of success, return and score per class.
 
-    Both evaluations are on the same tasks.
+    With ``random`` the table also has a random policy's results on the same tasks, and the difference. With ``gains``
+    it has the gains by adaptation.
     """
     caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: by the suite's rule, once or at end"
     headers = ["task", "episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
@@ -197,7 +198,7 @@ _SPARE = ("once", "at end", "length", "episodes", "score gained", "random return
 
 
 def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
-    """The least of ``evaluation_table``, with intervals where there is room."""
+    """Return a short form of ``evaluation_table``, with intervals if there is room."""
     headers = ["task", "success", "random", "return [95 %]", "random return"]
     table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks")
     rows, others = policy.to_json(), random.to_json()
@@ -211,7 +212,7 @@ def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
 
 
 def gained(measures: Mapping[str, Difference | None]) -> list[str]:
-    """Cells of the gains in success, return and score."""
+    """Return the cells of the gains in success, return and score."""
     success, earned, score = (measures[name] for name in ("success", "return", "score"))
     percents = NONE
     if success is not None:
@@ -225,7 +226,7 @@ def gained(measures: Mapping[str, Difference | None]) -> list[str]:
 
 
 def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]], spare: Sequence[str] = ()) -> Sheet:
-    """A table of anything."""
+    """Return a table of arbitrary columns and rows."""
     table = Sheet(columns, spare=spare)
     for row in rows:
         table.add(*row)
@@ -233,12 +234,12 @@ def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]], spare:
 
 
 def print_table(table: Sheet) -> None:
-    """To stdout, as wide as the terminal or COLUMNS says; wide enough for most where it is a file or a pipe."""
+    """Print a table to stdout, as wide as the terminal or COLUMNS; 180 columns wide in a file or a pipe."""
     sys.stdout.write(table.printed(output_width(180)))
 
 
 def print_evaluation(found: RunEvaluation, brief: bool = False) -> None:
-    """Print the tables of an evaluation; ``brief`` ones, of an evaluation with a random policy, fit a terminal."""
+    """Print the tables of an evaluation; ``brief`` tables, which need a random policy's results, fit a terminal."""
     title = f"{found.algo} on {found.worlds.name}"
     if not brief:
         title += f", {found.own.split} tasks"
@@ -259,7 +260,7 @@ def _print_played(title: str, played: PlayedTasks, brief: bool) -> None:
 
 
 def print_meta_test(found: RunMetaTest) -> None:
-    """Print for each split a table before adaptation and one after, the latter with the gains."""
+    """Print, for each split, a table before adaptation and a table after adaptation with the gains."""
     for split, result in found.splits.items():
         subject = f"{found.algo} on {found.worlds.name}, {found.steps:,} steps, {split} tasks"
         print_table(evaluation_table(f"{subject}, before adaptation", result.before))
@@ -269,7 +270,7 @@ def print_meta_test(found: RunMetaTest) -> None:
 
 
 def percent(value: float) -> str:
-    """``12.3 %`` of 0.123."""
+    """Format 0.123 as ``12.3 %``."""
     return f"{100 * value:.1f} %"
 
 
@@ -278,7 +279,7 @@ def _score(value: float | None) -> str:
 
 
 def ranged(value: float, interval: Interval | None, sign: bool = False, unit: str = "") -> str:
-    """A value and the ends of its interval."""
+    """Format a value and the ends of its interval."""
     form = "+.4g" if sign else ".4g"
     ends = NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
     return f"{value:{form}}{unit} [{ends}]"

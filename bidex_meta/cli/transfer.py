@@ -1,4 +1,4 @@
-"""``bidex-meta transfer``: what a run's policy is worth on classes that it was not trained on."""
+"""``bidex-meta transfer``: measure how much a run's policy helps on unseen classes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ class TransferFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run what is left, print and store the tables; exit code 1 where a run has failed."""
+    """Run the runs that are left, print and store the tables; exit with code 1 if a run has failed."""
     at = arguments.index("--") if "--" in arguments else len(arguments)
     flags = parse(TransferFlags, arguments[:at], "transfer")
     arms = arms_of([flags.run, *flags.start_from])
@@ -76,7 +76,8 @@ def main(arguments: Sequence[str]) -> None:
         say_other_rules(RunFolder.open(path), worlds)
     classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
     words = shared_words(flags.num_envs, arguments[at + 1 :])
-    planned = config_of_words([f"--suite={config.suite}", *words])  # refuses what follows -- before anything is written
+    # Bad words after -- are refused before anything is written.
+    planned = config_of_words([f"--suite={config.suite}", *words])
     if any(flags.demonstrations):
         part_files.hdf5()
     check_writable(flags.out / "transfer.json")
@@ -96,7 +97,7 @@ def _cells(
     flags: TransferFlags, worlds: Worlds, classes: Sequence[str], arms: Sequence[Arm], words: Sequence[str],
     steps: list[str]
 ) -> Iterator[Cell]:  # fmt: skip
-    """All runs, seeds outermost; writes suite files, and records demonstrations that are not there yet."""
+    """Yield all runs, seeds outermost; write suite files, and record missing demonstrations."""
     counts, most = sorted({*flags.demonstrations}), max(flags.demonstrations, default=0)
     for folder in ("suites", "data", "runs"):
         (flags.out / folder).mkdir(exist_ok=True)
@@ -110,7 +111,7 @@ def _cells(
 
 
 def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
-    """Of runs that are done a table of each track, transfer.json with both and, with matplotlib, a figure of each."""
+    """Report the runs that are done: a table per track, transfer.json and, with matplotlib, a figure per track."""
     groups: dict[tuple[str, str, int | None], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.task, cell.arm, cell.demonstrations), []).append(cell)
@@ -172,7 +173,7 @@ def _text(found: Json | None, factor: float = 100.0, form: str = ".1f") -> str:
 
 
 def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:
-    """A panel of each class: success against steps, and against demonstrations."""
+    """Draw a panel per class: success against steps, and success against demonstrations."""
     curves = {(row["class"], row["from"]): _curve(**row["curve"]) for row in steps}
     if curves:
         _save(plots.draw_panels(_panels(curves), TAG, "success"), out / "reinforcement.png")

@@ -1,4 +1,4 @@
-"""What ``bidex-meta transfer`` runs: a suite file of each held-out class, its demonstrations, a run for each cell."""
+"""Plan ``bidex-meta transfer``: a suite file per held-out class, the class's demonstrations, and a run per cell."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -33,9 +33,9 @@ _NETWORK = (
 """Fields of a learner's config that a policy to start from must share."""
 _ALGO, _PRESET = "ppo", "laptop"
 _USUAL = (f"--preset={_PRESET}", "--logger=none", "--learner.demonstration-cloning=5000")
-_EVALUATIONS = 100  # of a run by reinforcement: the first one after a hundredth of the steps
-_LONG = 10**9  # steps in which the critic learns alone: the policy of a run by demonstrations stays what was cloned
-_PATIENCE = 3  # rounds of a script
+_EVALUATIONS = 100  # evaluations of a run by reinforcement, evenly spaced
+_LONG = 10**9  # steps in which only the critic learns, so that a run by demonstrations keeps the cloned policy
+_PATIENCE = 3  # most rounds of a script
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Cell:
 
 
 class Arm(NamedTuple):
-    """What a policy starts from."""
+    """A start of training: a run's policy, or a fresh policy."""
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy
@@ -57,7 +57,7 @@ class Arm(NamedTuple):
 
 
 def arms_of(paths: Sequence[Path]) -> list[Arm]:
-    """The first run, a fresh policy with the first one's network, and the other runs."""
+    """Return the first run, a fresh policy with the first run's network, and the other runs."""
     folders = [RunFolder.open(absolute(path)) for path in paths]
     values = [folder.config().learner_values for folder in folders]
     network = [[w for n in _NETWORK if n in own for w in words_of(f"learner.{n}", own[n])] for own in values]
@@ -71,7 +71,10 @@ def arms_of(paths: Sequence[Path]) -> list[Arm]:
 
 
 def held_out(worlds: Worlds, asked: Sequence[str]) -> list[str]:
-    """Classes of a suite that are tested and not trained on: those asked for, or all; BidexError without any."""
+    """Return the held-out classes of a suite (tested, not trained on), all or the requested ones.
+
+    Raises BidexError if the suite has no held-out class.
+    """
     classes = [] if worlds.suite is None else worlds.suite.classes
     found = [entry.name for entry in classes if entry.splits == ("test",)]
     if not found:
@@ -83,7 +86,7 @@ def held_out(worlds: Worlds, asked: Sequence[str]) -> list[str]:
 
 
 def suite_file(worlds: Any, name: str, folder: Path) -> Path:
-    """The suite with its splits exchanged, in ``folder``: a held-out class is trained on, all others are not.
+    """Write a copy of the suite into ``folder`` in which only one held-out class is trained on; return the path.
 
     Padding, hidden goals, rules and the class's 50 tasks are those of the meta-test.
     """
@@ -119,7 +122,7 @@ def _entry(each: SuiteClass, split: str) -> dict[str, Any]:
 
 
 def _toml(value: object) -> str:
-    """A value as TOML, on one line; tables without what is empty."""
+    """Format a value as TOML on one line; leave empty entries out of tables."""
     if isinstance(value, dict):
         entries = (f"{json.dumps(key)} = {_toml(each)}" for key, each in value.items() if each not in ([], {}))
         return f"{{ {', '.join(entries)} }}"
@@ -129,9 +132,10 @@ def _toml(value: object) -> str:
 
 
 def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path, count: int) -> Dataset | None:
-    """Episodes of a class: a data set that was given, else its script's, at least ``count``; None without either.
+    """Return demonstrations of a class: a given data set, else at least ``count`` episodes of the class's script.
 
-    Raises BidexError for a data set of other rules: what succeeds by these may fail here.
+    Returns None if there is neither a data set nor a script. BidexError is raised for a data set of other rules,
+    because an episode that succeeds under other rules may fail here.
     """
     worlds = Worlds.open(WorldsConfig(suite=str(file)))
     task = worlds.task_classes()[name]
@@ -164,7 +168,10 @@ def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path,
 
 
 def some_of(dataset: Dataset, name: str, count: int, seed: int, folder: Path) -> Path:
-    """A data set of so many successful episodes, drawn by the seed; fewer are among more. BidexError for too few."""
+    """Write a data set of ``count`` successful episodes, drawn by the seed; return its folder.
+
+    With the same seed, a smaller draw is part of a larger one. BidexError is raised if there are too few episodes.
+    """
     folder = folder / f"{short_name(name)}-{count}-seed{seed}-v0"
     source = str(absolute(dataset.folder))
     if _is_complete(folder):
@@ -198,12 +205,12 @@ def _is_complete(folder: Path) -> bool:
 
 
 def shared_words(num_envs: int, more: Sequence[str]) -> list[str]:
-    """Words of all runs; ``more``, the user's, go before the usual ones."""
+    """Return the words of all runs; ``more`` holds the user's words, which override the usual words."""
     return [*_USUAL, *more, f"--algo={_ALGO}", f"--num-envs={num_envs}"]
 
 
 def reinforced(steps: int, planned: RunConfig[Any]) -> list[str]:
-    """Words of a run by reinforcement, which is evaluated a hundred times, or after each iteration; [] for 0 steps."""
+    """Return the words of a run by reinforcement: evaluate 100 times, or after each iteration; [] for 0 steps."""
     iteration = planned.num_envs * planned.learner_values["rollout_steps"]
     return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"] if steps else []
 
@@ -212,9 +219,9 @@ def cells_of(
     file: Path, name: str, arms: Sequence[Arm], seed: int, words: Sequence[str], out: Path, steps: list[str],
     counts: Sequence[int], dataset: Dataset | None
 ) -> Iterator[Cell]:  # fmt: skip
-    """The cells of a class and seed: for each arm by so many demonstrations each, then by reinforcement if ``steps``.
+    """Yield the cells of a class and seed: for each arm one per count of demonstrations, then by reinforcement.
 
-    Without a data set only those of no demonstration are there.
+    Without a data set only the cells without demonstrations are yielded, without ``steps`` none by reinforcement.
     """
     for count in (count for count in counts if not count or dataset is not None):
         track = ["--steps=1", f"--learner.critic-first={_LONG}"]  # one iteration

@@ -1,4 +1,4 @@
-"""``bidex-meta validity``: whether there is something to learn about the tasks of a suite."""
+"""``bidex-meta validity``: measure if there is something to learn about the tasks of a suite."""
 
 import json
 from collections.abc import Collection, Sequence
@@ -57,7 +57,7 @@ class ValidityFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, print, and store where it was asked."""
+    """Measure, print, and store if ``--out`` is given."""
     flags = parse(ValidityFlags, arguments, "validity")
     if flags.out is not None:
         check_writable(flags.out)
@@ -85,7 +85,7 @@ def _cells(name: str, row: Json) -> list[str]:
 
 
 def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Json]:
-    """The row of each class of a split."""
+    """Return the row of each class of a split."""
     world = worlds.world(split)
     if not isinstance(world, World):
         raise BidexError(f"Expected a suite of hands, got {flags.suite}.")
@@ -109,7 +109,7 @@ def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Jso
 
 
 def _witnesses(world: World) -> OpenLoopReplay:
-    """The witnesses of a world's classes, of version 1's task 0, in all tasks."""
+    """Return an agent that replays, in all tasks, the witnesses of version 1's task 0 of a world's classes."""
     known = {name: load_witness(plain_name(name)) for name in _with_witness(world)}
     return OpenLoopReplay(known, list(world.task_names), world.task_id, world.action_size)
 
@@ -125,7 +125,7 @@ def _scripted(world: World) -> list[str]:
 
 
 def _identified(slot: Slot, flags: ValidityFlags) -> Json:
-    """How well the best of the exploring episodes tells what a class hides."""
+    """Measure how well the best exploring episode identifies the hidden parts of a class."""
     say(f"{slot.name}: what rewards tell")
     world = World([slot], WorldConfig(len(slot.tasks), engine="c", threads=flags.threads, autoreset_mode="DISABLED"))
     explorers: list[Agent | None] = [None]
@@ -137,7 +137,7 @@ def _identified(slot: Slot, flags: ValidityFlags) -> Json:
 
 
 def _results(worlds: Worlds, world: World, flags: ValidityFlags) -> dict[str, dict[str, ClassResult]]:
-    """What each policy got in each class that it plays, by class and policy."""
+    """Return the results by class and policy, for each class that a policy plays."""
     scripted = _scripted(world)
     agents: dict[str, tuple[Agent, Collection[str]]] = {
         "uniform": (RandomAgent(world.action_space, flags.seed), world.task_names),

@@ -1,4 +1,4 @@
-"""``bidex-meta verify``: does a run's checkpoint still do what its recorded evaluation says?"""
+"""``bidex-meta verify``: test if a run's checkpoint still reproduces its recorded evaluation."""
 
 import json
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _print_table(title: str, found: Sequence[Agreement]) -> None:
-    """A class a row."""
+    """Print a table with one row per class."""
     caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
     table = Sheet(["task", "outcome", "success", "again", "return [95 %]", "return again [95 %]"], title, caption)
     for each in found:

@@ -1,4 +1,4 @@
-"""``bidex-meta witness``: replays stored reference solutions."""
+"""``bidex-meta witness``: replay stored reference solutions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class WitnessFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Replays the witnesses of one class or of all, and prints what they reach."""
+    """Replay the witnesses of one class or of all classes, and print the results."""
     flags = parse(WitnessFlags, arguments, "witness")
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))

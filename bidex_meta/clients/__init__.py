@@ -1,1 +1,1 @@
-"""Adapters for outsiders: each turns the world into what one other library expects."""
+"""Adapters for other libraries: each adapter gives the world the interface of one library."""

@@ -15,8 +15,8 @@ from bidex_meta.world.episodes import check_single_reset
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
-    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`; without it the tasks are those of seed 0, and
-    the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
+    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Without `seed` the tasks are those of seed 0,
+    and the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
     other than None and `"rgb_array"`.
     """
 
@@ -43,7 +43,10 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._over = True
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts an episode, the same for the same seed: observation (d,), float32, and an empty info. No options."""
+        """Start an episode, the same for the same seed; return the observation (d,), float32, and an empty info.
+
+        There are no options.
+        """
         check_single_reset(seed, options)
         super().reset(seed=seed, options=options)
         obs, _ = self.world.reset(seed=seed)
@@ -51,11 +54,12 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs[0].cpu().numpy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Advances 1/60 s by an action (a,) in [-1, 1]: observation (d,) float32, reward, terminated, truncated, info.
+        """Advance 1/60 s by an action (a,) in [-1, 1].
 
-        `info`: ``success`` (of this state; in version 2 whether the goal has been held for 0.25 s), ``unstable``,
-        ``reward_terms``, and at an episode's end ``is_success``: whether the episode is a success, in version 1 at any
-        step, in version 2 at its end. Raises BidexError where no episode runs: its end would count twice.
+        Returns observation (d,) float32, reward, terminated, truncated and info. `info` has ``success`` (of this state;
+        in version 2 whether the goal has been held for 0.25 s), ``unstable`` and ``reward_terms``. At an episode's end
+        `info` also has ``is_success``: whether the episode was a success, in version 1 at any step, in version 2 at its
+        end. BidexError is raised if no episode runs, because the last episode's end would count twice.
         """
         if self._over:
             raise BidexError("Expected reset() before step(): no episode runs.")
@@ -68,9 +72,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """A picture (height, width, 3), uint8; None without a render mode."""
+        """Return a picture (height, width, 3), uint8; None without a render mode."""
         return None if self.render_mode is None else self.world.render()
 
     def close(self) -> None:
-        """Frees the world."""
+        """Free the world."""
         self.world.close()

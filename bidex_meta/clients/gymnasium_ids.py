@@ -1,4 +1,4 @@
-"""Gymnasium ids of every shipped suite (vector entry points alone) and every task class (both)."""
+"""Gymnasium ids of every shipped suite (only vector entry points) and every task class (single and vector)."""
 
 import secrets
 from typing import Any
@@ -14,7 +14,7 @@ NAMESPACE = "bidex-meta"
 
 
 def suite_ids(suite: Suite) -> dict[str, str]:
-    """The Gymnasium ids of a suite and the split each stands for, e.g. `{"bidex-meta/MT4-v1": "train"}`."""
+    """Map the Gymnasium ids of a suite to the splits that they stand for, e.g. `{"bidex-meta/MT4-v1": "train"}`."""
     name, version = suite.name.removesuffix("-v2"), f"v{suite.version}"
     if suite.kind == "multi-task":
         return {f"{NAMESPACE}/{name}-{version}": "train"}
@@ -22,12 +22,12 @@ def suite_ids(suite: Suite) -> dict[str, str]:
 
 
 def task_id(task_name: str) -> str:
-    """The Gymnasium id of a task class: `"bidex-meta/CatchUnderarm-v1"`, or `-v2` of `CatchUnderarm-v2`."""
+    """Return the Gymnasium id of a task class: `"bidex-meta/CatchUnderarm-v1"`, or `-v2` for `CatchUnderarm-v2`."""
     return f"{NAMESPACE}/{task_name}" + ("" if task_name != plain_name(task_name) else "-v1")
 
 
 def register_ids() -> None:
-    """Registers all ids; ids that are registered already stay as they are."""
+    """Register all ids; ids that are registered already stay as they are."""
     specs: dict[str, dict[str, Any]] = {
         env_id: {"vector_entry_point": f"{__name__}:make_suite_world", "kwargs": {"suite": name, "split": split}}
         for name in suite_names()
@@ -50,14 +50,14 @@ def make_suite_world(
     suite: str, split: str, num_envs: int = 1, seed: int | None = None, benchmark_seed: int | None = None,
     render_mode: str | None = None, stagger: bool = False, **options: Any
 ) -> VectorEnv:  # fmt: skip
-    """The world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, environments over all classes.
+    """Make the world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, with environments of all classes.
 
-    `seed` chooses tasks, starts and task draws; `benchmark_seed` chooses the tasks instead, and the rest too if there
-    is no `seed`. Without both, the tasks are those of seed 0, and starts and draws differ each time. Both render modes,
-    None and `"rgb_array"`, are the same: a world draws on request. The rest as in `Benchmark.make_world`, except that
-    `stagger` is off: wrappers would count shortened episodes. `vector_strategy`, `meta_batch_size`,
-    `total_tasks_per_cls` or `env_name` give Meta-World's single environments of NumPy arrays side by side, whatever
-    `num_envs` says.
+    `seed` chooses tasks, starts and task draws. `benchmark_seed` chooses the tasks instead, and without `seed` also
+    starts and task draws. Without both seeds, the tasks are those of seed 0, and starts and draws differ each time. The
+    render modes, None and `"rgb_array"`, are equivalent, because a world draws on request. Other arguments are as in
+    `Benchmark.make_world`, except that `stagger` is off: wrappers would count shortened episodes. With
+    `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is Meta-World's vector of
+    single environments with NumPy arrays, and `num_envs` is ignored.
     """
     check_render_mode(render_mode)
     task_seed, start_seed = both_seeds(seed, benchmark_seed)
@@ -77,7 +77,7 @@ def make_class_world(
 ) -> VectorEnv:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)`.
 
-    Seeds, render modes and `stagger` are those of `make_suite_world`, other options those of `make_task_world`.
+    Seeds, render modes and `stagger` are as in `make_suite_world`, other options as in `make_task_world`.
     """
     from bidex_meta.benchmark import make_task_world
 
@@ -89,9 +89,9 @@ def make_class_world(
 
 
 def both_seeds(seed: int | None, benchmark_seed: int | None = None) -> tuple[int, int]:
-    """Return the seeds of tasks and of starts for what Gymnasium makes, from the seeds that were given.
+    """Return the seeds of tasks and of starts for a Gymnasium environment, from the seeds that were given.
 
-    Gymnasium draws starts from a random seed where none is given. The tasks are part of the benchmark: they stay.
+    Without a seed, Gymnasium draws starts from a random seed. The tasks are part of the benchmark and stay the same.
     """
     given = seed if benchmark_seed is None else benchmark_seed
     if given is None:
@@ -100,6 +100,6 @@ def both_seeds(seed: int | None, benchmark_seed: int | None = None) -> tuple[int
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Raises BidexError for a render mode other than None and `"rgb_array"`."""
+    """Raise BidexError for a render mode other than None and `"rgb_array"`."""
     if not isinstance(render_mode, str | None) or render_mode not in (None, "rgb_array"):
         raise BidexError(f"render_mode: expected None or 'rgb_array', got {shortened(render_mode)}.")

@@ -1,4 +1,4 @@
-"""What adapters share: the check for the package that they adapt to, and for a world that trains."""
+"""Checks that adapters share: the adapted package is installed, and the world has the right autoreset mode."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from bidex_meta.world.episodes import set_stagger
 
 @contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Around imports of an optional extra of pyproject's: raises BidexError where a package is not installed."""
+    """Raise BidexError if an import in the block fails because the optional extra ``name`` is not installed."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -22,7 +22,7 @@ def extra(name: str) -> Iterator[None]:
 
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
-    """Set whether a world staggers; raise BidexError for one in another autoreset mode than the library needs."""
+    """Set whether a world staggers episodes; raise BidexError if its autoreset mode is not the one that is needed."""
     check_argument("world", world, VectorWorld)
     given = world.metadata["autoreset_mode"]
     if given != mode:

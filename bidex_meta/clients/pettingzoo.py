@@ -23,8 +23,8 @@ class HandsEnv(ParallelEnv):
     """A single environment of a task class with several agents, which share reward, ends and `info`.
 
     `agents` is the partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or units by agent
-    (docs/learners/multiagent.md); the rest as of `TaskEnv`. Raises BidexError for an unknown task class or render mode,
-    or a bad partition.
+    (docs/learners/multiagent.md). Other arguments are as in `TaskEnv`. Raises BidexError for an unknown task class or
+    render mode, or a bad partition.
     """
 
     metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
@@ -49,26 +49,29 @@ class HandsEnv(ParallelEnv):
         self._state = np.zeros(whole.shape, np.float32)
 
     def observation_space(self, agent: str) -> Space:
-        """Returns the same object each time."""
+        """Return an agent's observation space, the same object each time."""
         return self.observation_spaces[known_name("agent", agent, self.possible_agents)]
 
     def action_space(self, agent: str) -> Space:
-        """Returns the same object each time."""
+        """Return an agent's action space, the same object each time."""
         return self.action_spaces[known_name("agent", agent, self.possible_agents)]
 
     @checked_arguments
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
-        """Starts an episode, the same for the same seed: observations by agent, and empty infos. Options do nothing."""
+        """Start an episode, the same for the same seed; return observations by agent, and empty infos.
+
+        Options have no effect.
+        """
         self._state, _ = self._env.reset(seed=seed)
         self.agents = list(self.possible_agents)
         return self._observations(), {name: {} for name in self.agents}
 
     @checked_arguments
     def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        """Advances 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
+        """Advance 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
 
-        Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; empty once the
-        episode is over. Raises BidexError where an agent's action is missing or of another shape.
+        Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; all are empty
+        once the episode is over. BidexError is raised if an agent's action is missing or has another shape.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
@@ -89,19 +92,19 @@ class HandsEnv(ParallelEnv):
         return obs, rewards, ends, cuts, {name: dict(info) for name in every}
 
     def state(self) -> np.ndarray:
-        """The full observation, for critics of all agents."""
+        """Return the full observation, for critics of all agents."""
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:
-        """A picture (height, width, 3), uint8; None without a render mode."""
+        """Return a picture (height, width, 3), uint8; None without a render mode."""
         return self._env.render()
 
     def close(self) -> None:
-        """Frees the world."""
+        """Free the world."""
         self._env.close()
 
     def _observations(self) -> dict[str, np.ndarray]:
         return {name: self._state[self._columns[name]] for name in self.agents}
 
 
-parallel_env = HandsEnv  # under the name of PettingZoo's packages
+parallel_env = HandsEnv  # the name that PettingZoo's packages use

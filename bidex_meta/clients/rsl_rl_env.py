@@ -20,11 +20,11 @@ with extra("rsl-rl"):
 class RslRlVecEnv(VecEnv):
     """All environments of one world on its device; observations in the groups `policy` and `critic`.
 
-    `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where none ended).
-    `policy` names the world's `observation_groups` for the policy, none: all; the critic gets everything. `cfg` is a
-    dict that rsl-rl's loggers store. `stagger`: shortened first episodes (docs/clients.md), which "Mean reward" counts
-    and `log` does not. Raises BidexError for another mode than SAME_STEP, an unknown group, or `episode_length_buf` set
-    to no whole numbers from 0 on.
+    `extras` has `time_outs` (episodes cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty if no
+    episode ended). `policy` names the world's `observation_groups` for the policy (none: all); the critic gets all
+    groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md); "Mean
+    reward" counts shortened episodes, `log` does not. Raises BidexError for a mode other than SAME_STEP, an unknown
+    group, or an `episode_length_buf` that holds other values than whole numbers from 0 on.
     """
 
     @checked_arguments
@@ -62,20 +62,20 @@ class RslRlVecEnv(VecEnv):
         episodes.elapsed = steps.minimum(self.world.max_episode_steps - 1)
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, Info]:
-        """Starts episodes of all environments."""
+        """Start episodes of all environments."""
         with torch.inference_mode(False):
             self._obs, self._log = self.world.reset(seed=seed)[0], EpisodeLog(self.world)
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:
-        """The present observations, `policy` (num_envs, p) and `critic` (num_envs, d)."""
+        """Return the present observations, `policy` (num_envs, p) and `critic` (num_envs, d)."""
         if self._obs is None:
             return self.reset()[0]
         policy = self._obs if self._policy is None else self._obs[:, self._policy]
         return TensorDict({"policy": policy, "critic": self._obs}, [self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, Info]:
-        """Takes actions (num_envs, a): observations, rewards and dones (num_envs,), extras."""
+        """Take actions (num_envs, a); return observations, rewards and dones (num_envs,), and extras."""
         with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
             self._obs, reward, terminated, truncated, info = self.world.step(actions)
             extras = {"time_outs": truncated, "log": self._log.update(info, terminated, truncated)}
@@ -83,18 +83,18 @@ class RslRlVecEnv(VecEnv):
 
 
 class EpisodeLog:
-    """Ended episodes of a world under the tags that Isaac Lab, mjlab and rsl-rl know, from a full reset on."""
+    """Log of a world's ended episodes, from a full reset on, under the tags of Isaac Lab, mjlab and rsl-rl."""
 
     def __init__(self, world: VectorWorld) -> None:
         self._world = world
         self._terms: dict[str, Tensor] = {}
 
     def update(self, info: Info, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
-        """Values of the environments that ended in a step, (k,), float32, to be averaged; empty where none did.
+        """Return the values of the k episodes that ended in a step, (k,), float32, to be averaged; empty if none ended.
 
-        Of episodes that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and,
-        as sums over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`,
-        `unstable`.
+        Full episodes yield `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as
+        sums over an episode, `Episode_Reward/<term>`. All episodes, also shortened ones, yield
+        `Episode_Termination/terminated`, `time_out` and `unstable`.
         """
         ended, episode_mask, world = info["_final_obs"], info["episode_mask"], self._world
         for name, term in info.get("reward_terms", {}).items():

@@ -19,12 +19,12 @@ with extra("sb3"):
 
 
 class SB3VecEnv(vec_env.VecEnv):
-    """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
+    """All environments of one world, NumPy arrays in and out; one SB3 seed starts all environments.
 
-    `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
-    observation) and, unless it was a shortened first episode, `episode` (r, l, t), `is_success` (by the suite's rule)
-    and `task`. `stagger`: shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does.
-    Raises BidexError for a world in another autoreset mode than SAME_STEP.
+    At an episode's end `infos` has `terminal_observation` and `TimeLimit.truncated` (if true, SB3 bootstraps from that
+    observation's value). Unless it was a shortened first episode, `infos` also has `episode` (r, l, t), `is_success`
+    (by the suite's rule) and `task`. `stagger` shortens first episodes (docs/clients.md); SB3 does not count shortened
+    episodes, but `VecMonitor` does. Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     @checked_arguments
@@ -36,18 +36,18 @@ class SB3VecEnv(vec_env.VecEnv):
         self.metadata = world.metadata
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes; observations (num_envs, d)."""
+        """Start all episodes; return observations (num_envs, d)."""
         obs, _ = self.world.reset(seed=self._seeds[0], options=self._options[0])
         self._reset_seeds()
         self._reset_options()
         return obs.cpu().numpy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Stores the actions (num_envs, a)."""
+        """Store the actions (num_envs, a)."""
         self._actions = checked.action(actions, self.world.action_space.shape, self.world.device)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:
-        """Takes them: observations (num_envs, d), rewards and dones (num_envs,), infos."""
+        """Take the stored actions; return observations (num_envs, d), rewards and dones (num_envs,), and infos."""
         obs, reward, _, truncated, info = self.world.step(self._actions)
         infos: list[Info] = [{} for _ in range(self.num_envs)]
         ended = info["_final_obs"]
@@ -67,21 +67,21 @@ class SB3VecEnv(vec_env.VecEnv):
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
 
     def get_attr(self, attr_name: str, indices: _Rows = None) -> list[object]:
-        """The world's attribute for each environment."""
+        """Return the world's attribute for each environment."""
         return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: _Rows = None) -> None:
-        """Sets an attribute of the world."""
+        """Set an attribute of the world."""
         setattr(self.world, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: object, indices: _Rows = None, **method_kwargs: object
     ) -> list[object]:
-        """Calls a method of the world once; its result for each environment."""
+        """Call a method of the world once; return its result for each environment."""
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
-        """True for `Monitor` alone: like it, `infos` reports whole episodes, and SB3 counts those in evaluations."""
+        """Return True only for `Monitor`, because `infos` reports whole episodes, which SB3 counts in evaluations."""
         return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> list[np.ndarray]:
@@ -94,12 +94,12 @@ class SB3VecEnv(vec_env.VecEnv):
         return [self.world.render(env_id=row, width=width, height=width * 3 // 4) for row in range(self.num_envs)]
 
     def close(self) -> None:
-        """Frees the world."""
+        """Free the world."""
         self.world.close()
 
 
 class SuccessPerTask(callbacks.BaseCallback):
-    """Logs `rollout/success/<task>`, the share of solved among each task's last 100 episodes."""
+    """Logs `rollout/success/<task>`, the share of successes among each task's last 100 episodes."""
 
     def _on_training_start(self) -> None:
         self._solved: dict[str, deque[bool]] = defaultdict(lambda: deque(maxlen=100))

@@ -20,13 +20,13 @@ with extra("skrl"):
 class SkrlEnv(Wrapper):
     """All environments of one world on its device, without NumPy in between (as `wrap_env` takes it).
 
-    skrl stores what `step` returns as the next observation, bootstraps from it at time limits, and acts on it. It looks
-    for no `final_obs`, so the world must be in mode NEXT_STEP: an ended environment returns its last observation, and
-    its next step starts the next episode, with reward 0, whatever the action.
+    skrl stores the observation that `step` returns as the next observation, bootstraps from it at time limits, and acts
+    on it. skrl does not read `final_obs`, so the world must be in mode NEXT_STEP: an ended environment returns its last
+    observation, and its next step starts the next episode, with reward 0, whatever the action.
 
-    `infos`: the world's; where episodes that count ended, `episode` has their means as skrl's trainers log them. `seed`
-    is of the first reset, None: the world's. `stagger`: shortened first episodes (docs/clients.md), which skrl's "Total
-    reward" counts. Raises BidexError for a world in another autoreset mode.
+    `infos` are the world's; if full episodes ended, `episode` has their means as skrl's trainers log them. `seed` is
+    the seed of the first reset (None: the world's). `stagger` shortens first episodes (docs/clients.md), which skrl's
+    "Total reward" counts. Raises BidexError for a world in another autoreset mode.
     """
 
     @checked_arguments
@@ -39,16 +39,16 @@ class SkrlEnv(Wrapper):
 
     @property
     def observation_space(self) -> Box:
-        """Of one environment."""
+        """Observation space of one environment."""
         return self.world.single_observation_space
 
     @property
     def action_space(self) -> Box:
-        """Of one environment."""
+        """Action space of one environment."""
         return self.world.single_action_space
 
     def reset(self) -> tuple[Tensor, Info]:
-        """Start all environments once, later only ended ones; return the present observations (num_envs, d)."""
+        """Start all environments in the first call, later only ended ones; return the observations (num_envs, d)."""
         if self._obs is None:
             self._obs, _ = self.world.reset(seed=self._seed)
         elif self._ended is not None and bool(self._ended.any()):  # skrl resets a single environment itself
@@ -57,7 +57,10 @@ class SkrlEnv(Wrapper):
         return self._obs, {}
 
     def step(self, actions: Tensor) -> Step:
-        """Takes actions (num_envs, a): observations (num_envs, d); reward and both ends (num_envs, 1); infos."""
+        """Take actions (num_envs, a).
+
+        Returns observations (num_envs, d); reward, terminated and truncated (num_envs, 1); and infos.
+        """
         with torch.no_grad():
             self._obs, *results, info = self.world.step(actions)
         infos = {name: value for name, value in info.items() if name not in ("episode", "_episode")}
@@ -70,13 +73,13 @@ class SkrlEnv(Wrapper):
         return self._obs, reward, terminated, truncated, infos
 
     def state(self) -> None:
-        """None: the policy sees what there is."""
+        """Return None: there is no state beyond the policy's observation."""
 
     def render(self, *args: object, **kwargs: object) -> np.ndarray:
-        """A picture of one environment, (height, width, 3), uint8."""
+        """Return a picture of one environment, (height, width, 3), uint8."""
         world: Any = self.world
         return world.render(*args, **kwargs)
 
     def close(self) -> None:
-        """Frees the world."""
+        """Free the world."""
         self.world.close()

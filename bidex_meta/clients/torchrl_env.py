@@ -17,10 +17,11 @@ _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 class TorchRLEnv(envs.EnvBase):
     """All environments of one world, batch size (num_envs,), each entry (num_envs, ...).
 
-    `next` holds the observation that the step led to, also where an episode ended; the reset that TorchRL asks for then
-    returns the new episode's, which the world has begun by itself. Beside `observation` there are `success` (of this
-    state) and `episode` (r, l, success so far). `stagger`: shortened first episodes (docs/clients.md), which TorchRL's
-    transforms count. Raises BidexError for a world in another autoreset mode than SAME_STEP.
+    `next` holds the observation that the step led to, also if an episode ended. TorchRL then asks for a reset, which
+    returns the first observation of the new episode; the world has already begun this episode. In addition to
+    `observation` there are `success` (of this state) and `episode` (r, l, success so far). `stagger` shortens first
+    episodes (docs/clients.md), which TorchRL's transforms count. Raises BidexError for a world in another autoreset
+    mode than SAME_STEP.
     """
 
     @checked_arguments
@@ -51,7 +52,7 @@ class TorchRLEnv(envs.EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         asked = tensordict.get("_reset", None) if tensordict is not None else None
         mask = torch.ones_like(self._begun) if asked is None else asked.squeeze(-1)
-        left = mask & ~self._begun  # what did not end in the last step
+        left = mask & ~self._begun  # environments whose episode did not end in the last step
         if asked is None or bool(left.any()):
             options = None if bool(left.all()) or asked is None else {"reset_mask": left}
             self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)

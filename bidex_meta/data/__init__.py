@@ -1,4 +1,4 @@
-"""Data sets of whole episodes: recorded from worlds, stored as HDF5 in Minari's layout, read and checked."""
+"""Record, store, read and check data sets of whole episodes (HDF5 in Minari's layout)."""
 
 from bidex_meta.data.dataset import Dataset, open_dataset
 from bidex_meta.data.part_files import Episode

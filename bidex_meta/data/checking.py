@@ -1,8 +1,9 @@
 """Checks and summaries of a data set.
 
-The check computes rewards again by the class's own formula, from the sensors that the observation shows and the
-variation that the episode stores: so it finds shifted environments, wrong tasks or starts. A formula that reads more
-(the hand's point of most classes with tables, objects' states where point clouds take their place) is reported.
+The check recomputes rewards by the class's own formula, from the sensors that the observation shows and the variation
+that the episode stores. This reveals shifted environments, wrong tasks and wrong starts. The check reports a formula
+that reads more than the observation shows (the hand's point of most classes with tables; objects' states if point
+clouds replace the states).
 """
 
 import math
@@ -27,8 +28,8 @@ from bidex_meta.utils.plugins import name_without_object
 from bidex_meta.world.depth_sensor import POINT_ENTRIES, privileged_columns
 
 _TOLERANCE = 1e-5
-"""Of a reward, beside the same share of its size: observations and, on a GPU, the formula are float32. Measured on the
-CPU: 2e-8."""
+"""Absolute and relative tolerance of a recomputed reward, because observations and, on a GPU, the formula are float32.
+The measured error on the CPU is 2e-8."""
 _EXAMPLES = 5
 _Shown = dict[str, tuple[slice, float]]
 
@@ -53,7 +54,7 @@ class _NotShown(Exception):
 
 
 class _ShownState(TaskState):
-    """The state as far as observations (n, d), float64, show it: ``shown`` are their entries."""
+    """The part of the state that observations (n, d), float64, show; ``shown`` maps sensors to observation entries."""
 
     def __init__(self, shown: _Shown, observations: Tensor, frozen: dict[str, Tensor]) -> None:
         super().__init__(observations, {}, frozen)
@@ -68,12 +69,12 @@ class _ShownState(TaskState):
         return values / scale
 
     def quaternion(self, name: str) -> Tensor:
-        # Observations show (x, y, z, w) already.
+        # Observations already show quaternions as (x, y, z, w).
         return self[name]
 
 
 def verify(dataset: Dataset, most: int | None = None) -> Findings:
-    """Checks all digests, and ``most`` episodes (None: all), evenly spread; BidexError for damaged files."""
+    """Check all digests, and ``most`` evenly spread episodes (None: all); raise BidexError if a file is damaged."""
     findings, formulas = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
     table = dataset.table
     for number, episode in _spread_episodes(dataset, most):
@@ -88,13 +89,13 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
 
 
 def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, Episode]]:
-    """At most so many episodes with their numbers, evenly spread; None: all."""
+    """Yield at most ``most`` evenly spread episodes (None: all), each with its number."""
     every = 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
     yield from ((number, episode) for number, episode in enumerate(dataset.episodes()) if number % every == 0)
 
 
 def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -> Iterator[str]:
-    """What is wrong with an episode by itself."""
+    """Yield the faults that an episode shows without its reward formula."""
     steps = len(episode)
     if steps == 0:
         yield "no transition"
@@ -118,19 +119,19 @@ def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -
 
 
 class _Formulas:
-    """The formulas of a data set's classes."""
+    """The reward formulas of a data set's classes."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset, about = dataset, dataset.metadata
         self._scales = about.get("reward_scales", {})
         self._rules = Rules(**about.get("rules", {}))
-        # A suite's file, which says whether bases move, may have gone: the number of actions shows it.
+        # The suite's file says whether bases move. If that file is gone, the number of actions shows whether they do.
         self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
         self._known: dict[str, tuple[TaskClass, _Shown] | None] = {}
 
     def check(self, episode: Episode, findings: Findings) -> Iterator[str]:
-        """What is wrong with an episode's rewards; adds to ``findings`` what was computed."""
+        """Yield the faults of an episode's rewards, and add the recomputed transitions to ``findings``."""
         name = episode.task_name.partition("/")[0]
         known = self._of(name, findings)
         scale = self._scales.get(episode.task_name)
@@ -167,7 +168,7 @@ class _Formulas:
         return self._known[name]
 
     def _class(self, name: str) -> TaskClass:
-        """A class with the bases of the data."""
+        """Return the class whose bases, fixed or moving, match the data's number of actions."""
         classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
         for task in classes:
             if task.action_size == actions:
@@ -181,10 +182,13 @@ class _Formulas:
 
 
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
-    """Where an observation shows each sensor whole and unmapped, and its factor; ``hidden`` entries show nothing."""
+    """Map each sensor that an observation shows whole and unmapped to its slice and factor, without ``hidden`` entries.
+
+    Joint positions are left out: the observation maps each one from its joint's range.
+    """
     shown: _Shown = {}
     for block, where in task.layout:
-        if block.sensors and not block.name.endswith("joint_position"):  # those are mapped from the joint's range
+        if block.sensors and not block.name.endswith("joint_position"):
             start = where.start
             for sensor in block.sensors:
                 size = _size(block, sensor)
@@ -216,7 +220,7 @@ class ClassSummary:
 
 
 def summary(dataset: Dataset) -> list[ClassSummary]:
-    """A summary of each slot that has episodes, from the tables alone."""
+    """Summarise each slot that has episodes; read only the tables."""
     table, summaries = dataset.table, []
     for number, name in enumerate(dataset.metadata["tasks"]):
         own = table["task"] == number
@@ -243,11 +247,11 @@ def summary(dataset: Dataset) -> list[ClassSummary]:
 
 
 def coverage(dataset: Dataset, most: int = 2000) -> Json:
-    """How widely states and actions are spread, over at most so many episodes.
+    """Measure how widely states and actions are spread over at most ``most`` episodes.
 
-    ``observation_std`` by group of the observation: mean over its entries of the standard deviation over all states;
-    ``constant``: share of its entries that never change; ``action_std``: mean over actions; ``action_at_bounds``: share
-    of actions at -1 or 1.
+    Two results are per group of the observation: ``observation_std`` is the standard deviation over all states,
+    averaged over the group's entries; ``constant`` is the share of the group's entries that never change.
+    ``action_std`` is the standard deviation averaged over actions; ``action_at_bounds`` is the share at ±1.
     """
     d, a = dataset.observation_size, dataset.action_size
     count, taken = 0, 0

@@ -1,8 +1,8 @@
-"""Plays policies and collects their episodes in rounds, each of which is one part of a data set and can be replayed.
+"""Play policies and collect their episodes in rounds; each round is one part of a data set and can be replayed.
 
-In a round every environment plays the same number of whole episodes: one that stopped after so many steps would lack
-the long ones. All draws of a round follow from the collection's seed and its number, so that a collection that was
-killed goes on with the first missing part, and ends with the same data.
+In a round every environment plays the same number of whole episodes: a round that stopped after a number of steps would
+lack the long episodes. All draws of a round follow from the collection's seed and the round's number. A collection that
+was killed therefore resumes at the first missing part, and ends with the same data.
 """
 
 import math
@@ -25,8 +25,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.world.contract import PooledWorld
 
-PART_BYTES = 64_000_000  # bytes of a part, about: what is played again after a kill at the worst moment
-FAILED = "unsuccessful_episodes"  # what is left out of demonstrations
+PART_BYTES = 64_000_000  # approximate bytes of a part; at most one part is played again after a kill
+FAILED = "unsuccessful_episodes"  # the episodes that demonstrations leave out
 _SLACK = 1.05  # the last round is planned for a little more than is missing, since episodes differ in length
 
 
@@ -35,7 +35,7 @@ class SamplingAgent(Agent, Protocol):
     """An agent whose policy has a distribution."""
 
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
-        """Actions (N, a) drawn from the policy's distribution."""
+        """Draw actions (N, a) from the policy's distribution."""
         ...
 
 
@@ -49,13 +49,13 @@ class Actor:
     noise: float = 0.0  # standard deviation of Gaussian noise on the actions
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
-        """A function from observations (N, d) to actions (N, a) that draws by the seed alone."""
+        """Return a function from observations (N, d) to actions (N, a) whose draws depend only on the seed."""
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
         drawing = policy if self.sampled and isinstance(policy, SamplingAgent) else None
-        # A generator for each kind of draw: the policy's lives where its network does. With one seed the noise would be
-        # the policy's own normals once more.
+        # Each kind of draw has its own generator; the policy's generator is on the network's device. With the same seed
+        # the noise would repeat the policy's own normal draws.
         inner = torch.Generator(world.device).manual_seed(seed)
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
@@ -70,7 +70,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is, by policy; computed from its parts alone."""
+    """Progress of a collection by policy, computed only from the collection's parts."""
 
     rounds: int  # parts that are there
     steps: list[int]  # transitions of each policy
@@ -80,7 +80,7 @@ class Progress:
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
-    """The progress of a collection; raises BidexError where a part is damaged."""
+    """Return the progress of a collection; raise BidexError if a part is damaged."""
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
     owner, steps, returns, success = (
@@ -93,7 +93,7 @@ def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
 
 
 def resumed_writer(folder: Path) -> DatasetWriter:
-    """The writer of a new collection, or of one that has begun; parts after a missing one are deleted."""
+    """Return the writer of a new or interrupted collection; delete the parts after a missing part."""
     names = [path.name for path in part_files.parts_of(folder / "data", 0)]
     keep = next((n for n, name in enumerate(names) if not name.endswith(f"-{n:05d}.hdf5")), len(names))
     return DatasetWriter(folder, keep=keep)
@@ -107,18 +107,18 @@ def collect(
     seed: int,
     report: Callable[[Progress, float], None],
 ) -> None:
-    """Plays rounds until each actor has its share of ``size`` transitions; goes on where the writer's parts end.
+    """Play rounds until each actor has its share of ``size`` transitions, and resume after the writer's last part.
 
-    ``world`` is in autoreset mode DISABLED; actors act in rounds of their own; the writer's parts count as rounds; the
-    last episodes may make it a little more than ``size``; all that is drawn follows from ``seed``. ``report`` receives
-    the progress after each round, and the seconds since the call. Raises BidexError where a part is damaged, or no
-    transition can be recorded.
+    ``world`` must be in autoreset mode DISABLED. One actor acts in each round, and each of the writer's parts counts as
+    a round. The last episodes may exceed ``size`` slightly. All draws follow from ``seed``. After each round ``report``
+    receives the progress and the seconds since the call. BidexError is raised if a part is damaged, or if no transition
+    can be recorded.
     """
     began, share = time.monotonic(), math.ceil(size / len(actors))
     now = progress(writer, len(actors))
     collector = EpisodeCollector(world, writer.add)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     while min(now.steps) < share:
-        # The one that has least, so that both have their share should the collection be ended early.
+        # The actor with the fewest steps acts next, so that shares are about equal if the collection is ended early.
         which = int(np.argmin(now.steps))
         rows, repeats = _plan(world, share - now.steps[which], now, which)
         number = np.random.SeedSequence((seed, writer.parts)).generate_state(1, np.uint64)[0]
@@ -135,7 +135,7 @@ def collect(
 
 
 def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[np.ndarray, int]:
-    """Environments that play in the next round, bool (N,), and how many episodes each."""
+    """Return the environments of the next round, bool (N,), and the number of episodes that each plays."""
     known = now.episodes[which] > 0
     mean = now.steps[which] / now.episodes[which] if known else float(world.max_episode_steps.float().mean())
     step_bytes = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 1) + 2
@@ -152,7 +152,7 @@ def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[
 
 @torch.no_grad()
 def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int, seed: int) -> None:
-    """Each environment of a mask plays ``repeats`` episodes."""
+    """Play ``repeats`` episodes in each environment of the mask ``rows``."""
     obs, _ = collector.reset(seed=seed)
     act = actor.acting(collector, seed)
     left = torch.where(rows, repeats, 0).to(collector.device)
@@ -172,10 +172,10 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
 
 @torch.no_grad()
 def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writer: DatasetWriter, seed: int) -> None:
-    """Plays one round, an episode in every environment, and stores those that succeed as a part.
+    """Play one round, an episode in every environment, and store the successful episodes as a part.
 
-    ``world`` is in autoreset mode DISABLED; ``agent_of`` makes the agent of a round from a seed, once the world has
-    been reset; the round's draws follow from the collection's seed and the writer's number of parts.
+    ``world`` must be in autoreset mode DISABLED. ``agent_of`` makes the agent of a round from a seed, after the world
+    has been reset. The round's draws follow from the collection's seed and the writer's number of parts.
     """
 
     def sink(episode: Episode) -> None:
@@ -196,7 +196,7 @@ def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writ
 
 
 def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
-    """Most bytes of the running episodes of some environments (None: all) while they are collected."""
+    """Return the most bytes that the running episodes of the environments ``rows`` (None: all) take in memory."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
     limits = world.max_episode_steps if rows is None else world.max_episode_steps[list(rows)]
     return int(limits.sum()) * step

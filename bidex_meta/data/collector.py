@@ -1,4 +1,4 @@
-"""Wrappers around a world that hand on whole episodes of chosen environments exactly as they were played."""
+"""Wrappers around a world that collect whole episodes of chosen environments exactly as they were played."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -19,19 +19,20 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 _FIRST_ROOM = 64  # steps of an episode in a world without time limit; doubled when one is longer
 BROKEN, SHORTENED, CUT = "broken_transitions", "shortened_episodes", "cut_episodes"
-"""What is left out: transitions in which physics broke; episodes that began after their first step, as those of a
-training world may; episodes that a reset cut."""
+"""Reasons for leaving data out: physics broke in a transition; an episode began after its first step, as can happen in
+a training world; a reset cut an episode."""
 _KEY = "recorder"  # entry of a checkpoint's world state
 
 
 class EpisodeCollector(PooledWorldWrapper):
-    """Collects whole episodes; it changes nothing of what the world does.
+    """Collects whole episodes without changing what the world does.
 
-    A transition in which physics broke is left out, and its episode ends as truncated before it. Only ``rows``, the
-    environments to collect from (None: all), are in memory: a step of one takes 4 (d + a + 2) bytes. ``sink`` receives
-    each episode when it has ended, those of one step by ascending environment. ``left_out`` counts what was not
-    collected, by reason; ``policy`` is the number of the one that acts; ``active``, bool (rows,), which environments
-    collect the episodes that begin: all at first.
+    A transition in which physics broke is left out, and its episode ends as truncated before that transition. Only the
+    episodes of ``rows``, the environments to collect from (None: all), are in memory: a step of one environment takes
+    4 (d + a + 2) bytes. ``sink`` receives each episode when the episode has ended; episodes that end in the same step
+    arrive by ascending environment. ``left_out`` counts uncollected transitions and episodes by reason; ``policy`` is
+    the number of the acting policy; ``active``, bool (rows,), marks the environments whose new episodes are collected:
+    all at first.
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
@@ -52,10 +53,10 @@ class EpisodeCollector(PooledWorldWrapper):
         self._forget()
 
     def _forget(self) -> None:
-        """Drops all running episodes."""
+        """Drop all running episodes."""
         num, room = len(self.rows), _FIRST_ROOM
         if isinstance(self.world, TaskWorld) and num:
-            # Pages of memory that no episode reaches are never taken.
+            # The system allocates no memory for pages that no episode reaches.
             room = int(self.world.max_episode_steps[self._where].max())
         d, a = (int(s.shape[0]) for s in (self.world.single_observation_space, self.world.single_action_space))
         self._observations = np.zeros((num, room + 1, d), np.float32)
@@ -65,18 +66,18 @@ class EpisodeCollector(PooledWorldWrapper):
         self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes; those that run in these environments are left out."""
+        """Start episodes; leave out the running episodes of the environments that are reset."""
         obs, info = self.world.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         begun = np.ones(len(self.rows), bool) if mask is None else self._own(torch.as_tensor(mask))
         if begun.all() or not self._pools:
-            self._read_pools()  # other tasks hold from a reset of all environments on
+            self._read_pools()  # a reset of all environments may bring other tasks
         self.left_out[CUT] += int((begun & self._running & (self._length > 0)).sum())
         self._begin(begun, self._own(obs))
         return obs, info
 
     def step(self, action: Tensor, /) -> Step:
-        """Takes actions (N, a); see ``VectorWorld``."""
+        """Take actions (N, a); see ``VectorWorld``."""
         taken = self._own(clean(torch.as_tensor(action, dtype=torch.float32))[0])
         result = obs, reward, terminated, _, info = self.world.step(action)
         if not self._running.any():
@@ -106,7 +107,7 @@ class EpisodeCollector(PooledWorldWrapper):
         return of_all.to(self._where.device)[self._where].detach().cpu().numpy()
 
     def _begin_again(self, info: dict[str, Tensor], obs: Tensor) -> None:
-        """Begins the episodes that a world in SAME_STEP mode has started within the step."""
+        """Begin the episodes that a world in SAME_STEP mode has started within the step."""
         if self.world.metadata["autoreset_mode"].name == "SAME_STEP":
             begun = self._own(info["_final_obs"])
             if begun.any():
@@ -122,7 +123,7 @@ class EpisodeCollector(PooledWorldWrapper):
             self._task = np.where(mask, self._own(self.world.task_index), self._task)
 
     def _end(self, row: int, terminated: bool, unstable: bool, episode_mask: bool, success: bool) -> None:
-        """Hands an episode on, unless it was shortened or has no good transition."""
+        """Pass an episode to the sink, unless the episode was shortened or has no good transition."""
         length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
         if not episode_mask:
             self.left_out[SHORTENED] += 1
@@ -158,12 +159,12 @@ class EpisodeCollector(PooledWorldWrapper):
         self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
 
     def load_state_dict(self, state: State) -> None:
-        """Restores the world's state; episodes that run there are not collected, since their beginning is unknown."""
+        """Restore the world's state; do not collect its running episodes, because their beginning is unknown."""
         self.world.load_state_dict(state)
         self._forget()
 
     def collector_state(self) -> dict[str, Tensor]:
-        """The running episodes, for a checkpoint: tensors, copied."""
+        """Return the running episodes as copied tensors, for a checkpoint."""
         most = int(self._length.max(initial=0))
         arrays = {"observations": self._observations[:, : most + 1], "actions": self._actions[:, :most]}
         arrays |= {"rewards": self._rewards[:, :, :most], "running": self._running}
@@ -171,7 +172,7 @@ class EpisodeCollector(PooledWorldWrapper):
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def load_collector_state(self, state: dict[str, Tensor]) -> None:
-        """Goes on, in a restored world, with ``collector_state``; BidexError for other environments or sizes."""
+        """Continue from ``collector_state`` in a restored world; raise BidexError if environments or sizes differ."""
         given = {name: value.numpy() for name, value in state.items()}
         self._forget()
         sizes = [given[name].shape[-1] for name in ("observations", "actions")]
@@ -191,11 +192,11 @@ class EpisodeCollector(PooledWorldWrapper):
 
 
 class RunCollector(EpisodeCollector):
-    """Collects from ``rows`` of the training world of a run; killed and resumed, each episode is stored once.
+    """Collects from ``rows`` of a run's training world; each episode is stored once even if the run is resumed.
 
-    ``state_dict``, which a checkpoint calls, commits what was collected as a part. Its result holds the number of parts
-    and the running episodes. A run that goes on from it deletes later parts and plays them again. ``folder``, the data
-    set's, is set by ``open``, or before ``load_state_dict``, which opens it.
+    Saving a checkpoint calls ``state_dict``, which commits the collected episodes as a part; the result holds the
+    number of parts and the running episodes. A run that resumes from this state deletes later parts and plays them
+    again. ``folder`` is the data set's folder: call ``open``, or set it before ``load_state_dict``, which opens it.
     """
 
     folder: Path
@@ -206,27 +207,27 @@ class RunCollector(EpisodeCollector):
 
     @property
     def writer(self) -> DatasetWriter:
-        """Where episodes go, once the folder is open."""
+        """Return the writer of the open folder."""
         assert self._writer is not None, "open the folder first"
         return self._writer
 
     def open(self, folder: Path, parts: int = 0) -> None:
-        """Sets the folder, before the first reset, and deletes this process's parts from a number on."""
+        """Set the folder, before the first reset, and delete this process's parts from number ``parts`` on."""
         self.folder = folder
         self._writer = DatasetWriter(folder, self.process, keep=parts)
-        if self.process == 0:  # no complete data set any longer
+        if self.process == 0:  # the data set is no longer complete
             write_json(folder / "data" / part_files.RECORDING, {"run": folder.parent.name})
             (folder / "data" / part_files.METADATA).unlink(missing_ok=True)
 
     def state_dict(self) -> State:
-        """The world's state, the number of parts, and the running episodes."""
+        """Return the world's state, the number of parts, and the running episodes."""
         self.writer.left_out.update(self.left_out)
         self.left_out.clear()
         self.writer.commit()
         return {**self.world.state_dict(), _KEY: {"parts": self.writer.parts, **self.collector_state()}}
 
     def load_state_dict(self, state: State) -> None:
-        """Goes on from ``state_dict``; raises BidexError where nothing was collected then."""
+        """Continue from ``state_dict``; raise BidexError if the checkpoint was saved without a recording."""
         if _KEY not in state:
             raise BidexError("This checkpoint was saved without a recording. Start a new run to record one.")
         own = dict(state[_KEY])
@@ -237,14 +238,14 @@ class RunCollector(EpisodeCollector):
         self.load_collector_state(own)
 
     def close(self) -> None:
-        """Drops what no checkpoint knows, and frees the world."""
+        """Drop the episodes that no checkpoint covers, and free the world."""
         if self._writer is not None:
             self._writer.close()
         super().close()
 
 
 def spread_environments(world: VectorWorld, share: float) -> list[int]:
-    """A share, above 0 (1 or more: all), of a world's environments, evenly over its slots, at least one of each."""
+    """Return a share, above 0 (1 or more: all), of a world's environments, evenly over slots, at least one per slot."""
     chosen: list[int] = []
     slots = world.task_id.tolist()
     for slot in range(world.num_tasks):

@@ -1,4 +1,4 @@
-"""A data set as it is read: metadata, episodes, and all transitions as tensors."""
+"""Read a data set: metadata, episodes, and all transitions as tensors."""
 
 import math
 import os
@@ -28,7 +28,7 @@ _Range = tuple[Whole, Whole]
 _MOST_LISTED = 5000
 _OF_EPISODE = ("task", "task_index", "success", "broken", "return_unscaled", "row", "policy")
 _CHECKED_AT_OPENING = 64_000_000
-"""Bytes of parts, about, whose digests are checked at opening (0.03 s); the others follow when episodes are read."""
+"""Approximate bytes of the parts whose digests are checked at opening (0.03 s); reading episodes checks the others."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class _Reference:
 
 @dataclass(frozen=True)
 class _Collected:
-    """What is read again of our entry ``bidex`` in the metadata; others may stand beside it."""
+    """The fields that are read of our metadata entry ``bidex``, which may hold further fields."""
 
     tasks: Annotated[list[Text], Meta(min_length=1)]
     kind: Text
@@ -71,7 +71,7 @@ class _Collected:
 
 @dataclass(frozen=True)
 class _Metadata:
-    """What is read of ``metadata.json``: Minari's entries, and ours."""
+    """The entries that are read of ``metadata.json``: Minari's entries, and ours."""
 
     total_episodes: Whole
     total_steps: Whole
@@ -81,13 +81,13 @@ class _Metadata:
 
 
 def data_folder() -> Path:
-    """Where data sets lie: the folder that BIDEX_DATA names, else ``data`` in the working folder."""
+    """Return the folder of data sets: the folder that BIDEX_DATA names, else ``data`` in the working folder."""
     return expanded(os.environ.get("BIDEX_DATA") or "data")
 
 
 @checked_arguments
 def dataset_names(folder: Path | None = None) -> list[str]:
-    """Names of the complete data sets in a folder (``data_folder()``), such as ``CatchUnderarm/random-v0``."""
+    """List the complete data sets in a folder (``data_folder()``), by names such as ``CatchUnderarm/random-v0``."""
     folder = data_folder() if folder is None else folder
     complete = islice(folder.glob("**/data/" + part_files.METADATA) if folder.is_dir() else (), _MOST_LISTED)
     return sorted(path.parent.parent.relative_to(folder).as_posix() for path in complete)
@@ -95,7 +95,7 @@ def dataset_names(folder: Path | None = None) -> list[str]:
 
 @checked_arguments
 def open_dataset(name_or_path: str | Path) -> "Dataset":
-    """A data set by name in ``data_folder()``, or by folder; BidexError where it is missing, incomplete or damaged."""
+    """Open a data set by name in ``data_folder()`` or by path; raise BidexError if missing, incomplete or damaged."""
     named = expanded(name_or_path)
     for folder in (named, data_folder() / named):
         for inner in (folder / "data", folder):
@@ -113,8 +113,8 @@ def open_dataset(name_or_path: str | Path) -> "Dataset":
 class Dataset:
     """Whole episodes on disk, as ``open_dataset`` returns it; only small tables stay in memory.
 
-    ``folder`` is the folder ``data``, ``content`` all of ``metadata.json``, ``metadata`` our entry of it
-    (``commands.run_data.dataset_metadata``); of a data set from elsewhere only ``tasks`` and ``kind``.
+    ``folder`` is the folder ``data``, ``content`` is all of ``metadata.json``, and ``metadata`` is our entry of it
+    (``commands.run_data.dataset_metadata``). Without our entry ``metadata`` has only ``tasks`` and ``kind``.
     """
 
     def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
@@ -127,7 +127,7 @@ class Dataset:
         self._sealed = {folder / part_files.METADATA: sealed}
 
     def check_digests(self) -> list[str]:
-        """Names of the files without a digest; reads all files, and raises BidexError where one has changed."""
+        """Read all files and return the names of files without a digest; raise BidexError if a file has changed."""
         if "bidex" not in self.content:
             return [part_files.METADATA, part_files.MAIN]
         for path in (*self._paths, self.folder / part_files.MAIN):
@@ -149,7 +149,7 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """By episode, in their order: columns of ``part_files.TABLE``, ``variation``; BidexError for damage."""
+        """Columns of ``part_files.TABLE`` and ``variation``, one row per episode; raises BidexError for damage."""
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes, steps = len(columns["steps"]), int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
@@ -162,17 +162,20 @@ class Dataset:
 
     @property
     def observation_size(self) -> int:
-        """Entries of an observation, d."""
+        """Number of entries of an observation, d."""
         return self._sizes[0]
 
     @property
     def action_size(self) -> int:
-        """Actions, a."""
+        """Number of entries of an action, a."""
         return self._sizes[1]
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Least and largest actions, (a,) each, if from elsewhere (BidexError without finite ones); None: ±1."""
+        """Least and largest actions, (a,) each, of a data set from elsewhere; None for our own data sets, i.e. ±1.
+
+        Raises BidexError if the bounds are not finite.
+        """
         if "bidex" in self.content:
             return None
         return other_formats.action_bounds(self.content, self.name, self.action_size)
@@ -190,7 +193,7 @@ class Dataset:
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:
-        """All episodes, read one by one; BidexError for a damaged file, or observations or actions not flat."""
+        """Read all episodes one by one; raise BidexError for damaged files, or observations or actions not flat."""
         other_formats.check_spaces(self.content, self.name)
         number, sizes = 0, None
         for path, table in zip(self._paths, self._tables, strict=True):
@@ -224,15 +227,15 @@ class Dataset:
         )
 
     def transition_bytes(self) -> int:
-        """Bytes that ``transitions`` takes."""
+        """Return the bytes of memory that ``transitions`` takes."""
         return self.num_steps * (4 * (2 * self.observation_size + self.action_size + 1) + 1 + 8)
 
     def transitions(self) -> "dict[str, Tensor]":
-        """All transitions in memory, in the order of the episodes, each tensor contiguous.
+        """Load all transitions into memory, in the order of the episodes, as contiguous tensors.
 
-        ``observations`` (N, d), ``actions`` (N, a), ``rewards`` (N,), ``next_observations`` (N, d), all float32;
-        ``terminated`` (N,), bool: where a value must not be taken of the next observation; ``task`` (N,), int64. Raises
-        BidexError where they do not fit into the free memory.
+        ``observations`` (N, d), ``actions`` (N, a), ``rewards`` (N,) and ``next_observations`` (N, d) are float32;
+        ``task`` (N,) is int64. ``terminated`` (N,), bool, marks transitions whose next observation must not be
+        bootstrapped from. BidexError is raised if the tensors do not fit into the free memory.
         """
         import torch
 
@@ -270,7 +273,7 @@ class Dataset:
 
 
 def _joined(columns: list[np.ndarray]) -> np.ndarray:
-    """Variations are filled up with NaN to the widest."""
+    """Concatenate columns; pad variations with NaN to the widest one."""
     if not columns:
         return np.zeros(0)
     if columns[0].ndim == 1:

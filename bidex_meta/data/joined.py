@@ -1,4 +1,4 @@
-"""Data sets in memory as one, each observation once, in the form of the world that a policy is learned for."""
+"""Join data sets in memory, each observation stored once, in the form of the world that a policy is trained for."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,23 +31,23 @@ class Joined:
     left: Tensor  # later transitions of the same episode, int64 (N,)
 
     def __len__(self) -> int:
-        """Transitions, N."""
+        """Return the number of transitions, N."""
         return len(self.rewards)
 
     def fingerprint(self) -> dict[str, float]:
-        """Sums by which a checkpoint recognises the data that its run must go on with."""
+        """Return sums by which a checkpoint recognises the data that its run must be resumed with."""
         parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
         sums = {name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()}
         return {"transitions": len(self), **sums}
 
 
 def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
-    """Reads data sets, at least one, for a world, which is neither stepped nor reset.
+    """Read at least one data set for a world, without stepping or resetting the world.
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards its scale; goals that the world hides become zero; actions from elsewhere are mapped to [-1, 1]. With
-    ``every`` each of the world's classes needs data. Raises BidexError for actions, states or clouds of another form,
-    actions from elsewhere without bounds, classes that do not match, or too little memory.
+    rewards get the world's scale. Goals that the world hides become zero, and actions from elsewhere are mapped to
+    [-1, 1]. With ``every`` each of the world's classes needs data. BidexError is raised if actions, states or clouds
+    have another form, actions from elsewhere have no bounds, classes do not match, or memory is too small.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
@@ -67,7 +67,10 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Episodes with slot, and observations (T + 1, d) in the world's form, as one; BidexError for too few steps."""
+    """Join episodes, each with its slot and its observations (T + 1, d) in the world's form.
+
+    Raises BidexError if the episodes have fewer than ``steps`` transitions.
+    """
     states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
     at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
     ends = torch.zeros(steps, dtype=torch.bool)
@@ -95,7 +98,7 @@ class _Columns(NamedTuple):
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
-        """Those of ``size`` entries, by groups' names and index ranges."""
+        """Return the columns of an observation of ``size`` entries, by groups' names and index ranges."""
         every = np.arange(size)
         for name, parts in groups:
             if name in POINT_ENTRIES:
@@ -106,7 +109,7 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """How a data set's episodes become a world's; ``slots`` are the world's; ``plain``: without one-hot."""
+    """Converts a data set's episodes to a world's form; ``slots`` are the world's, ``plain`` excludes the one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset, about = dataset, dataset.metadata
@@ -132,7 +135,7 @@ class _Form:
         ]
 
     def _check_observations(self, may_pad: bool) -> None:
-        """``may_pad``: whether the world's states may be wider."""
+        """Raise BidexError for other clouds or state sizes; with ``may_pad`` the world's states may be wider."""
         name, own, theirs = self.dataset.name, self._own, self._theirs
         if own.label != theirs.label:
             mend = "Learn with the points that it was recorded with (--points, or [points] in the suite's file)"
@@ -143,7 +146,7 @@ class _Form:
             raise BidexError(f"{what}. Learn for what it was recorded of.")
 
     def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
-        """An episode, its slot, and its observations in the world's form."""
+        """Return an episode, its slot, and its observations in the world's form."""
         slot, factor = self.slots[episode.task], self._factors[episode.task]
         own, theirs = self._own, self._theirs
         seen = np.zeros((len(episode) + 1, self._width + ids), np.float32)
@@ -154,7 +157,7 @@ class _Form:
             seen[:, self._width + slot] = 1.0
         if self._bounds is not None:
             low, high = self._bounds
-            # Clipped as the data set's own environment does.
+            # The data set's own environment clips actions in the same way.
             mapped = (episode.actions - (high / 2.0 + low / 2.0)) / (high / 2.0 - low / 2.0)
             episode = replace(episode, actions=mapped.clip(-1.0, 1.0))
         if factor != 1.0:
@@ -163,7 +166,7 @@ class _Form:
 
 
 def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
-    """The world's slot of each name."""
+    """Yield the world's slot of each name."""
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)
         return

@@ -1,4 +1,4 @@
-"""Data sets from elsewhere, such as Minari's: which of their arrays can be read, and the range of their actions."""
+"""Read data sets from elsewhere, such as Minari's: check their arrays, and read the range of their actions."""
 
 import json
 
@@ -8,11 +8,11 @@ from bidex_meta.data.part_files import H5, Json
 from bidex_meta.errors import BidexError, shortened
 
 _SPACES = {"observations": "observation_space", "actions": "action_space"}
-"""Arrays of several numbers a step, and the entries of their spaces."""
+"""Arrays with several numbers per step, and the metadata entries of their spaces."""
 
 
 def check_spaces(content: Json, name: str) -> None:
-    """Raises BidexError where the spaces in ``metadata.json`` say that observations or actions are not flat."""
+    """Raise BidexError if the spaces in ``metadata.json`` say that observations or actions are not flat."""
     for what, entry in _SPACES.items():
         space = _space(content, entry)
         kind, shape = space.get("type", "Box"), space.get("shape", [0])
@@ -21,7 +21,7 @@ def check_spaces(content: Json, name: str) -> None:
 
 
 def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.ndarray:
-    """An episode's array ``what`` (Minari's name); BidexError for another shape or ``length``, or no numbers."""
+    """Read an episode's array ``what`` (Minari's name); raise BidexError for a wrong shape, type or ``length``."""
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
     shape, kind = stored.shape or (), stored.dtype
@@ -33,7 +33,10 @@ def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.n
 
 
 def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest actions, (a,) each, float64, which become ±1; BidexError unless finite and rising."""
+    """Return the least and largest actions, (a,) each, float64, to be mapped to ±1.
+
+    Raises BidexError unless the bounds are finite and rising.
+    """
     space = _space(content, "action_space")
     try:
         low, high = (np.array(space[end], np.float64) for end in ("low", "high"))
@@ -48,7 +51,7 @@ def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.n
 
 
 def _space(content: Json, entry: str) -> Json:
-    """A space as Minari writes it, JSON within JSON; empty without one."""
+    """Read a space as Minari writes it, JSON within JSON; return an empty dict if there is no space."""
     space = content.get(entry)
     try:
         space = json.loads(space) if isinstance(space, str) else space

@@ -3,13 +3,13 @@
 ::
 
     <name>/data/
-        recording.json         the plan: written first, compared when the collection goes on
+        recording.json         the plan: written first, compared when the collection is resumed
         part-<p>-<n>.hdf5      part n of process p: episodes, and a table of them
         main_data.hdf5         Minari's file: episode_0, episode_1, ... as links into the parts
         metadata.json          Minari's entries, and ours under "bidex"; written last: it marks a complete data set
 
-A part is written under a temporary name and renamed: it is there wholly or not at all, with its digest (``seals.py``).
-Each episode is a group in Minari's layout, so that ``minari.load_dataset`` opens it, and no byte is stored twice.
+A part is written under a temporary name and then renamed, so a part is either complete, with its digest (``seals.py``),
+or absent. Each episode is a group in Minari's layout: ``minari.load_dataset`` opens it, and no byte is stored twice.
 """
 
 import io
@@ -29,13 +29,13 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.atomic import sync_folder
 from bidex_meta.utils.files import is_file
 
-H5 = Any  # h5py's file, group, array or buffer: of an optional package without types
+H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no types
 Json = dict[str, Any]
 
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
-FORMAT = 1  # raised when older code could no longer read what is written
+FORMAT = 1  # increased when older code can no longer read the files
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 3800  # bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes
+EPISODE_BYTES = 3800  # overhead of an episode in HDF5, bytes: measured 3,675 with five attributes
 ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
 ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
@@ -64,12 +64,12 @@ class Episode:
     policy: int = 0  # which of several policies acted, from 0 on
 
     def __len__(self) -> int:
-        """Transitions, T."""
+        """Return the number of transitions, T."""
         return len(self.rewards)
 
 
 def hdf5() -> ModuleType:
-    """The package ``h5py``; raises BidexError where it is not installed."""
+    """Return the package ``h5py``; raise BidexError if ``h5py`` is not installed."""
     try:
         import h5py
     except ModuleNotFoundError:
@@ -79,18 +79,18 @@ def hdf5() -> ModuleType:
 
 
 def parts_of(folder: Path, process: int | None = None) -> list[Path]:
-    """The parts in a folder ``data``, of all processes or of one, by process and number."""
+    """List the parts in a folder ``data``, of all processes or of one, sorted by process and number."""
     parts = [(int(match[1]), int(match[2]), path) for path in _files(folder) if (match := _PART.fullmatch(path.name))]
     return [path for owner, _, path in sorted(parts) if process in (None, owner)]
 
 
 def part_path(folder: Path, process: int, number: int) -> Path:
-    """Path of a part."""
+    """Return the path of a part."""
     return folder / f"part-{process}-{number:05d}.hdf5"
 
 
 def remove_parts(folder: Path, process: int, keep: int) -> None:
-    """Deletes a process's parts from number ``keep`` on, and its half-written files."""
+    """Delete a process's parts from number ``keep`` on, and its half-written files."""
     for path in _files(folder):
         match = _PART.fullmatch(path.name)
         if (match and int(match[1]) == process and int(match[2]) >= keep) or path.name.startswith(f".part-{process}-"):
@@ -104,13 +104,14 @@ def _files(folder: Path) -> Iterator[Path]:
 class _Disk(io.FileIO):
     """A file for HDF5 that stores the system's first error (``refused``) instead of raising it.
 
-    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash as the process ends.
+    If the error were raised, HDF5 would retry at each close, print tracebacks that nobody can catch, and crash as the
+    process ends.
     """
 
     refused: OSError | None = None
 
     def write(self, data: H5, /) -> int:
-        """Writes all data."""
+        """Write all data."""
         left = memoryview(data)
         size = left.nbytes
         try:
@@ -121,7 +122,7 @@ class _Disk(io.FileIO):
         return size
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Sets the file's length."""
+        """Set the file's length."""
         try:
             return super().truncate(size)
         except OSError as error:
@@ -130,7 +131,7 @@ class _Disk(io.FileIO):
 
 
 class SealedFile:
-    """A file of HDF5 while it is written; ``commit`` adds its digest, forces it to the disk and renames it."""
+    """An HDF5 file that is being written; ``commit`` adds its digest, forces the file to the disk and renames it."""
 
     def __init__(self, path: Path) -> None:
         h5, self._path = hdf5(), path
@@ -141,7 +142,7 @@ class SealedFile:
 
     @contextmanager
     def writing(self) -> Iterator[H5]:
-        """h5py's file, to be written into; raises OSError where the disk did not take it, and drops the file."""
+        """Yield h5py's file for writing; if the disk refuses a write, drop the file and raise OSError."""
         try:
             yield self._file
         finally:
@@ -150,7 +151,7 @@ class SealedFile:
                 raise OSError(refused.errno, refused.strerror, str(self._path))
 
     def commit(self) -> None:
-        """Completes the file; errors as of ``writing``."""
+        """Complete the file; raise the same errors as ``writing``."""
         with self.writing() as file:
             file.close()
         with self.writing():
@@ -163,16 +164,16 @@ class SealedFile:
         sync_folder(self._path.parent)
 
     def abandon(self) -> None:
-        """Drops the file, unless it was committed."""
+        """Drop the file, unless it was committed."""
         if not self._disk.closed:
-            with suppress(Exception):  # of a full disk HDF5 may read what was never written
+            with suppress(Exception):  # on a full disk HDF5 may read bytes that were never written
                 self._file.close()
             self._disk.close()
             self._temporary.unlink(missing_ok=True)
 
 
 class PartWriter:
-    """One part while it is written: episodes go to the disk at once; nothing is at ``path`` before ``commit``."""
+    """A part that is being written: episodes go to the disk at once; nothing is at ``path`` before ``commit``."""
 
     def __init__(self, path: Path) -> None:
         self._sealed = SealedFile(path)
@@ -181,7 +182,7 @@ class PartWriter:
         self.steps = 0
 
     def add(self, episode: Episode) -> None:
-        """Writes an episode; errors as of ``SealedFile.writing``."""
+        """Write an episode; raise the same errors as ``SealedFile.writing``."""
         row = {name: getattr(episode, name) for name in TABLE if name not in ("steps", "return")}
         row |= {"steps": len(episode), "return": float(episode.rewards.astype(np.float64).sum())}
         named = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
@@ -197,7 +198,7 @@ class PartWriter:
         self.steps += len(episode)
 
     def commit(self, counts: dict[str, int]) -> None:
-        """Completes the part, with counts of what was left out, by reason."""
+        """Complete the part, with counts of the left-out transitions and episodes by reason."""
         width = max(map(len, self._variations), default=0)
         variations = np.full((len(self._rows), width), np.nan)
         for row, variation in zip(variations, self._variations, strict=True):
@@ -211,12 +212,12 @@ class PartWriter:
         self._sealed.commit()
 
     def abandon(self) -> None:
-        """Drops the part, unless it was committed."""
+        """Drop the part, unless it was committed."""
         self._sealed.abandon()
 
 
 def write_main(folder: Path, parts: Iterable[Path]) -> None:
-    """Writes Minari's file: a link to every episode of the parts, in their order."""
+    """Write Minari's file: a link to every episode of the parts, in the order of the parts."""
     main, number, h5 = SealedFile(folder / MAIN), 0, hdf5()
     try:
         with main.writing() as file:
@@ -231,7 +232,7 @@ def write_main(folder: Path, parts: Iterable[Path]) -> None:
 
 @contextmanager
 def reading(path: Path) -> Iterator[H5]:
-    """h5py's file, to be read; raises BidexError where it is no file, or what was read within is damaged."""
+    """Yield h5py's file for reading; raise BidexError if there is no file, or if the data read inside is damaged."""
     h5 = hdf5()
     if not is_file(path):
         raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
@@ -240,14 +241,14 @@ def reading(path: Path) -> Iterator[H5]:
             yield file
     except BidexError:
         raise
-    except Exception as error:  # h5py raises all kinds; a group in the place of an array lacks its attributes
+    except Exception as error:  # h5py raises many kinds; a group instead of an array lacks an array's attributes
         reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
         what = f"{path} is damaged or no part of a data set ({reason})"
         raise BidexError(f"{what}. Delete it and record it again.") from None
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a part's episodes, (episodes,), ``variation`` (episodes, v); BidexError for a damaged one."""
+    """Read the columns of a part's episodes, (episodes,), ``variation`` (episodes, v); raise BidexError for damage."""
     with reading(path) as file:
         table = {name: file["table"][name] for name in (*TABLE, "variation")}
         rows = table["steps"].shape[:1]

@@ -1,7 +1,7 @@
-"""Digests of a data set's files, so that no flipped bit is read in silence.
+"""Digests of a data set's files, so that a flipped bit is detected.
 
-The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows; the last entry of
-``metadata.json`` is the digest of all before it. It is no protection against intent.
+The user block of an HDF5 file holds the file's length and the CRC-32 of all bytes after the user block; the last entry
+of ``metadata.json`` is the digest of all text before this entry. Digests do not protect against intentional changes.
 """
 
 import json
@@ -14,15 +14,15 @@ from typing import IO
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.files import open_regular
 
-BLOCK = 512  # bytes of the user block: the least that HDF5 takes
+BLOCK = 512  # bytes of the user block: the least that HDF5 accepts
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
-_MARK = "sealed"  # entry in the metadata beside the digest: one flipped bit cannot remove both
+_MARK = "sealed"  # second entry in the metadata: one flipped bit cannot remove both this entry and the digest
 
 
 def block(file: IO[bytes]) -> bytes:
-    """The user block for the content of an open file."""
+    """Compute the user block for the content of an open file."""
     length, digest = file.seek(0, 2), 0
     file.seek(BLOCK)
     while piece := file.read(_PIECE):
@@ -35,19 +35,19 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Checks a file's digest, reading all of it; false for one without. Raises BidexError where it has changed."""
+    """Check a file's digest by reading all bytes; return False without a digest. Raises BidexError if it is wrong."""
     with open_regular(path, "a file of a data set") as file:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):
             return False
-        # The length first: a file of terabytes of nothing is not read.
+        # The length is checked first, so that a huge empty file is not read.
         if not first.startswith(_line(file.seek(0, 2), "")) or first != block(file):
             raise _changed(path, "Bring it back from a copy, or delete it and record it again")
     return True
 
 
 def sealed_text(content: Mapping[str, object], ours: Mapping[str, object]) -> bytes:
-    """A data set's metadata, ours under ``bidex``, as JSON with one entry a line and a digest."""
+    """Return a data set's metadata, ours under ``bidex``, as JSON with one entry per line and a digest."""
     whole = {**content, "bidex": {**ours, _MARK: True}}
     rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in whole.items() if name != "digest"]
     text = ("{\n" + ",\n".join(rows)).encode()
@@ -59,7 +59,7 @@ def _ending(text: bytes) -> bytes:
 
 
 def check_text(path: Path, data: bytes) -> bool:
-    """Checks the digest of metadata; false for those without. Raises BidexError where they have changed since."""
+    """Check the digest of metadata; return False if there is none. Raises BidexError if the metadata have changed."""
     text, found, _ = data.rpartition(_LAST.encode())
     if not found and not re.search(rb'"%s"\s*:\s*true' % _MARK.encode(), data):
         return False

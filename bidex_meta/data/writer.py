@@ -1,4 +1,4 @@
-"""A data set as it is written: its path and name, parts that are there wholly or not at all, then the index."""
+"""Write a data set: its path and name, then its parts, each complete or absent, and last the index."""
 
 import contextlib
 import json
@@ -25,21 +25,21 @@ from bidex_meta.utils.files import absolute, exists, expanded, is_file, read_jso
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Threads, parse
 
-_MARGIN = 1.05  # what file systems take beside the files
+_MARGIN = 1.05  # file systems take about 5 % in addition to the files
 _MINARI = "0.5.0"  # the version of Minari whose layout is written
 _NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
-"""Names that Minari takes: words of letters, digits, - and _, parted by /, and a version such as -v0."""
+"""Names that Minari accepts: words of letters, digits, - and _, separated by /, and a version such as -v0."""
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is read again of a collection's plan."""
+    """The entries that are read again from a collection's plan."""
 
     threads: Threads | None = None
 
 
 def default_name(subject: str, kind: str) -> str:
-    """The name of a new data set of a suite, a suite file's path or a class: ``CatchUnderarm/random-v0``."""
+    """Return the name, such as ``CatchUnderarm/random-v0``, of a new data set of a suite, a suite file or a class."""
     if ":" in subject:
         return f"{short_name(subject)}/{kind}-v0"
     parts = [Path(subject).stem] if subject.endswith(".toml") else subject.split("/")
@@ -48,7 +48,7 @@ def default_name(subject: str, kind: str) -> str:
 
 
 def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
-    """Folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
+    """Return folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
     root, usual = data_folder(), default_name(subject, kind)
     if out is None:
         return root / usual, usual
@@ -61,13 +61,13 @@ def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
 
 
 def check_name(name: str) -> None:
-    """Raises BidexError for a name that Minari would not take."""
+    """Raise BidexError for a name that Minari does not accept."""
     if not _NAME.fullmatch(name):
         raise BidexError(f"Expected a name such as CatchUnderarm/random-v0, got {name!r}. Name another path by --out.")
 
 
 def check_room(folder: Path, needed: int, what: str) -> None:
-    """Raises BidexError where ``needed`` bytes, of ``what``, do not fit on a folder's disk; it may be missing."""
+    """Raise BidexError if ``needed`` bytes, of ``what``, do not fit on the disk of a folder, which may be missing."""
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
@@ -78,9 +78,10 @@ def check_room(folder: Path, needed: int, what: str) -> None:
 class DatasetWriter:
     """Writes episodes of one process into the parts of a data set.
 
-    ``folder`` is the data set's: its name within the data folder is how it is opened. Each ``process`` has parts of its
-    own: ``keep`` of them stay, later ones are deleted; ``parts`` are committed. ``left_out`` counts, by reason, what
-    was not stored since the last commit; the collector adds to it.
+    ``folder`` is the data set's folder; the data set is opened by the folder's name within the data folder. Each
+    ``process`` has its own parts: the first ``keep`` parts stay, and later parts are deleted. ``parts`` is the number
+    of committed parts. ``left_out`` counts, by reason, the transitions and episodes that were not stored since the last
+    commit; the collector adds to these counts.
     """
 
     def __init__(self, folder: Path, process: int = 0, keep: int = 0) -> None:
@@ -93,15 +94,15 @@ class DatasetWriter:
 
     @property
     def open_steps(self) -> int:
-        """Transitions that are not committed yet."""
+        """Number of transitions that are not committed yet."""
         return 0 if self._part is None else self._part.steps
 
     def add(self, episode: Episode) -> None:
-        """Writes an episode; it is lost unless ``commit`` follows."""
+        """Write an episode, which is lost unless ``commit`` follows."""
         self._open().add(episode)
 
     def commit(self) -> None:
-        """Makes a part of what was added since the last one, if anything was."""
+        """Complete a part from the episodes and counts added since the last part, if there are any."""
         if self._part is None and not self.left_out:
             return
         self._open().commit(dict(self.left_out))
@@ -113,7 +114,7 @@ class DatasetWriter:
         return self._part
 
     def close(self) -> None:
-        """Drops what was not committed."""
+        """Drop the episodes that were not committed."""
         if self._part is not None:
             self._part.abandon()
             self._part = None
@@ -121,10 +122,10 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
-    """Locks a folder against other processes, from before anything is written there to the end.
+    """Lock a folder against other processes, from before anything is written there to the end.
 
-    It creates the folder, and removes it again if it stays empty. Arguments and errors as of ``has_begun``; and
-    BidexError where another process records there.
+    The folder is created, and removed again if it stays empty. Arguments and errors are those of ``has_begun``;
+    BidexError is also raised if another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]
@@ -136,7 +137,7 @@ def claimed(folder: Path, plan: Json) -> Iterator[None]:
         raise BidexError(f"{folder} cannot be written: {error.strerror}. Name another path by --out.") from None
     with lock:
         if not folder.is_dir():
-            raise BidexError(message)  # a process that was refused has removed it
+            raise BidexError(message)  # another process, which was refused, has removed the folder
         try:
             has_begun(folder, plan)
             yield
@@ -147,14 +148,17 @@ def claimed(folder: Path, plan: Json) -> Iterator[None]:
 
 
 def begin(folder: Path, plan: Json) -> None:
-    """Writes the plan of a collection; arguments and errors as of ``has_begun``."""
+    """Write the plan of a collection; arguments and errors are those of ``has_begun``."""
     if not has_begun(folder, plan):
         (folder / "data").mkdir(parents=True, exist_ok=True)
         write_json(folder / "data" / part_files.RECORDING, plan)
 
 
 def stored_plan(folder: Path) -> Json:
-    """The plan of a collection that has begun in a folder, empty without one; BidexError for anything else."""
+    """Read the plan of a collection that has begun in a folder; return an empty dict if there is no plan.
+
+    Raises BidexError if the file is not a plan.
+    """
     path = folder / "data" / part_files.RECORDING
     if not is_file(path):
         return {}
@@ -164,14 +168,14 @@ def stored_plan(folder: Path) -> Json:
 
 
 def has_begun(folder: Path, plan: Json) -> bool:
-    """Whether the same collection has begun here, so that the same command goes on with it.
+    """Return whether the same collection has begun here, so that the same command resumes it.
 
-    ``plan`` is everything that decides what is collected, ready for JSON. Raises BidexError where the data set's folder
-    holds a complete data set, the recording of something else, or something else.
+    ``plan`` holds everything that decides what is collected, ready for JSON. BidexError is raised if the data set's
+    folder holds a complete data set, another recording, or other files.
     """
     inner = folder / "data"
     path = inner / part_files.RECORDING
-    # With a plan beside it, it was killed between its last two steps, and the index is written once more.
+    # If metadata and plan both exist, the process was killed between its last two steps: the index is written again.
     if is_file(inner / part_files.METADATA) and not is_file(path):
         raise BidexError(f"{folder} holds a complete data set. Name another by --out, or delete it.")
     if is_file(path):
@@ -183,7 +187,7 @@ def has_begun(folder: Path, plan: Json) -> bool:
             raise BidexError(f"{what}. Give its own command to go on, or name another path by --out.")
         return True
     if inner.is_dir():
-        remove_leftovers(inner)  # of a collection that was killed as it began
+        remove_leftovers(inner)  # left by a collection that was killed as it began
     if folder.exists() and any(folder.iterdir()) and not (inner.is_dir() and not any(inner.iterdir())):
         raise BidexError(f"{folder} exists and is not empty. Name another path by --out.")
     check_writable(path)
@@ -191,10 +195,11 @@ def has_begun(folder: Path, plan: Json) -> bool:
 
 
 def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: Json) -> None:
-    """Completes a data set: writes Minari's index over the parts of all processes, then the metadata.
+    """Complete a data set: write Minari's index over the parts of all processes, then the metadata.
 
-    ``name`` is as Minari takes it, the spaces are of one observation (d,) and action (a,); ``metadata`` is our entry:
-    ``tasks`` must be there, ``left_out`` is added. Raises BidexError for another name, or a damaged part.
+    ``name`` must be one that Minari accepts; the spaces are those of one observation (d,) and action (a,). ``metadata``
+    is our entry: it must have ``tasks``, and ``left_out`` is added. BidexError is raised for another name, or a damaged
+    part.
     """
     check_name(name)
     inner = folder / "data"
@@ -221,7 +226,10 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: J
 
 
 def adopt(inner: Path, folder: Path, name: str) -> None:
-    """Publishes a folder ``data`` as another data set, by links, or copies elsewhere; BidexError as ``claimed``."""
+    """Publish a folder ``data`` as another data set, by links, or by copies if the file system cannot link.
+
+    Raises the same errors as ``claimed``.
+    """
     check_name(name)
     with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
         begin(folder, plan)
@@ -240,7 +248,7 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
 
 
 def left_out(inner: Path) -> dict[str, int]:
-    """Counts over all parts of what was left out, by reason."""
+    """Count the left-out transitions and episodes of all parts by reason."""
     counts: Counter[str] = Counter()
     for path in part_files.parts_of(inner):
         with part_files.reading(path) as file:
@@ -258,7 +266,7 @@ def _space(space: Box) -> str:
 
 
 def estimated_bytes(steps: int, observation_size: int, action_size: int, episode_steps: float) -> int:
-    """Bytes on the disk, estimated; ``episode_steps``: of an episode, on average."""
+    """Estimate the bytes on the disk; ``episode_steps`` is the mean length of an episode."""
     episodes = math.ceil(steps / max(episode_steps, 1.0))
     own = 4 * observation_size + part_files.EPISODE_BYTES
     return steps * (4 * (observation_size + action_size + 1) + 2) + episodes * own

@@ -1,1 +1,1 @@
-"""Benchmarks of the project itself, ``python -m tools.bench KIND``. For users there is ``bidex-meta bench world``."""
+"""Benchmarks for maintainers, ``python -m tools.bench KIND``. Users have ``bidex-meta bench world``."""

@@ -1,6 +1,6 @@
-"""``python -m tools.bench KIND [--json]``: measures, and prints a table or JSON.
+"""``python -m tools.bench KIND [--json]``: measure, and print a table or JSON.
 
-A kind is a function, its arguments are the flags.
+A kind is a function; the function's arguments are the flags.
 """
 
 import json
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> None:
     """Measure and print; ``--json`` may stand anywhere.
 
     Raises:
-        SystemExit: With one line that says what is wrong, or after tyro's help text.
+        SystemExit: With a one-line error message, or after tyro's help text.
     """
     flags = [word for word in arguments if word != "--json"]
     try:

@@ -1,7 +1,8 @@
-"""The speed of this code's worlds beside that of another commit, side by side in one run.
+"""Compare the speed of this code's worlds with another commit's, side by side in one run.
 
-Speeds on a shared machine drift by more than a change gains, so numbers of two runs say little. Here a process for each
-side holds the same world; they take turns, a repeat each, and what counts is the ratio of a pair of repeats.
+Speeds on a shared machine drift by more than a change gains, so numbers of two runs say little. Here each side has a
+process with the same world. The processes take turns, one repeat each, and the result is the ratio of a pair of
+repeats.
 """
 
 import contextlib
@@ -40,7 +41,7 @@ def against(
     seed: int = 0,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Speed of a suite's world, and of its classes alone, beside that of other code on the same interpreter.
+    """Compare the speed of a suite's world, and of single classes, with other code on the same interpreter.
 
     Args:
         other: A commit of the git checkout that this code runs from, or a folder with a checkout.
@@ -83,12 +84,12 @@ def against(
 
 
 def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, repeats: int) -> dict[str, Any]:
-    """One row of the table: both sides' speeds of one world, repeat after repeat."""
+    """Return one row of the table: both sides' speeds of one world, measured in alternating repeats."""
     physics = {worker: worker.ask("build", **world) for worker in (old, new)}
     walls: dict[_Worker, list[float]] = {old: [], new: []}
     cpus: dict[_Worker, list[float]] = {old: [], new: []}
     for repeat in range(repeats + 1):
-        for worker in (old, new) if repeat % 2 else (new, old):  # neither is always the one that finds a warm machine
+        for worker in (old, new) if repeat % 2 else (new, old):  # alternate which side finds a warm machine
             took = worker.ask("step", steps=steps, seed=repeat)
             if repeat:  # the first one warms up
                 walls[worker].append(took["wall"])
@@ -109,7 +110,7 @@ def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, re
 
 @contextlib.contextmanager
 def checkout(other: str) -> Iterator[Path]:
-    """The folder of the other code; a commit is unpacked for as long as the block lasts."""
+    """Yield the folder of the other code; a commit is unpacked for the duration of the block."""
     with tempfile.TemporaryDirectory(prefix="bidex-meta-") as unpacked:
         folder = Path(other).resolve()
         if not folder.is_dir():
@@ -120,7 +121,7 @@ def checkout(other: str) -> Iterator[Path]:
 
 
 def commit_name(other: str) -> str | None:
-    """The full name of a commit; None for a folder that git does not know."""
+    """Return the full name of a commit; None for a folder."""
     if Path(other).is_dir():
         return None
     return _git("rev-parse", "--verify", f"{other}^{{commit}}").decode().strip()
@@ -135,17 +136,17 @@ def _ratios(old: list[float], new: list[float]) -> list[float]:
 
 
 def _told(batches: list[tuple[float, int]]) -> str:
-    """E.g. "1/240 s × 4"; of several engine batches each kind once."""
+    """Format engine batches as, e.g., "1/240 s × 4", each kind once."""
     return ", ".join(dict.fromkeys(f"1/{1.0 / time_step:.4g} s × {substeps}" for time_step, substeps in batches))
 
 
 class _Worker:
-    """A process that steps the worlds of one checkout, asked over pipes; it ends with the block."""
+    """A process that steps the worlds of one checkout and is called over pipes; the process ends with the block."""
 
     def __init__(self, checkout: Path) -> None:
         self._checkout = checkout
         path = [str(checkout), str(checkout / "algos"), os.environ.get("PYTHONPATH", "")]
-        # -P: the script's own folder stays off the path, or its neighbours here would pass for modules.
+        # -P keeps the script's own folder off the path; otherwise the files next to it could be imported as modules.
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(Path(__file__).with_name("stepper.py"))],
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))},
@@ -162,9 +163,9 @@ class _Worker:
         self._process.communicate()
 
     def ask(self, name: str, **given: Any) -> Any:
-        """What the worker's method of this name answers."""
+        """Call the worker's method of this name and return the method's result."""
         assert self._process.stdin is not None and self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):  # a worker that has died is told of below
+        with contextlib.suppress(BrokenPipeError):  # a dead worker is reported below
             self._process.stdin.write(json.dumps([name, given]) + "\n")
             self._process.stdin.flush()
         line = self._process.stdout.readline()

@@ -1,4 +1,4 @@
-"""How many contacts and constraint rows the classes need: what ``TaskClass.needs`` was filled from."""
+"""Measure how many contacts and constraint rows the classes need, the source of ``TaskClass.needs``."""
 
 import math
 from typing import Any
@@ -23,10 +23,10 @@ def capacity(
     threads: int | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """How many contacts and constraint rows a simulation has under rough actions (those of ``stability``).
+    """Count the contacts and constraint rows of a simulation under the rough actions of ``stability``.
 
-    Contacts and rows are counted by C MuJoCo after every step of every row, candidate pairs of the broadphase and pairs
-    of the convex collider by mujoco_warp on a sample of 32 rows a step.
+    C MuJoCo counts contacts and constraint rows after every step of every environment. mujoco_warp counts candidate
+    pairs of the broadphase and pairs of the convex collider in a sample of 32 environments per step.
 
     Args:
         suite: Measure the classes of this suite.

@@ -1,4 +1,4 @@
-"""``bench field``: the speed of our worlds beside what others offer, side by side on one core."""
+"""``bench field``: compare the speed of our worlds with other libraries, side by side on one core."""
 
 import importlib
 import math
@@ -26,10 +26,10 @@ _INSTALL = "pip install gymnasium-robotics"
 
 
 def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int = 0) -> dict[str, Any]:
-    """Speed under random actions, resets included: Meta-World's MT10, gymnasium-robotics' hand, and our MT4 and MT20.
+    """Measure speed under random actions with resets: Meta-World's MT10, gymnasium-robotics' hand, our MT4 and MT20.
 
-    Everything runs in one process on one thread; pin it to a core (``taskset -c 0``). The tasks differ, and so does the
-    time that a step stands for: hence the columns beside the speed.
+    Everything runs in one process on one thread; pin the process to a core (``taskset -c 0``). Tasks and the duration
+    of a step differ between the libraries, so the table has further columns besides the speed.
 
     Args:
         num_envs: Rows of MT4 and MT20. Meta-World's vector environment has ten, and so has ours of it.
@@ -89,10 +89,11 @@ def _robot_hands(skipped: dict[str, str]) -> Iterator[Entry]:
 
 
 def _mend(utils: Any) -> None:
-    """Lets gymnasium-robotics 1.4.2 run on MuJoCo 3.12 and later.
+    """Patch gymnasium-robotics 1.4.2 to run on MuJoCo 3.12 and later.
 
-    It asks whether a joint's type, a NumPy number, is in a tuple of MuJoCo's names for them. Since 3.12 such a name no
-    longer equals a NumPy number, and no hand could be made. Here its module finds plain numbers under these names.
+    gymnasium-robotics tests if a joint's type, a NumPy number, is in a tuple of MuJoCo's names of joint types. Since
+    MuJoCo 3.12 these names no longer equal NumPy numbers, so that no hand could be made. The patch replaces the names
+    by plain numbers in the library's module.
     """
     mujoco = utils.mujoco
     plain = SimpleNamespace(**{name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()})
@@ -107,7 +108,7 @@ def _ours(num_envs: int, seed: int) -> Iterator[Entry]:
 
 
 def _speed(vector: VectorEnv, steps: int, rng: np.random.Generator) -> Speed:
-    """How fast uniform actions are stepped."""
+    """Measure how fast a vector environment steps uniform actions."""
     shape = math.ceil(steps / vector.num_envs), vector.num_envs, *(vector.single_action_space.shape or ())
     actions = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
     wall, cpu = time.perf_counter(), time.process_time()

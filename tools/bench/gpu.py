@@ -1,4 +1,4 @@
-"""What an accelerator gives: speed by the number of environments, memory of each, and where a step's time goes."""
+"""Measure an accelerator: speed by the number of environments, memory per environment, and time per stage of a step."""
 
 import json
 import time
@@ -34,7 +34,7 @@ def gpu(
     out: Path | None = None,
     learning: bool = False,
 ) -> dict[str, Any]:
-    """Speed of a suite and of single classes over the number of environments.
+    """Measure the speed of a suite and of single classes over the number of environments.
 
     Args:
         suite: Suite to step.
@@ -101,10 +101,10 @@ def _measured(
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
-    """Milliseconds of a step, of its physics, of the rest (``torch``), and of each group with the others at rest.
+    """Return the milliseconds of a step, its physics, the rest (``torch``), and each group with the others at rest.
 
-    ``launching`` is the host's part of the physics. ``overlap`` is 0 where groups run one after the other, and 1 where
-    all take no longer than the slowest.
+    ``launching`` is the host's part of the physics. ``overlap`` is 0 if groups run one after the other, and 1 if all
+    groups together take no longer than the slowest group.
     """
     took = {"step": 1000.0 * _random_steps(made, steps) / steps}
     took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
@@ -120,7 +120,7 @@ def _stages(made: World, steps: int) -> dict[str, float]:
 
 
 def _random_steps(world: World, steps: int) -> float:
-    """Return the seconds that uniform actions take, which are drawn before the clock starts."""
+    """Return the seconds that steps under uniform actions take; the actions are drawn before the clock starts."""
     generator = torch.Generator(world.device).manual_seed(0)
     shape = steps, world.num_envs, world.action_size
     actions = 2.0 * torch.rand(shape, generator=generator, device=world.device) - 1.0
@@ -131,14 +131,14 @@ def _random_steps(world: World, steps: int) -> float:
 
 
 def _now(device: torch.device) -> float:
-    """Return the clock's seconds, once all that a device was given is done."""
+    """Return the clock's seconds after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
-    """Of one of ``steps`` runs: until all is done, and until the host had it launched."""
+    """Return the mean milliseconds of a run of ``work`` until all is done, and until the host has launched it."""
     start = _now(made.device)
     for _ in range(steps):
         work()
@@ -147,7 +147,7 @@ def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[fl
 
 
 def _memory(device: str) -> int:
-    """Bytes in use: of the device, whoever holds them, or of this process."""
+    """Return the bytes in use: on a GPU those of all processes, else those of this process."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
         torch.cuda.empty_cache()

@@ -1,4 +1,4 @@
-"""Whether the physics holds under rough actions."""
+"""Test if the physics is stable under rough actions."""
 
 import math
 from typing import Any
@@ -32,11 +32,11 @@ def stability(
     device: str = "cpu",
     engine: str = "auto",
 ) -> dict[str, Any]:
-    """Whether the physics holds under rough actions, and under those that solve the task.
+    """Test if the physics is stable under rough actions, and under actions that solve the task.
 
-    Half the rows draw uniform actions at every step, half hold each action at -1 or 1 for 5 to 40 steps. Depths of
-    contacts are taken from a sample of rows. Then the class's witness is played, where there is one, from its start
-    and from shifted ones.
+    Half the environments draw uniform actions at every step; the other half hold each action at -1 or 1 for 5 to 40
+    steps. Depths of contacts are taken from a sample of environments. Then the class's witness, if there is one, is
+    played from its own start and from shifted starts.
 
     Args:
         suite: Test the classes of this suite, with the bases they have there, by its version's rules.
@@ -68,7 +68,7 @@ def stability(
 
 
 def variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
-    """Names of the classes to test, each with whether its base moves."""
+    """Return the names of the classes to test, each with a flag that is true if the base moves."""
     if suite is not None and task is None:
         benchmark = Benchmark(suite)
         classes = benchmark.task_classes("train") | benchmark.task_classes("test")
@@ -114,9 +114,9 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
 
 
 def witness_share(name: str, threads: int | None = None) -> float | None:
-    """Share of states without a contact deeper than 5 mm while a class's witness is replayed; None without a witness.
+    """Return the share of states without a contact deeper than 5 mm in replays of a witness; None without a witness.
 
-    Every state of the episode counts, from its own start and from the shifted ones of a replay.
+    Every state of the episodes counts, from the witness's own start and from the shifted starts of a replay.
     """
     if not witness_path(name).is_file():
         return None
@@ -125,7 +125,7 @@ def witness_share(name: str, threads: int | None = None) -> float | None:
 
 
 def rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
-    """Uniform actions in the first half of the rows, held extremes in the second; both buffers are updated in place."""
+    """Draw uniform actions in the first half of the rows, and held extremes in the second; update both buffers."""
     num, size = held.shape
     half = num // 2
     expired = left <= 0

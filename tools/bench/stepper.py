@@ -1,7 +1,7 @@
-"""The worker of ``tools.bench.against``: steps the worlds of whatever checkout stands first on its path.
+"""The worker of ``tools.bench.against``: step the worlds of the checkout that is first on the import path.
 
-It is started by its own file name and finds another commit's ``bidex_meta`` under that name, so it may use only what
-commit e0e28c4 has too. A command is a line of JSON on stdin, its answer a line of JSON on stdout.
+The worker is started by its file name and imports another commit's ``bidex_meta``, so the worker may use only names
+that commit e0e28c4 has too. A command is a line of JSON on stdin, the answer a line of JSON on stdout.
 """
 
 import json
@@ -19,7 +19,7 @@ class Stepper:
         self._world: Any = None
 
     def classes(self, checkout: str, suite: str, seed: int) -> list[str]:
-        """Names of the train classes of a suite, as the code under ``checkout`` has them."""
+        """Return the names of the train classes of a suite in the code under ``checkout``."""
         import bidex_meta
 
         found = Path(bidex_meta.__file__).resolve().parents[1]
@@ -28,10 +28,10 @@ class Stepper:
         return list(bidex_meta.Benchmark(suite, seed=seed).train_classes)
 
     def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[Any]:
-        """Makes and resets the world of a suite, or of one of its classes as the suite has it.
+        """Make and reset the world of a suite, or of one of the suite's classes.
 
         Returns:
-            Time step (seconds) and substeps of each engine batch; empty where the code keeps them elsewhere.
+            Time step (seconds) and substeps of each engine batch; empty if the code stores these values elsewhere.
         """
         from bidex_meta import Benchmark
 
@@ -50,7 +50,7 @@ class Stepper:
             return []
 
     def step(self, steps: int, seed: int) -> dict[str, float]:
-        """Steps all rows under uniform actions, once more than it measures.
+        """Step all rows under uniform actions, once more than is measured.
 
         Returns:
             ``wall`` and ``cpu`` (of all threads), seconds.
@@ -88,7 +88,7 @@ def _slot(benchmark: Any, task: str) -> Any:
 
 
 def main() -> None:
-    """Answers commands until stdin ends."""
+    """Answer commands until stdin ends."""
     # Whatever a library prints must not stand between the answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

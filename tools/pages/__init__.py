@@ -1,1 +1,1 @@
-"""Generates the tables and pictures of README.md and docs/results from results/data."""
+"""Generate the tables and pictures of README.md and docs/results from results/data."""

@@ -1,4 +1,4 @@
-"""``python -m tools.pages [--check] [PAGE...]`` (``make results``), from the repository's root."""
+"""``python -m tools.pages [--check] [PAGE...]`` (``make results``): fill pages, from the repository's root."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Fills the marked blocks of pages with tables and pictures of studies.
+"""Fill the marked blocks of pages with tables and pictures of studies.
 
 ::
 
@@ -58,7 +58,7 @@ class Block:
 
 
 def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
-    """Updates a page's blocks and pictures from the data.
+    """Update a page's blocks and pictures from the data.
 
     Args:
         page: A file of Markdown.
@@ -92,7 +92,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
 
 def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path]) -> Iterator[str]:
-    """Markdown lines of a block; draws its pictures."""
+    """Yield the Markdown lines of a block, and draw the block's pictures."""
     if block.show == "references":
         yield from tables.references_table()
         return
@@ -129,7 +129,7 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
 
 
 def _stored_digest(picture: Path) -> str | None:
-    """Digest of the data of a picture (its own bytes depend on matplotlib's version)."""
+    """Read the stored digest of a picture's data (the picture's own bytes depend on matplotlib's version)."""
     if not picture.exists():
         return None
     with Image.open(picture) as opened:

@@ -1,4 +1,4 @@
-"""Meta-tests: success after each shot, and each run's gain beside that of a control without meta-training."""
+"""Meta-tests: success after each shot, and each run's gain compared with a control without meta-training."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -21,9 +21,9 @@ _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "retur
 
 
 def gains_table(study: Study) -> Iterator[str]:
-    """One row per run, class by class; a gain whose interval excludes zero is bold.
+    """Yield one row per run, class by class; a gain whose interval excludes zero is bold.
 
-    A gain is the meta-test's gain in return, with its interval over adaptations and their episodes. "Over control" is
+    A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
     the difference to the gain of the control's run of the same seed; half widths add as independent errors (the root
     of the sum of squares).
 
@@ -56,13 +56,14 @@ def gains_table(study: Study) -> Iterator[str]:
 
 
 def shots_table(*studies: Study) -> Iterator[str]:
-    """Success after each shot, mean over seeds (least to most), and return before and after the last.
+    """Yield a row per arm and per line of a ladder.
 
-    A row per arm, and per line of a ladder.
+    A row has the success after each shot, as mean over seeds (least to most), and the return before the first shot and
+    after the last.
 
     Args:
-        studies: Runs with a meta-test of ``Study.split`` or of one split alone. One study has rows for each class; of
-            several each has one row per arm, of the mean over its classes.
+        studies: Runs with a meta-test of ``Study.split`` or of a single split. One study has rows per class. With
+            several studies each has one row per arm, the mean over the study's classes.
     """
     found = _by_shot(studies)
     most = max(len(seeds.shares[0]) for seeds in found.values())
@@ -78,10 +79,12 @@ def shots_table(*studies: Study) -> Iterator[str]:
 
 
 def shots_figure(*studies: Study) -> Any:
-    """Success against exploring episodes: a panel a class or suite, a line an arm; who knows the goal has one value.
+    """Draw success against exploring episodes: a panel per class or suite, a line per arm.
+
+    A policy that knows the goal has one value.
 
     Args:
-        studies: As of ``shots_table``.
+        studies: As in ``shots_table``.
     """
     found, panels = _by_shot(studies), dict[str, list[plots.Group]]()
     most = max(len(seeds.shares[0]) for seeds in found.values())
@@ -99,7 +102,7 @@ def shots_figure(*studies: Study) -> Any:
 
 @dataclass
 class _Seeds:
-    """What is known of an arm's seeds, or of a ladder's line, on one class or suite."""
+    """Results of an arm's seeds, or of a ladder's line, on one class or suite."""
 
     shares: list[list[float]] = field(default_factory=list)
     """Success before and after each shot."""
@@ -109,7 +112,7 @@ class _Seeds:
 
 
 def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
-    """By class, or suite if there are several studies, and arm: the best first, lines of ``ladder/`` last."""
+    """Group results by class (or by suite if there are several studies) and arm: best first, lines of ladders last."""
     found: dict[tuple[str, str], _Seeds] = {}
 
     def rows(study: Study, classes: dict[str, list[float]]) -> dict[str, list[float]]:
@@ -142,12 +145,12 @@ def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
 
 
 def _gain(part: dict[str, Any], name: str) -> Estimate:
-    """The gain of the return."""
+    """Return the gain of the return."""
     return Estimate(**part["gain"]["classes"][name]["return"])
 
 
 def _over(gain: Estimate, control: Estimate) -> Estimate:
-    """The difference of two gains that were measured independently."""
+    """Return the difference of two gains that were measured independently."""
     value = gain.value - control.value
     if gain.interval is None or control.interval is None:
         return Estimate(value, None)
@@ -162,7 +165,7 @@ def _both(part: dict[str, Any], name: str, measure: str, factor: float = 1.0, un
 
 
 def _bold(found: Estimate) -> str:
-    """In bold where the interval excludes zero."""
+    """Format an estimate, in bold if its interval excludes zero."""
     value, space, ends = found.text(form="+.3g").partition(" ")
     sure = found.interval is not None and (found.interval[0] > 0 or found.interval[1] < 0)
     return f"**{value}**{space}{ends}" if sure else value + space + ends

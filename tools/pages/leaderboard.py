@@ -1,4 +1,4 @@
-"""The leaderboard's tables, from the entries in ``leaderboard/`` beside the folder of data."""
+"""Tables of the leaderboard, from the entries in ``leaderboard/`` next to the folder of data."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,7 @@ from tools.pages.tables import table
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
     """Yield a row for each entry of a suite in its present version, best first.
 
-    Each has the probability that it is above the row below it.
+    Each row has the probability that its entry is better than the entry of the next row.
     """
     entries = {path: read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))}
     check_apart(entries)

@@ -22,7 +22,7 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 
 
 def offline_table(study: Study) -> Iterator[str]:
-    """Data sets by learners: score as mean over seeds (least to most) and mean success.
+    """Yield a table of data sets by learners: score as mean over seeds (least to most), and mean success.
 
     Args:
         study: Runs on data sets; its online runs are the experts.
@@ -57,12 +57,12 @@ def offline_table(study: Study) -> Iterator[str]:
 
 
 def _kind(names: Sequence[str]) -> str:
-    """Kind of data of a run: ``medium`` for ``HandOver/medium-v0``."""
+    """Return the kind of data of a run: ``medium`` for ``HandOver/medium-v0``."""
     return " + ".join(name.rpartition("/")[2].rpartition("-v")[0] or name for name in names)
 
 
 def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[float, float] | None:
-    """Mean returns of uniform actions and of the experts; None without experts."""
+    """Return the mean returns of uniform actions and of the experts; None without experts."""
     random = [run.evaluation()["random"] for run in runs if "random" in run.evaluation()]
     if not experts or not random:
         return None
@@ -85,7 +85,7 @@ def _mean(runs: Sequence[StoredRun], name: str) -> float:
 
 
 def _of(found: dict[str, Any], name: str) -> float:
-    """Mean over the classes of an evaluation; NaN if a class has no value."""
+    """Return the mean over the classes of an evaluation; NaN if a class has no value."""
     return float(np.mean(np.array([row.get(name) for row in classes_of(found).values()], dtype=float)))
 
 

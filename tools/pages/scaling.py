@@ -14,7 +14,7 @@ from tools.pages.tables import mean_and_range, random_rows, table
 
 
 def rows_table(study: Study) -> Iterator[str]:
-    """Environments by learners: the evaluation's return, mean over seeds (least to most).
+    """Yield a table of environments by learners: the evaluation's return, as mean over seeds (least to most).
 
     Args:
         study: Runs on one class.
@@ -38,7 +38,7 @@ def rows_table(study: Study) -> Iterator[str]:
 
 
 def rows_figure(study: Study) -> Any:
-    """Return over training: one panel per learner, one line per number of environments.
+    """Draw the return over training: one panel per learner, one line per number of environments.
 
     Raises:
         BidexError: As for ``rows_table``, or matplotlib is missing.
@@ -50,7 +50,7 @@ def rows_figure(study: Study) -> Any:
 
 
 def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
-    """Runs by learner and number of environments."""
+    """Group runs by learner and number of environments."""
     cells: dict[tuple[str, int], list[StoredRun]] = {}
     for run in study.runs:
         config = run.config()

@@ -38,14 +38,14 @@ class Arm:
 
     @cached_property
     def others(self) -> np.ndarray | None:
-        """Success on other tasks of its classes (seeds, classes), as ``group.success``; None if a run has not any."""
+        """Success on other tasks of the classes (seeds, classes), as ``group.success``; None if a run lacks a value."""
         rows = [run.evaluation().get("other_tasks", {}).get("policy", {}).get("classes", {}) for run in self.runs]
         by_seed = [[row.get(name, {}).get("success") for name in self.group.classes] for row in rows]
         return None if any(None in row for row in by_seed) else np.array(by_seed)
 
     @property
     def parameters(self) -> int | None:
-        """Number of learned parameters of its policy; None if unknown."""
+        """Number of learned parameters of the arm's policy; None if unknown."""
         counts = {run.content["parameters"] for run in self.runs}
         return counts.pop() if len(counts) == 1 else None
 
@@ -65,7 +65,7 @@ class Study:
 
     @cached_property
     def arms(self) -> list[Arm]:
-        """Its arms, the best first.
+        """Arms of the study, the best first.
 
         Raises:
             BidexError: Runs of an arm differ in more than the seed, or do not cover the same classes.
@@ -79,7 +79,7 @@ class Study:
         return sorted(arms, key=lambda arm: -arm.success.value)
 
     def _only(self, group: Group) -> Group:
-        """The classes of ``split`` of a meta-test, without its suffix."""
+        """Keep only the classes of a meta-test's ``split``, and strip the split's suffix from their names."""
         ending = f" ({self.split})"
         if self.split is None:
             return group
@@ -94,20 +94,20 @@ class Study:
 
     @property
     def ladders(self) -> list[Path]:
-        """Files ``STUDY-ladder-*.json`` beside its own (:mod:`tools.ladder`)."""
+        """Files ``STUDY-ladder-*.json`` next to the study's file (:mod:`tools.ladder`)."""
         return sorted(self.runs[0].path.parent.glob(f"{self.name}-ladder-*.json"))
 
     @property
     def classes(self) -> list[str]:
-        """All classes of its arms."""
+        """All classes of the study's arms."""
         return list(dict.fromkeys(name for arm in self.arms for name in arm.group.classes))
 
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:
-    """Return the studies in ``data/name.json``: one for each set of classes; none if there is no such file.
+    """Return the studies in ``data/name.json``, one for each set of classes; [] if there is no such file.
 
-    Suites with the same classes, such as one with other discounts, are one study. Runs on single classes join a suite's
-    study if an arm covers all its classes, and otherwise are one study per class.
+    Suites with the same classes, such as a suite with other discounts, form one study. Runs on single classes join a
+    suite's study if an arm covers all classes of the suite; otherwise they form one study per class.
 
     Args:
         data: Folder of the studies' files.
@@ -136,7 +136,7 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
 
 
 def digest_of(studies: Sequence[Study]) -> str:
-    """Return the digest of all data that their pictures show."""
+    """Return the digest of all data that the studies' pictures show."""
     found = hashlib.sha256()
     for study in studies:
         found.update(json.dumps([run.content for run in study.runs]).encode())
@@ -146,12 +146,12 @@ def digest_of(studies: Sequence[Study]) -> str:
 
 
 def curves_figure(study: Study) -> Any:
-    """Learning curves, one line per arm."""
+    """Draw learning curves, one line per arm."""
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 
 
 def _subject(runs: Sequence[StoredRun]) -> str:
-    """The suite or class; among several suites with the same classes the shipped one."""
+    """Return the suite or class of the runs; among several suites with the same classes, the shipped suite."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
     if not suites:
         return short_name(str(runs[0].config().task)).rpartition("/")[2]
@@ -159,13 +159,13 @@ def _subject(runs: Sequence[StoredRun]) -> str:
 
 
 def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
-    """The classes of all runs that share a run's arm and seed."""
+    """Return the classes of all runs that share a run's arm and seed."""
     same = [other for other in runs if (other.arm, other.config().seed) == (run.arm, run.config().seed)]
     return frozenset(str(other.config().task) for other in same)
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
-    """Refuses seeds of an arm whose shared config entries differ (versions may know more or fewer entries)."""
+    """Raise BidexError if shared config entries of an arm's seeds differ (versions may have more or fewer entries)."""
     for run in runs[1:]:
         same = next(known for known in runs if known.config().task == run.config().task)
         first, other = flat(same.content["config"]), flat(run.content["config"])

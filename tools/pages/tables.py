@@ -34,20 +34,20 @@ _BEST = (
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines of Markdown."""
+    """Yield the Markdown lines of a table."""
     yield _row(head)
     yield "|" + "---|" * len(head)
     yield from map(_row, rows)
 
 
 def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str:
-    """``mean (least to most)`` of the values (seeds,); a single seed's value alone."""
+    """Format values (seeds,) as ``mean (least to most)``, or a single seed's value."""
     ends = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
     return f"{values.mean():{form}}{unit}{ends}"
 
 
 def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
-    """Results of uniform actions by class, from each evaluation that has them."""
+    """Collect the results of uniform actions by class, from each evaluation that has such results."""
     found: dict[str, list[dict[str, float]]] = {}
     for run in study.runs:
         for name, row in run.evaluation().get("random", {"classes": {}})["classes"].items():
@@ -56,7 +56,7 @@ def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
 
 
 def arms_table(study: Study) -> Iterator[str]:
-    """One row per arm, then one for uniform actions. Means over classes where arms have played other tasks too."""
+    """Yield one row per arm, then one for uniform actions; means over classes if arms have played other tasks too."""
     classes = study.classes if len(study.classes) <= _FEW else []
     means_only = any(arm.others is not None for arm in study.arms)
     measures = ["success, mean", "other tasks, mean"] if means_only else ["success, IQM", "score, IQM"]
@@ -83,12 +83,12 @@ def arms_table(study: Study) -> Iterator[str]:
 
 
 def _over_seeds(success: np.ndarray | None) -> str:
-    """Success (seeds, classes) as the mean over all and its range over seeds."""
+    """Format success (seeds, classes) as the mean over all, and the range over seeds."""
     return "–" if success is None else mean_and_range(100.0 * success.mean(axis=1), ".1f", " %")
 
 
 def classes_table(study: Study) -> Iterator[str]:
-    """Success and return per class: mean over seeds (least to most). Many classes are rows, few are columns."""
+    """Yield success and return per class, as mean over seeds (least to most); many classes are rows, few columns."""
     if len(study.classes) > _MANY:
         return _classes_as_rows(study)
 
@@ -104,7 +104,7 @@ def classes_table(study: Study) -> Iterator[str]:
 
 
 def _classes_as_rows(study: Study) -> Iterator[str]:
-    """One row per class, then their mean; of each arm success on its tasks and on others, return and score."""
+    """Yield one row per class, then the mean: for each arm success on own and other tasks, return and score."""
     columns: dict[str, list[str]] = {"class": [*study.classes, "mean"]}
     for arm in study.arms:
         group, before = arm.group, f"{arm.group.label}: " if len(study.arms) > 1 else ""
@@ -122,9 +122,9 @@ def _classes_as_rows(study: Study) -> Iterator[str]:
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
-    """One row per class, in MT20's order: the run with the highest success, ties broken by return.
+    """Yield one row per class, in MT20's order: the run with the highest success, ties broken by return.
 
-    The run is not named in the rows when there is only one. Columns without any number are left out.
+    If there is only one run, the rows do not name it. Columns without any number are left out.
     """
     found: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
     for run in (run for study in studies for run in study.runs):
@@ -156,7 +156,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
 
 
 def references_table() -> Iterator[str]:
-    """One row per class: return and success of untrained policies; the expert and its source."""
+    """Yield one row per class: return and success of untrained policies; the expert and its source."""
     played, expert = [load(kind) for kind in _PLAYED], load("expert")
     measures = [f"{who}: {what}" for who in _PLAYED.values() for what in ("return", "success")]
     rows = []

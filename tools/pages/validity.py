@@ -1,4 +1,4 @@
-"""Tables of what ``bidex-meta validity`` measured."""
+"""Tables of the results of ``bidex-meta validity``."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ _SHARES = {
 
 
 def validity_table(suite: str, data: Path) -> list[str]:
-    """The table of a suite from ``validity/SUITE.json`` beside the folder of data; last row: the mean of classes."""
+    """Return a suite's table from ``validity/SUITE.json`` next to the folder of data; the last row is the mean."""
     file = data.parent / "validity" / f"{suite}.json"
     if not file.is_file():
         raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
@@ -36,7 +36,7 @@ def validity_table(suite: str, data: Path) -> list[str]:
 
 
 def _aligned(row: dict[str, Any]) -> tuple[str, str]:
-    """Rank correlation; mean return of successful episodes beside the most that a policy gets that always fails."""
+    """Format the rank correlation, and the mean return of successes versus the most that a failing policy gets."""
     found = row["alignment"]
     return ("", "") if found is None else (f"{found['rank']:.2f}", f"{found['solved']:.4g} / {found['unsolved']:.4g}")
 

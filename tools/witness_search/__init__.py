@@ -1,1 +1,1 @@
-"""The search for witnesses: actions that solve a task, found by planners on its printed reward, or by a script."""
+"""Search for witnesses: actions that solve a task, found by planners on the printed reward, or by a script."""

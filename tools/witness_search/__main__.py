@@ -1,4 +1,4 @@
-"""``python -m tools.witness_search``: searches actions that solve a task; ``bidex-meta witness`` replays them."""
+"""``python -m tools.witness_search``: search for actions that solve a task; ``bidex-meta witness`` replays them."""
 
 import sys
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from tools.witness_search.whole import searched
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """What every search is given, and where it keeps its episode."""
+    """Arguments of every search, and the storage of its episode."""
 
     task: str
     """Task class."""
@@ -32,12 +32,12 @@ class Search:
     """Threads of the physics; None: one per core."""
 
     def keep(self, actions: np.ndarray, made: dict[str, Any], above: float = -float("inf")) -> Replay:
-        """Replays an episode (T, action_size), prints what it reaches, and stores it.
+        """Replay an episode (T, action_size), print the result, and store the episode.
 
         Args:
-            actions: Of the episode.
-            made: How it was found.
-            above: Return that one which does not hold must exceed to be stored.
+            actions: Actions of the episode.
+            made: Facts about how the episode was found.
+            above: Return that an episode that does not hold must exceed to be stored.
         """
         result = replay(self.task, Witness(actions, {}), self.threads)
         print(
@@ -64,7 +64,7 @@ class Plan(Search):
     """The planner."""
 
     def run(self) -> None:
-        """Searches with one seed after another until an episode holds."""
+        """Search with one seed after another until an episode holds."""
         earlier = None if self.improve is None else load_witness(self.task, self.improve)
         rivals: list[float] = []
         best = -float("inf")
@@ -82,7 +82,7 @@ class Plan(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Improvement(Search):
-    """What a search that begins with an episode is given."""
+    """Arguments of a search that begins with an episode."""
 
     improve: Path
     """File of the episode to begin with."""
@@ -97,7 +97,7 @@ class Steady(Improvement):
     """Make an episode succeed from more shifted starts, with softer blows, by small changes."""
 
     def run(self) -> None:
-        """Changes the episode for so many rounds."""
+        """Change the episode for the given number of rounds."""
         earlier = load_witness(self.task, self.improve)
         actions = steadied(self.task, earlier.actions, self.rounds, self.seed, self.threads)
         self.keep(actions, earlier.made | {"steadied": {"rounds": self.rounds, "seed": self.seed}})
@@ -108,7 +108,7 @@ class Whole(Improvement):
     """Search whole episodes instead of plans that look some steps ahead."""
 
     def run(self) -> None:
-        """Searches for so many rounds; the last round's best counts."""
+        """Search for the given number of rounds; keep the best episode of the last round."""
         earlier = load_witness(self.task, self.improve)
         actions = searched(self.task, earlier.actions, self.rounds, self.seed, self.threads)
         how = {"rounds": self.rounds, "seed": self.seed, "began_with": earlier.made}
@@ -120,7 +120,7 @@ class Script(Search):
     """Play the class's script (bidex_meta/witness/scripts/) in sixteen slightly shifted copies of the start."""
 
     def run(self) -> None:
-        """Plays the script once."""
+        """Play the script once."""
         simulator = Simulator(self.task, 16, self.threads)
         play = script_of(simulator.task)
         simulator.load(simulator.starts(15, seed=7))
@@ -129,7 +129,7 @@ class Script(Search):
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the search that the command line names."""
+    """Run the search that the command line names."""
     search = tyro.cli(Plan | Steady | Whole | Script, args=arguments, description=__doc__, prog="tools.witness_search")
     try:
         search.run()

@@ -1,4 +1,4 @@
-"""Changed copies of good plans: what a search tries beside draws around its mean."""
+"""Changed copies of good plans, which a search tries in addition to draws around the mean."""
 
 import torch
 from torch import Tensor
@@ -10,19 +10,20 @@ FINEST = 0.05
 
 
 def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: torch.Generator) -> Tensor:
-    """So many elites with some of their knots changed, (count, K, a).
+    """Return ``count`` elites with some of their knots changed, (count, K, a).
 
-    Half of them take the left hand's actions from another elite, since what one hand does well seldom depends on the
-    other. Half of them change a few actions, wherever they are, half one part of the hands, so that a grip can be
-    carried somewhere and a base stays while its fingers close. Half change a random half of their knots, each by
-    itself, half every knot from some time on by the same amount.
+    Half of the mutants take the left hand's actions from another elite, because good actions of one hand seldom depend
+    on the other hand. Half of the mutants change a few actions anywhere; the other half change one part of the hands,
+    so that a grip can be carried somewhere, or a base stays while its fingers close. Half of the mutants change a
+    random half of their knots, each independently; the other half change every knot from some time on by the same
+    amount.
 
     Args:
         elites: Plans to change, (E, K, a).
-        count: How many mutants.
+        count: Number of mutants.
         std: Standard deviation of the coarsest changes.
-        mutated: Share of the actions that change where not one part of the hands does.
-        generator: Of the draws.
+        mutated: Share of the actions that change in mutants that do not change one part of the hands.
+        generator: Generator of the draws.
     """
 
     def uniform(*shape: int) -> Tensor:
@@ -42,7 +43,7 @@ def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: t
 
 
 def parts_of_the_hands(size: int) -> Tensor:
-    """Masks of actions, bool (parts, size): each hand's fingers; each base's force and torque; both bases' forces."""
+    """Return masks of actions, bool (parts, size): fingers per hand; force and torque per base; both bases' forces."""
     joints, one = len(hand().control_low), size // 2
     place = torch.arange(size)
     finger, force = place % one < joints, (place % one >= joints) & (place % one < joints + 3)

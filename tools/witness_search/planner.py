@@ -1,7 +1,8 @@
 """A sampling planner: the cross-entropy method over knots in time, with a receding horizon, on the printed reward.
 
-From the present state it samples action sequences, keeps the best as elites, moves mean and deviation towards them, and
-after some rounds plays the first steps of the best sequence; the rest warm-starts the next plan.
+From the present state the planner samples action sequences, keeps the best sequences as elites, and moves mean and
+standard deviation towards the elites. After some rounds the planner plays the first steps of the best sequence; the
+rest warm-starts the next plan.
 """
 
 from dataclasses import dataclass
@@ -64,7 +65,7 @@ class PlannerConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a search found."""
+    """Result of a search."""
 
     actions: np.ndarray
     """Actions of the whole episode, (T, action_size), multiples of 1/127."""
@@ -105,13 +106,13 @@ class Planner:
         self._of_bases = ~parts_of_the_hands(self.simulator.action_size)[:2].any(0)
 
     def search(self, earlier: np.ndarray | None = None) -> Plan:
-        """Plays one episode, planning as it goes, and prints what has been reached after every plan.
+        """Play one episode with replanning, and print the return so far after every plan.
 
         Args:
-            earlier: Actions (T, action_size) of an earlier search: every plan also tries what they did at that time.
+            earlier: Actions (T, action_size) of an earlier search: every plan also tries these actions at their time.
         """
         cfg, sim = self.config, self.simulator
-        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not those of the replay
+        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
         if earlier is not None:
             mean = knots_of(earlier, 0, cfg)
@@ -145,13 +146,13 @@ class Planner:
         return Plan(played, np.array(rewards), first, max(rivals, default=None))
 
     def _plan(self, states: list[State], mean: Tensor, elites: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The new mean of the knots (K, a); the best sequences seen, best first, (E, K, a); those without success."""
+        """Return the new mean of the knots (K, a), the best sequences, best first, (E, K, a), and unsuccessful ones."""
         cfg = self.config
         knots, order, won = elites, torch.arange(len(elites)), torch.zeros(len(elites), dtype=torch.bool)
         std = torch.full_like(mean, cfg.std)
         for _ in range(rounds):
             knots = self._sample(mean, std, elites)
-            # Each sequence meets one copy of the state, drawn anew every round.
+            # Each sequence starts from one copy of the state; every round draws the copies again.
             knots = knots[torch.randperm(len(knots), generator=self._generator)]
             scores, won = self._try(states, knots)
             order = scores.argsort(descending=True)
@@ -165,9 +166,9 @@ class Planner:
         return mean, elites, knots[order[~won[order]]][:RIVALS]
 
     def _try(self, states: list[State], knots: Tensor) -> tuple[Tensor, Tensor]:
-        """Score (samples,) of sequences, equal shares of them played from each state, and who succeeds.
+        """Play sequences, equal shares of them from each state; return their scores (samples,) and successes.
 
-        The score is the discounted sum of reward less effort.
+        The score is the discounted sum of reward minus effort.
         """
         self.simulator.load(states)
         actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
@@ -177,9 +178,9 @@ class Planner:
         return (discount[:, None] * (trace.rewards - effort)).sum(0), trace.success.any(0)
 
     def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
-        """What is still to come of the episode's reward if these sequences (n, K, a) are played, the last action held.
+        """Return the remaining reward of the episode for sequences (n, K, a) that end without success.
 
-        Only of those that end without success.
+        The last action of a sequence is held to the end.
         """
         sim, rest = self._judge, self.simulator.episode_steps - played
         if not len(knots):
@@ -191,20 +192,20 @@ class Planner:
         return trace.rewards.sum(0)[~trace.success.any(0)].tolist()
 
     def _sample(self, mean: Tensor, std: Tensor, elites: Tensor) -> Tensor:
-        """Knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
+        """Return knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
         cfg, random = self.config, self._generator
         changed = mutants(elites, round(cfg.mutants * cfg.samples), cfg.std, cfg.mutated, random)
         count = cfg.samples - len(changed)
         scale = FINEST ** torch.rand(count, 1, 1, generator=random)
         drawn = mean + std * scale * torch.randn(count, *mean.shape, generator=random)
         knots = torch.cat((changed, drawn))
-        # What is kept goes first, so that the best sequence of a round never falls behind that of the round before.
+        # Kept sequences go first, so that the best sequence of a round is never worse than in the round before.
         kept = torch.cat((elites, mean[None]))[: cfg.samples]
         knots[: len(kept)] = kept
         return knots.clamp(-1.0, 1.0)
 
     def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], Trace]:
-        """Plays actions (T, a) in every copy; the states it leads to and what happened, a row for each copy."""
+        """Play actions (T, a) in every copy; return the resulting states and the trace, a row per copy."""
         sim = self.simulator
         sim.load(states)
         trace = sim.play(actions[:, None].expand(-1, sim.num, -1))
@@ -214,13 +215,13 @@ class Planner:
 
 
 def interpolation(horizon: int, knots: int) -> Tensor:
-    """Weights (horizon, knots) of linear interpolation; the first knot is the first step, the last one the last."""
+    """Return weights (horizon, knots) of linear interpolation; the first knot is the first step, the last the last."""
     place = torch.linspace(0.0, knots - 1.0, horizon)
     return (1.0 - (place[:, None] - torch.arange(knots)).abs()).clamp(min=0.0)
 
 
 def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
-    """The knots (K, a) of a plan of which so many steps have been played; the last value is held."""
+    """Return the knots (K, a) of a plan after ``steps`` steps have been played; the last value is held."""
     place = torch.linspace(0.0, horizon - 1.0, len(knots)) + steps
     weights = (1.0 - (place[:, None] * (len(knots) - 1) / (horizon - 1) - torch.arange(len(knots))).abs()).clamp(
         min=0.0
@@ -231,6 +232,6 @@ def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
 
 
 def knots_of(actions: np.ndarray, start: int, config: PlannerConfig) -> Tensor:
-    """The knots (K, a) of a plan that plays actions (T, a) from some step on; the last one is held."""
+    """Return the knots (K, a) of a plan that plays actions (T, a) from step ``start`` on; the last action is held."""
     steps = start + torch.linspace(0.0, config.horizon - 1.0, config.knots).round().long()
     return torch.from_numpy(actions)[steps.clamp(max=len(actions) - 1)]

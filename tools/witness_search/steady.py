@@ -1,9 +1,9 @@
-"""Small changes to an episode that make it succeed from more shifted starts, and with softer blows.
+"""Make small changes to an episode so that it succeeds from more shifted starts, and with softer contacts.
 
-The planner looks at reward alone: an episode that solves its task may fail when its start is moved by 0.1 mm, or drive
-a finger deep into an egg when it is caught. Here whole episodes are changed, played from several shifted starts, and
-kept if more of them succeed, longer, at a higher return, with fewer deep contacts. The shifted starts are not those of
-the replay.
+The planner considers only reward: an episode that solves its task may fail when its start is moved by 0.1 mm, or may
+drive a finger deep into an egg during a catch. Here whole episodes are changed and played from several shifted starts.
+A change is kept if more of the starts succeed, for longer, at a higher return, with fewer deep contacts. The shifted
+starts are not the starts of the replay.
 """
 
 import numpy as np
@@ -25,13 +25,13 @@ _BLOW = 3.0
 
 
 def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
-    """The best episode found, (T, action_size), multiples of 1/127; prints what each round's best reaches.
+    """Return the best episode, (T, action_size), in multiples of 1/127; print the result of each round's best episode.
 
     Args:
         name: The class.
         actions: The episode to begin with, (T, action_size).
         rounds: Rounds of twelve changes, each played from ten shifted starts.
-        seed: Of changes and starts.
+        seed: Seed of changes and starts.
         threads: Engine threads; None takes all CPUs.
     """
     simulator = Simulator(name, _STARTS * _CHANGES, threads)

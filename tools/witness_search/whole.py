@@ -1,8 +1,8 @@
-"""The cross-entropy method over whole episodes, from an earlier one: for what a receding horizon gives up too early.
+"""The cross-entropy method over whole episodes, starting from an earlier episode.
 
-In TwoCatchUnderarm one egg that is caught pays more than both in the air, so a plan of forty steps keeps the other.
-Here an episode is judged to its end, by its return and by the least of the reward's terms, which one egg alone does
-not raise.
+It solves tasks on which a receding horizon gives up too early. In TwoCatchUnderarm one caught egg earns more reward
+than two eggs in the air, so a plan of forty steps does not throw the other egg. Here a whole episode is scored, by its
+return and by the least of the reward's terms, which a single egg does not raise.
 """
 
 import numpy as np
@@ -22,13 +22,13 @@ _SUCCESS, _LASTING = 5.0, 0.2
 
 
 def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
-    """The best episode of the last round, (T, action_size), multiples of 1/127; prints what each round's best reaches.
+    """Return the last round's best episode, (T, action_size), in multiples of 1/127; print each round's best result.
 
     Args:
         name: The class.
         actions: The episode to begin with, (T, action_size); its last action is held.
         rounds: Rounds of 256 episodes, in turns from the start and from one that is shifted.
-        seed: Of changes and of the shifted start.
+        seed: Seed of changes and of the shifted start.
         threads: Engine threads; None takes all CPUs.
     """
     simulator, generator = Simulator(name, _SAMPLES, threads), torch.Generator().manual_seed(seed)
@@ -63,7 +63,7 @@ def _worth(trace: Trace) -> Tensor:
 
 
 def _tries(mean: Tensor, std: Tensor, elites: Tensor, generator: torch.Generator) -> Tensor:
-    """Knots to try (samples, K, a): the elites, mutants of them, draws around the mean."""
+    """Return knots to try (samples, K, a): the elites, mutants of the elites, draws around the mean."""
     knots, size = mean.shape
     count = _SAMPLES - len(elites)
     scale = torch.logspace(0.0, -1.3, count)[:, None, None]
@@ -74,7 +74,7 @@ def _tries(mean: Tensor, std: Tensor, elites: Tensor, generator: torch.Generator
 
 
 def _mutants(parents: Tensor, generator: torch.Generator) -> Tensor:
-    """Parents (n, K, a), each changed in some of its actions for a while."""
+    """Return parents (n, K, a), each changed in some of its actions for some time."""
     count, knots, size = parents.shape
 
     def uniform(*shape: int) -> Tensor:
