@@ -31,7 +31,7 @@ class _Partition:
 
 
 def partition_line(agents: Agents) -> str:
-    """A partition as one line: a name of :data:`NAMED`, or agents with their units, which ``agent_views`` checks.
+    """Return a partition as one line: a name of :data:`NAMED`, or agents with units, which ``agent_views`` checks.
 
     Raises BidexError for a file that cannot be read or has no agents.
     """
@@ -46,7 +46,7 @@ def partition_line(agents: Agents) -> str:
 
 
 def units_by_agent(line: str) -> dict[str, list[str]]:
-    """The units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
+    """Return the units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
     found: dict[str, list[str]] = {}
     for part in line.split(";"):
         name, equals, units = (each.strip() for each in part.partition("="))
