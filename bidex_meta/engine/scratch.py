@@ -13,7 +13,8 @@ class Scratch:
     an allocation adds no node if enough memory of its size was allocated before the recording.
 
     Kernels that were launched or recorded earlier may still read returned memory. So users must launch all work
-    on one stream, on which the next user of the memory runs later, and must keep this object as long as the graphs. Arrays that live on are safe: they keep their memory and this object until Python frees them.
+    on one stream, on which the next user of the memory runs later, and must keep this object as long as the graphs.
+    Arrays that live on are safe: they keep their memory and this object until Python frees them.
     """
 
     def __init__(self, device: wp.Device) -> None:
