@@ -123,7 +123,7 @@ class CpuEngine(Engine):
         return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        if self._poses is None:  # each field that is bound is copied out after every step
+        if self._poses is None:  # every bound field is copied out after every step
             self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
         return self._poses
 

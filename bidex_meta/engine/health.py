@@ -10,14 +10,14 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 
 LARGEST = 1e6
-"""Bound of positions (m, rad) and velocities (m/s, rad/s), far from what healthy rows reach (hands/README.md). All
-else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
+"""Bound of positions (m, rad) and velocities (m/s, rad/s), far above the values of healthy rows (hands/README.md).
+Forces, accelerations, controls and time are bounded by MuJoCo's own 1e10."""
 SHORTEST, LONGEST = 1e-3, 1e3  # bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
 STATE = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),
 )
-"""What a simulation carries from one step to the next; the fields that a model has none of are skipped."""
+"""The state that a simulation carries from one step to the next; fields that a model lacks are skipped."""
 
 
 def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:

@@ -45,9 +45,9 @@ class Lean:
         if self.integration is None:
             mjw.step(model, d)
             return
-        if not model.ntendon:  # else the forward dynamics do it
+        if not model.ntendon:  # otherwise the forward dynamics compute tendons
             mjw.tendon(self.whole, d)
-        if model.callback.passive is not self.whole.callback.passive:  # ours; it puts gravity back
+        if model.callback.passive is not self.whole.callback.passive:  # our callback switches gravity on again
             model.opt.disableflags |= int(mjw.DisableBit.GRAVITY)
         mjw.forward(model, d)
         if self.solver is None:

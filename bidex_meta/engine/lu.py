@@ -77,7 +77,7 @@ class ImplicitSolver:
             ancestors = columns[rows[i] : rows[i] + diagonal[i]].tolist()
             updates += [(place[j, i], place[i, k], place[j, k]) for j in ancestors for k in ancestors]
             first.append(len(updates))
-        by_level = np.argsort(diagonal, kind="stable")  # of an ancestor fewer are above
+        by_level = np.argsort(diagonal, kind="stable")  # an ancestor has fewer ancestors
         levels = np.searchsorted(diagonal[by_level], np.arange(diagonal.max() + 2))
         arrays = (rows, diagonal, columns, first, np.reshape(updates, (-1, 3)), levels, by_level)
         self._arrays = [wp.array(np.asarray(a, dtype=np.int32), dtype=int, device=m.D_colind.device) for a in arrays]

@@ -46,7 +46,7 @@ def _rounded(values: np.ndarray) -> bytes:
 
 
 # Numbers that mujoco_warp 4.0 keeps per world (arrays of its Model with a first dimension "*"); the C engine takes a
-# whole model per simulation and is freer, but both engines shall group alike.
+# whole model per simulation and is freer, but both engines must group models in the same way.
 _PER_WORLD_FIELDS = """
     qpos0 qpos_spring
     body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia body_invweight0 body_gravcomp
@@ -62,7 +62,7 @@ _PER_WORLD_FIELDS = """
     actuator_lengthrange
 """
 _PER_WORLD = frozenset(_PER_WORLD_FIELDS.split())
-# Names, pictures, and numbers that follow from those above.
+# Names, pictures, and numbers that are derived from the fields above.
 _FREE_PREFIXES = ("name", "light_", "cam_", "mat_", "tex_", "vis", "bvh_", "site_rgba")
 _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 

@@ -29,7 +29,7 @@ class Engine(Protocol):
     xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
     sensordata: Tensor  # shape (num, nsensordata)
     _state: dict[str, Tensor]  # views of what a state holds
-    _mocap: list[Tensor]  # positions and quaternions of fixtures that may stand elsewhere, or nothing
+    _mocap: list[Tensor]  # positions and quaternions of movable fixtures, or empty
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advance all simulations, or those of the mask ``active`` (num,), and refresh their sensors.
@@ -93,4 +93,4 @@ class Engine(Protocol):
 
 
 EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int], Capacity], Engine]
-"""Makes an engine of models of equal structure, for each simulation the index of its model, and room for contacts."""
+"""Makes an engine from models of equal structure, the model index of each simulation, and the room for contacts."""

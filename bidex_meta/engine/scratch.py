@@ -32,7 +32,7 @@ class Scratch:
         """Return a pointer to memory that nobody else uses."""
         if self._free[size_in_bytes]:
             return self._free[size_in_bytes].pop()
-        if self._device.is_capturing:  # nothing but Warp's own allocators may be asked now
+        if self._device.is_capturing:  # only Warp's own allocators may allocate now
             return self._warp.allocate(size_in_bytes)
         memory = torch.empty(size_in_bytes, dtype=torch.uint8, device=wp.device_to_torch(self._device))
         self._memory[memory.data_ptr()] = memory

@@ -72,7 +72,7 @@ class WarpEngine(Engine):
             self._bind()
             self._substeps, self._scratch = 1, Scratch(self._device)
             with self._from_scratch():
-                self._advance()  # compiles all kernels and asks for memory, which a capture must not do
+                self._advance()  # compiles all kernels and allocates memory, which a capture must not do
                 self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
@@ -110,7 +110,7 @@ class WarpEngine(Engine):
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """Step all simulations; those outside the mask take the same time but keep their state."""
+        """Step all simulations; simulations outside the mask take the same time but keep their state."""
         kept = [] if active is None else [value.clone() for value in self._stepped]
         self._substeps = substeps
         self._play(f"step {substeps}", self._advance)
@@ -150,7 +150,7 @@ class WarpEngine(Engine):
         with self._on_device():
             for name in names:
                 field = getattr(self._m, name, None)
-                if field is None:  # bounding volumes, of which it has none
+                if field is None:  # mujoco_warp has no bounding volumes
                     continue
                 if len(field) != self.num:
                     field = wp.array(np.repeat(field.numpy(), self.num, axis=0), dtype=field.dtype)
@@ -279,7 +279,9 @@ def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
     # C has a separate routine for two boxes with up to eight contacts. So has mujoco_warp with this flag (which
     # has no other effect there); without it, boxes go through the convex collider, which gives four.
     model.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it has none, and refuses the flag
+    model.opt.disableflags &= ~int(
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    )  # mujoco_warp has no autoreset and refuses the flag
     return model
 
 

@@ -12,7 +12,7 @@ from bidex_meta.utils import paths
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 """Fingers in the order of Table 7."""
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
-"""The hand's centre of mass in the mount frame at zero pose, metres: where a moving base is driven
+"""The hand's centre of mass in the mount frame at zero pose, metres: the point at which a moving base is driven
 (docs/figures.md, base)."""
 LINEAR_DAMPING, ANGULAR_DAMPING = (501.0, 501.0, 501.0), (2.60, 2.65, 1.12)
 """Damping of a moving base, N s/m, and about its own axes, N m s/rad: the hand's 5.011 kg and inertia times the
@@ -62,12 +62,12 @@ def hand() -> Hand:
 
 
 SIDES = ("right", "left")
-"""Both hands are the same right-hand model; the order is that of every table."""
+"""Both hands use the same right-hand model; every table has this order."""
 
 RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
-"""Contact bits. Geoms of one hand never meet by bits (its 18 listed pairs do); every other two kinds do,
-save fixtures among themselves. INNER is what an object's file calls a geom that no table can meet before another of the
-object does, so that tables need not look for it."""
+"""Contact bits. Geoms of one hand never collide by bits (only by its 18 listed pairs), nor do fixtures with each
+other; all other kinds collide. An object's file marks a geom INNER if a table always touches another geom of the object
+first, so that tables need not test it."""
 _ALL = RIGHT | LEFT | OBJECT
 _COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: _ALL, FIXTURE: _ALL, INNER: _ALL | INNER}
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}

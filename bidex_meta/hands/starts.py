@@ -33,16 +33,16 @@ _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Where on a link's centre line its distance to a box is measured, from its joint on."""
+"""Positions on a link's centre line, from its joint on, at which its distance to a box is measured."""
 _SLACK = 0.002
-"""Overlap left at a start, metres: contacts carry the object from the first step; 5 mm would be allowed."""
+"""Overlap left at a start, metres, so that contacts carry the object from the first step; 5 mm is allowed."""
 _MAX_CROSSING = 0.1
 """Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
 roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
 
 
 _Support = Callable[[Tensor, Tensor], Tensor]
-"""How far a body reaches against vectors (n, ..., 3) of these lengths (n, ...), from its origin, metres."""
+"""Extent of a body from its origin against vectors (n, ..., 3) of the given lengths (n, ...), metres."""
 
 
 @dataclass(frozen=True)

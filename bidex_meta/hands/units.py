@@ -16,7 +16,7 @@ from bidex_meta.utils.files import expanded, read_toml
 from bidex_meta.utils.validation import Text, parse
 
 UNITS: dict[str, str] = {"palm": "WR", "first": "FF", "middle": "MF", "ring": "RF", "little": "LF", "thumb": "TH"}
-"""The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base where it
+"""The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base if it
 moves."""
 NAMED = ("single", "hands", "fingers")
 """Partitions that need no list."""

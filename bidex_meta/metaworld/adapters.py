@@ -23,7 +23,7 @@ from bidex_meta.utils.validation import real_numbers, true_or_false
 from bidex_meta.world.contract import Info, Options, PooledWorld
 
 MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
-"""The six entries of Meta-World's own, for agents that unpack them."""
+"""The six entries of Meta-World's own Timestep, for agents that unpack it."""
 
 
 class ForMetaWorld:
@@ -66,7 +66,7 @@ class ForMetaWorld:
     def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, Info]:
         """Return exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
         obs = self._tensor(observations)
-        if self._begins:  # Meta-World resets the environments here, and does not say so
+        if self._begins:  # Meta-World resets the environments here without calling reset
             self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
             self._begins = False
         action, outputs = checked_outputs(self._agent, self._agent.adapt_action(obs))
@@ -78,7 +78,7 @@ class ForMetaWorld:
         tensors = [self._tensor(value) for value in (obs, action, reward, terminated, truncated)]
         outputs = {k: self._tensor(v) if isinstance(v, np.ndarray) else v for k, v in outputs.items()}
         self._agent.step(Timestep._make([*tensors, outputs, None, None]))
-        self.reset(np.logical_or(terminated, truncated))  # these go on with their next episodes
+        self.reset(np.logical_or(terminated, truncated))  # ended environments start their next episodes
 
     def adapt(self) -> None:
         """Learn from the transitions since the last ``adapt`` or ``init``."""

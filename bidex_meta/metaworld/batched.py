@@ -31,7 +31,7 @@ class MetaWorldWorld(ForeignWorld):
     """A suite of Meta-World's on the CPU, a key of ``suite.METAWORLD_SUITES``: a world whose slots are the classes.
 
     Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are its "v2" in
-    [0, 10]; an episode is 500 steps, ended by the time limit alone. Starts are part of Meta-World's tasks: an episode
+    [0, 10]; an episode is 500 steps, ended only by the time limit. Starts are part of Meta-World's tasks: an episode
     depends only on its task and actions. A task's variation is its number among the class's fifty. ``seed`` chooses
     Meta-World's tasks, and the draws of tasks until ``reset(seed=...)``; other keywords are those of ``World``.
     Raises BidexError for an unknown suite or mode, for fewer environments than classes, or if Meta-World is not

@@ -48,7 +48,7 @@ def _library() -> ModuleType:
     return library
 
 
-@functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
+@functools.lru_cache(maxsize=8)  # drawing tasks resets each class 50 times, which takes seconds
 def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     """Return Meta-World's 50 tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
 

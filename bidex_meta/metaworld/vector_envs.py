@@ -199,7 +199,7 @@ def make_env(
     if use_one_hot:
         if env_id is None or num_tasks is None:
             raise BidexError("use_one_hot: expected env_id and num_tasks with it, got none. Give both.")
-        with warnings.catch_warnings(action="ignore"):  # its space is made of float64 bounds
+        with warnings.catch_warnings(action="ignore"):  # Meta-World's space has float64 bounds
             env = wrappers.OneHotWrapper(env, env_id, num_tasks)
     if recurrent_info_in_obs:
         env = wrappers.RNNBasedMetaRLWrapper(env, normalize_reward=normalize_reward_in_recurrent_info)

@@ -19,7 +19,7 @@ Json = dict[str, Any]  # an object of JSON
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Call ``write`` on a temporary file beside ``path``, force it to the disk and rename it over ``path``."""
+    """Call ``write`` on a temporary file next to ``path``, force it to the disk and rename it over ``path``."""
     temporary = temporary_name(path)
     try:
         with temporary.open("xb") as file:

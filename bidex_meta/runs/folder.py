@@ -33,11 +33,11 @@ from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 from bidex_meta.utils.validation import Whole
 
-AnyConfig = RunConfig[Any]  # A run's config, its learner's settings in whichever form
+AnyConfig = RunConfig[Any]  # A run's config, with its learner's settings in any form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
-"""In a run folder before its first iteration has ended, beside TensorBoard's file."""
+"""Entries of a run folder before the end of its first iteration, apart from TensorBoard's file."""
 _EVENTS = "events.out.tfevents."
-_MOST_LOOKED_AT = 2000  # entries that are looked at to find runs below a folder that is none
+_MOST_LOOKED_AT = 2000  # entries that are searched for runs below a folder that is no run
 
 
 class _Part:
@@ -75,10 +75,10 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         folder = cls(path)
         for part in (folder.checkpoints_path, folder.videos_path):
-            part.mkdir(exist_ok=True)  # there where a start was killed before its config stood
+            part.mkdir(exist_ok=True)  # exists if a start was killed before its config was written
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
-        write_json(folder.config_path, config.to_json())  # last: a folder with a config.json is a complete one
+        write_json(folder.config_path, config.to_json())  # last, because a folder with a config.json counts as complete
         return folder
 
     @classmethod
@@ -98,7 +98,7 @@ class RunFolder:
     metrics_path = _Part("metrics.jsonl")
     checkpoints_path = _Part("checkpoints")
     videos_path = _Part("videos")
-    evaluation_path = _Part("evaluation.json")  # when it has ended and was evaluated
+    evaluation_path = _Part("evaluation.json")  # exists after the run has ended and was evaluated
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -176,7 +176,7 @@ class RunFolder:
                     message = message or f"Another process trains in {self.path}. Wait for its end, or stop it."
                     raise BidexError(message) from None
                 except OSError:
-                    pass  # a network's file system may lock no folders
+                    pass  # a network file system may not lock folders
             yield
         finally:
             os.close(handle)
@@ -228,7 +228,7 @@ def _new_folder(config: AnyConfig, root: Path) -> Path:
     path, count = base, 1
     while True:
         try:
-            path.mkdir()  # fails where it exists, so two runs started in one second never share a folder
+            path.mkdir()  # fails if it exists, so two runs started in one second never share a folder
             return path
         except FileExistsError:
             count += 1

@@ -16,7 +16,7 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
 from bidex_meta.utils.validation import Whole
 
-_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; a line an iteration is some kilobytes
+_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; one iteration writes a line of a few kilobytes
 _TAIL = 65_536
 
 
@@ -40,7 +40,7 @@ class MetricsWriter:
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
-        self._file.flush()  # into the hands of the system: a killed process loses no line
+        self._file.flush()  # to the operating system, so that a killed process loses no line
         self.writer.scalars(values, step)
 
     def flush(self) -> None:
@@ -68,7 +68,7 @@ def last_rows(path: Path) -> list[Json]:
     with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         rows = [_row(line) for line in file.read().split(b"\n") if line.strip()]
-    return [row for row in rows if row is not None]  # a first one that was cut in two cannot be read
+    return [row for row in rows if row is not None]  # the first line may be cut and is then unreadable
 
 
 @checked_arguments

@@ -15,7 +15,7 @@ from bidex_meta.runs.atomic import Json, write_atomic
 from bidex_meta.runs.schemas import check_evaluation
 from bidex_meta.utils.files import exists, read_json
 
-Figure = Any  # matplotlib's, which is not imported where nothing is drawn
+Figure = Any  # matplotlib's, which is only imported for drawing
 Axes = Any
 
 
@@ -29,16 +29,16 @@ class Curve:
     high: np.ndarray | None  # upper end
 
 
-Group = tuple[str, Mapping[str, Curve]]  # runs that are drawn in one colour: their label, and curves by tag
-Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval where it is known
+Group = tuple[str, Mapping[str, Curve]]  # runs drawn in one colour: a label, and curves by tag
+Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval if known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
 _STYLES = ("-", "--")
-_FEW = 60  # evaluations up to which each is a dot: more of them would hide the dashes
+_FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
-_MILLIONS = (1e6, _STEPS)  # of an axis: what is counted as one, and what it is called
+_MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
@@ -115,7 +115,7 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
 def draw_adaptation(evaluation: Json, where: object) -> Figure:
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError where ``evaluation`` (of evaluation.json or
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if ``evaluation`` (of evaluation.json or
     of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names the source in messages) holds no meta-test.
     """
     splits = evaluation.get("splits") if isinstance(evaluation, dict) else None
@@ -153,7 +153,7 @@ def _draw_shots(axis: Axes, rows: list[Json], measure: str, colour: str | None) 
 
 
 def _matplotlib() -> Any:
-    import_module("matplotlib.figure")  # only where something is drawn: it takes half a second
+    import_module("matplotlib.figure")  # imported only for drawing, because it takes half a second
     return import_module("matplotlib")
 
 

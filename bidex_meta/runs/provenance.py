@@ -18,7 +18,7 @@ _WORLD = ("physics", "suite_version", "suite_digest")
 _ENGINES = ("mujoco", "mujoco-warp", "metaworld")
 Value = str | int
 Subject = tuple[str | None, ...]
-"""What runs are trained on: two runs of one subject have the same worlds, if nobody has changed these."""
+"""The subject that runs are trained on: two runs of one subject have the same worlds, if nobody changed the worlds."""
 
 
 class Difference(NamedTuple):
@@ -101,7 +101,7 @@ def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
     names = [*engines, *(name.replace("_", " ") for name in _WORLD)]
     yield from ((name, trained[name]) for name in names if name in trained)
     if run.evaluated:
-        with suppress(BidexError):  # of an evaluation that cannot be read; who needs it says so
+        with suppress(BidexError):  # an unreadable evaluation is reported by the code that needs it
             evaluated = _values(run.evaluation().get("conditions", {}))
             yield from ((f"evaluated with {name}", evaluated[name]) for name in names if name in evaluated)
 

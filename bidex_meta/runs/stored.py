@@ -8,7 +8,7 @@
                "evaluation": {...}},
      ...}
 
-``python -m tools.collect`` of the repository writes such files. :func:`open_runs` reads them and run folders alike.
+``python -m tools.collect`` of the repository writes study files. :func:`open_runs` reads study files and run folders.
 """
 
 import json
@@ -27,7 +27,7 @@ from bidex_meta.runs.schemas import check_evaluation, check_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
-FORMAT = 1  # of a run in these files; raised where an older reader would misread it
+FORMAT = 1  # of a run in these files; increased if an older reader would misread it
 
 
 class _Content(TypedDict):

@@ -13,7 +13,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
-"""Endings of films, and the media types that web pages know them by."""
+"""Suffixes of films, and their media types on web pages."""
 SUFFIXES = (".png", *FILMS)
 LABEL = 20
 """Height of a name under a tile, pixels."""

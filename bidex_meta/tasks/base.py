@@ -61,17 +61,17 @@ class Solver:
 
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
-"""For eggs, held for a second: what creeps by a millimetre a second does no harm."""
+"""For eggs, held for a second: creeping by a millimetre per second does no harm."""
 GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
 """For an egg that is thrown across a narrow gap, so that nothing is fast."""
 FIRM = Solver(100, 50)
-"""For light bodies between hands and table: with the common caps the solver stops early and kicks them."""
+"""For light bodies between hands and table, which the solver would kick by stopping early at the common limits."""
 FAST = Solver(100, 50, time_step=1.0 / 180.0)
-"""For fast bases among things that do not yield: in 1/120 s a hand at full speed sinks 24 mm into a table."""
+"""For fast bases near rigid objects: in 1/120 s a hand at full speed sinks 24 mm into a table."""
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
-"""For fast bases that press things as thin as a finger on a table."""
+"""For fast bases that press objects as thin as a finger on a table."""
 JITTER, JOINT_NOISE = 0.005, 0.1
-"""Of jittered starts: half width of a fixture's shift, metres, and joint noise as a share of each joint's range."""
+"""Half width of a fixture's shift in jittered starts, metres, and joint noise as a share of each joint's range."""
 
 
 class TaskClass(ABC):
@@ -83,7 +83,7 @@ class TaskClass(ABC):
         name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: what it asks for, one line.
         formula: The printed reward; ``solved``: when it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
-        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, where that takes longer.
+        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, if it takes longer.
         right: Start pose of the right hand; ``left`` of the left one.
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
@@ -91,19 +91,19 @@ class TaskClass(ABC):
         wide_space: The same with wide variation; None: a class without version 2.
         wide_solved: ``solved`` with wide variation.
         wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
-        jittered_hands: Hands that jittered starts give joint noise, where ``start`` gives none.
+        jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
-        rules: Those of the suite; ``adopt`` sets them.
+        rules: The suite's rules; ``adopt`` sets them.
         chosen: Options of the constructor by name, given or by default; ``registry.get`` sets them.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
-            class says (fixed for HandOver alone).
+            class says (fixed only for HandOver).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
             by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
             largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
-        camera_angle: Azimuth and elevation of that look, degrees, such that hands, objects and goal are seen.
+        camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
     """

@@ -50,7 +50,7 @@ class GraspAndPlace(ReachTask):
     """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
 
     Table 1 x 1 m, 60 cm high. Observation: the original's (425; docs/figures.md, observation). Reward: its formula with
-    hand-point distances. The original's success, d < 20 cm, is met by a block beside the bucket. A task shifts and
+    hand-point distances. The original's success, d < 20 cm, is met by a block next to the bucket. A task shifts and
     turns bucket and block. Both start on the table; the original's start inside it. Bucket pose and bucket link have
     one orientation here, so entries 401-404 and 414-417 are equal.
     """
@@ -138,11 +138,11 @@ def _bucket_ghosts(state: TaskState) -> list[Ghost]:
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _SINK, _DEEPEST = 5.0, 0.2
-"""How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
-most, metres."""
+"""Metres that the goal sinks for each metre that the bucket is lifted, and its largest depth below the mouth of a
+standing bucket, metres."""
 _TROUGH_TILT = 0.541
 _TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
-"""Of the box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
+"""The box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
 
@@ -242,7 +242,7 @@ class PourWater(ReachTask):
         i = torch.arange(self.water, device=like.device)
         middle = 0.5 * (_SIDE - 1)
         x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
-        z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest 0.5 mm above the floor
+        z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest drops start 0.5 mm above the floor
         return torch.stack((x, y, z), dim=1).to(like.dtype)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ from bidex_meta.tasks.variation import component, join, orientation
 from bidex_meta.utils.maths import constant, multiply, norm, rotate, rotation_angle, wxyz, xyzw
 
 _RED, _BLUE = (0.85, 0.43, 0.30), (0.24, 0.52, 0.74)
-"""Colours of the first cube and of the second, which has that of its file."""
+"""Colours of the first cube and of the second cube, which keeps its file's colour."""
 _EDGE, _HALF = 0.05, (0.025, 0.025, 0.025)
 """Edge of a cube and its half sizes, metres."""
 _RODS = (
@@ -167,7 +167,7 @@ class StackBlock(_TwoBlocks):
         placed("block1"), placed("block2"), *(component(f"target_{axis}", -0.03, 0.03) for axis in "xy")
     )
     wide_space = join(
-        placed("block1"),  # farther they would meet
+        placed("block1"),  # with larger shifts the blocks would touch
         placed("block2"),
         *(component(f"target_{axis}", -0.09, 0.09) for axis in "xy"),
         component("order", -1.0, 1.0),

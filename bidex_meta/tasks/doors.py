@@ -24,16 +24,16 @@ from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rota
 
 _BASE = (0.0, 0.0, 0.7)
 _HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
-"""Where the leaves turn, right and left, in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
+"""Hinges of the right and the left leaf in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
 _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
 """Centres of the panels in the leaves' frames, and their half sizes, metres."""
 _HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
-"""The hands' points in the leaves' frames, metres; of an Inward door at -x."""
+"""The hands' points in the leaves' frames, metres; at -x for an Inward door."""
 _POLE = (0.025, 0.025, 0.65)
 """Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
 _LEAST_SHARE = 0.1
-"""Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
-pushed against its stop, which yields, more than 0.5 m."""
+"""Least distance of each handle from the door's middle along y, metres. One leaf of an Inward door gives 0.497 m, and
+more than 0.5 m if it is pushed against its stop, which yields."""
 _SHUT_ANGLE = 0.1 * (0.5 * math.pi)
 _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
 
@@ -153,7 +153,7 @@ class _Open(_Door):
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
     wide_space = join(
-        component("base_y", -0.08, 0.08),  # farther the handles would start in the hands
+        component("base_y", -0.08, 0.08),  # with larger shifts the handles would start in the hands
         component("start_angle", 0.0, 0.15),
         *(component(f"{side}_angle", 0.3, 1.4) for side in SIDES),
     )
@@ -222,7 +222,7 @@ class DoorCloseInward(_Close):
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
     camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
-    wide_space = _closed_to(0.05)  # farther the leaves would start in the hands
+    wide_space = _closed_to(0.05)  # with larger angles the leaves would start in the hands
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
         """Return the panel of each leaf; an open leaf ends next to the fingertips of its hand."""

@@ -18,7 +18,7 @@ SHIFT, TURN = 0.03, 0.2617993877991494
 JITTER, JITTER_TURN = 0.005, 0.05
 """Half widths of an episode's additional shift, metres, and turn, radians."""
 DRAWS = 3
-"""Uniform numbers that an episode draws for an object that it jitters: x, y, turn."""
+"""Uniform numbers that an episode draws for each jittered object: x, y, turn."""
 
 
 @checked_arguments

@@ -98,7 +98,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
 
 
 def _outside(name: str) -> "type[TaskClass]":
-    from bidex_meta.tasks.base import TaskClass  # torch and mujoco: not where names are listed
+    from bidex_meta.tasks.base import TaskClass  # listing names must not import torch and mujoco
 
     found, _ = outside_class(name, "task")
     if not issubclass(found, TaskClass):

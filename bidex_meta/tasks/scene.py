@@ -22,7 +22,7 @@ Colour = tuple[Fraction, Fraction, Fraction, Fraction]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
-"""Gravity compensation with which an object falls by 9.81 m/s² where gravity, a millionth of that, points up."""
+"""Gravity compensation that makes an object fall at 9.81 m/s² although gravity, a millionth of it, points up."""
 
 
 @checked_arguments

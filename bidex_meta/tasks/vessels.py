@@ -93,16 +93,16 @@ class LiftUnderarm(OwnObjectClass):
 
 _TILT = 0.87
 _PALM_NORMAL = (math.sin(_TILT), 0.0, math.cos(_TILT))
-"""Out of the right palm at the start, world."""
+"""Normal of the right palm at the start, pointing out of the palm, world."""
 _LIFT, _AHEAD = 0.006, 0.015
-"""How far the bottle starts from the original's place, metres: along the palm's normal, since there it is in the hand,
-and along the fingers, so that it can be turned without meeting the thumb."""
+"""Shift of the bottle's start from the original's place, metres: along the palm's normal, because the original's place
+lies inside the hand, and along the fingers, so that the bottle can be turned without touching the thumb."""
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
 _DISC = (0.1, 0.1, 0.003)
 """Semi-axes of the goal in pictures, metres: a disc about the cap, wider than the hand."""
 _DROPPED = 0.25
-"""Height of the bottle below which it no longer lies in the hand, metres: half of where it starts."""
+"""Height below which the bottle no longer lies in the hand, metres: half of its start height."""
 
 
 class BottleCap(OwnObjectClass):
@@ -138,7 +138,7 @@ class BottleCap(OwnObjectClass):
     constant = 0.2
     camera_target = (0.0, -0.62, 0.52)
     variation_space = VariationSpace(("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -0.01, -TURN), (SHIFT, 0.0, TURN))
-    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # there is no room in the hand for more
+    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # the hand has no room for more
     wide_solved = "cap within 5 mm of where it shall stand out"
     wide_blocks = goal_blocks("goal")
     jittered_hands = ("left",)

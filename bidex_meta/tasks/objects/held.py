@@ -143,7 +143,7 @@ def held_object(name: object) -> HeldObject | None:
     try:
         state = os.stat(file)
     except (OSError, ValueError):
-        return _loaded(file, (0, 0))  # which says what is wrong
+        return _loaded(file, (0, 0))  # raises the error with the reason
     return _loaded(file.resolve(), (state.st_mtime_ns, state.st_size))
 
 

@@ -20,12 +20,12 @@ _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
 _MOST_TAGS, _DEEPEST = 2_000, 32
 _TAGS = {"mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"}
 _TAGS |= {"body", "inertial", "geom", "joint", "freejoint", "site"}
-"""What a file may hold; sensors may stand in a file that names points (``points=True``)."""
+"""Tags that a file may hold; a file that names points (``points=True``) may also hold sensors."""
 _SENSOR_TAGS = {"sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"}
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
-"""As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
+"""The values of the files under assets/objects, as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
-"""MuJoCo takes such numbers, and writes a log file into the working folder."""
+"""MuJoCo accepts numbers that are not finite, and writes a log file into the working folder."""
 _MOST_FRICTION = 5.0
 
 
@@ -143,8 +143,8 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
 
 
 _AROUND, _OVER = 12, 128
-"""Points around a cylinder's rim, which stand out by 3.5 % so that nothing of the rim does; directions in which an
-ellipsoid's and a mesh's outermost points are taken."""
+"""Number of points around a cylinder's rim, placed 3.5 % outside so that they enclose the rim; number of directions in
+which the outermost points of an ellipsoid or a mesh are taken."""
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 

@@ -20,11 +20,11 @@ from bidex_meta.utils import paths
 from bidex_meta.utils.files import absolute
 
 _MOST_MASS, _LARGEST, _MOST_GEOMS = 10.0, 0.6, 64
-"""kg; metres of the box around it; geoms that collide."""
+"""Limits of an object: mass, kg; size of the box around it, metres; number of colliding geoms."""
 _LEVEL = 0.003
-"""How far its foot may lie from the usual one's, metres: it starts at rest on the table."""
+"""Largest distance of an object's foot from the usual object's foot, metres, so that it starts at rest on the table."""
 _DEEPEST = 0.005
-"""How deep it may stick in hands or table at the start, metres, as for every class (docs/figures.md)."""
+"""Deepest penetration of hands or table at the start, metres, as for every class (docs/figures.md)."""
 
 
 @dataclass(frozen=True)
