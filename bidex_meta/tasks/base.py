@@ -104,7 +104,7 @@ class TaskClass(ABC):
             largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
-        depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
+        depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
             at ``camera_target`` from the front.
     """
 
