@@ -1,4 +1,4 @@
-"""Which engine a device gets."""
+"""The choice of an engine for a device."""
 
 import torch
 
@@ -13,7 +13,7 @@ ENGINES = ("auto", "c", "warp")
 def choose_engine(
     device: str | torch.device, engine: str = "auto", threads: int | None = None
 ) -> tuple[torch.device, EngineMaker]:
-    """The device and what makes engines there; ``threads`` are C MuJoCo's, None takes all CPUs.
+    """Return the device and its engine maker; ``threads`` are the threads of C MuJoCo, None takes all CPUs.
 
     ``engine`` "auto" is C MuJoCo on the CPU, mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing
     device, C MuJoCo on a GPU, or an impossible number of threads.
@@ -32,7 +32,7 @@ def choose_engine(
 
 
 def known_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name; BidexError unless it is the CPU or a CUDA device, which may be missing here."""
+    """Return the device of a name, which may be missing here; BidexError unless it is the CPU or a CUDA device."""
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError, ValueError):

@@ -19,7 +19,7 @@ from bidex_meta.engine.protocol import Engine
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
-# A full arena drops contacts or constraints in silence: as broken as a bad number.
+# A full arena drops contacts or constraints in silence, which is as bad as a number out of bounds.
 _TROUBLE = mujoco.mjtWarning.__members__
 _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")]
 
@@ -27,13 +27,13 @@ _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", 
 class CpuEngine(Engine):
     """Simulations of models of equal structure, in double precision. See ``Engine`` for the views.
 
-    Sensors are refreshed by a velocity stage after each step, which costs about a tenth of the speed but makes
+    A velocity stage after each step refreshes the sensors. The stage costs about a tenth of the speed but makes
     positions and velocities those of the new state; a persistent batch takes its next step from there. Without
-    ``refresh`` it is left out, as by ``mj_step``: what is no part of the state is then that before the last substep.
+    ``refresh`` the stage is left out, as in ``mj_step``: derived values are then from before the last substep.
 
-    A row with a number out of bounds is reported by ``unstable`` and put at rest at the model's reference pose, before
-    a step by ``_quarantine``, within it by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving for
-    their contacts takes up to thousands of times a normal step, for which all rows wait.
+    ``unstable`` reports a row with a number out of bounds. The row is put at rest at the model's reference pose, before
+    a step by ``_quarantine``, within a step by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving
+    for their contacts takes up to thousands of times as long as a normal step, while all rows wait.
     """
 
     device = torch.device("cpu")
@@ -42,7 +42,7 @@ class CpuEngine(Engine):
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Builds the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
+        """Build the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.
@@ -72,7 +72,7 @@ class CpuEngine(Engine):
 
     @property
     def batch(self) -> mujoco.batch.Batch:
-        """The simulations; BidexError where their threads stayed in the process that made it."""
+        """Return the batch of simulations; BidexError if its threads stayed in the process that made the batch."""
         if self._forked:
             raise BidexError(
                 "Expected a world in the process that made it, got one with engine threads in a forked child, where "
@@ -94,11 +94,11 @@ class CpuEngine(Engine):
         try:
             self.batch.step(ids=ids, nstep=substeps, stage=self._after_step)
         except mujoco.batch.SimulationError as error:
-            # A broken row can meet more contacts than its memory holds; it keeps its old state, the others are done.
+            # A broken row can have more contacts than its memory holds. It keeps its old state; other rows are stepped.
             self._failed[torch.as_tensor(error.ids)] = True
 
     def _quarantine(self) -> None:
-        """Puts rows with a number out of bounds, written by hand or left by the last step, on a safe state."""
+        """Put rows with a number out of bounds, written by hand or left by the last step, on a safe state."""
         # Few operations over all rows: a row whose norm is within the least bound is within all of them.
         size = torch.linalg.vector_norm(self._numbers, dim=1)
         turns = self._numbers.index_select(1, self._quaternions).unflatten(1, (-1, 4))
@@ -123,12 +123,12 @@ class CpuEngine(Engine):
         return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        if self._poses is None:  # each field that is bound is copied out after every step
+        if self._poses is None:  # every bound field is copied out after every step
             self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
         return self._poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """A row whose start is out of bounds stands at the reference pose and is unstable."""
+        """Reset rows; a row whose start is out of bounds stands at the reference pose and is unstable."""
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
@@ -143,7 +143,7 @@ class CpuEngine(Engine):
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Refreshes position and velocity sensors."""
+        """Restore a state, then refresh position and velocity sensors."""
         state = checked_state(state, self._state)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._failed[:] = False
@@ -152,7 +152,7 @@ class CpuEngine(Engine):
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
-        # A batch has either models or fields of its simulations' own: what the models differ in becomes such fields.
+        # A batch has either models or fields per simulation: fields in which the models differ become per-row fields.
         self.batch.set_models(None)
         differing = {name for model in self._models for name in differing_fields(self._models[0], model)}
         wanted, found = set(names), {}
@@ -173,7 +173,7 @@ class CpuEngine(Engine):
 
     def contact_depth(self, row: int) -> float:
         model = self._models[self._model_of[row]]
-        # The batch's copies of model and data would take forty times as long.
+        # Copying the batch's model and data would take forty times as long.
         data = self._probe = self._probe or mujoco.MjData(model)
         data.qpos[:] = self.qpos[row].numpy()
         if self._mocap:
@@ -188,7 +188,7 @@ _WITH_THREADS: "weakref.WeakSet[CpuEngine]" = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    """In a child: to step a batch, and even to free it, would wait without end for threads that stayed behind."""
+    """Mark batches in a child process: stepping or freeing one would wait forever for the parent's threads."""
     for engine in _WITH_THREADS:
         engine._forked = True
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine._batch))

@@ -1,4 +1,4 @@
-"""What a simulation's numbers may be, and what a saved state must be before it is put back."""
+"""Bounds of a simulation's numbers, and checks of a saved state before it is restored."""
 
 from collections.abc import Mapping
 
@@ -10,18 +10,18 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 
 LARGEST = 1e6
-"""Bound of positions (m, rad) and velocities (m/s, rad/s), far from what healthy rows reach (hands/README.md). All
-else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
+"""Bound of positions (m, rad) and velocities (m/s, rad/s), far above the values of healthy rows (hands/README.md).
+Forces, accelerations, controls and time are bounded by MuJoCo's own 1e10."""
 SHORTEST, LONGEST = 1e-3, 1e3  # bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
 STATE = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),
 )
-"""What a simulation carries from one step to the next; the fields that a model has none of are skipped."""
+"""The state that a simulation carries from one step to the next; fields that a model lacks are skipped."""
 
 
 def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
-    """Columns of ``qpos`` that hold a quaternion, four for each free and ball joint, shape (4 k,)."""
+    """Return the columns of ``qpos`` that hold a quaternion, four for each free and ball joint, shape (4 k,)."""
     kinds = np.asarray(model.jnt_type)
     free, ball = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
     first = np.concatenate((model.jnt_qposadr[kinds == free] + 3, model.jnt_qposadr[kinds == ball]))
@@ -29,9 +29,9 @@ def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
 
 
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The saved state of either engine, shaped as the fields (``views``) of the one that takes it.
+    """Return the saved state of either engine, shaped as the fields (``views``) of the receiving engine.
 
-    Raises BidexError for another model's or number of rows' state, or one with numbers that are not finite.
+    Raises BidexError for a state of another model or another number of rows, or with numbers that are not finite.
     """
     if not isinstance(state, Mapping) or set(state) != set(views):
         got = sorted(map(str, state)) if isinstance(state, Mapping) else type(state).__name__
@@ -40,12 +40,12 @@ def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tenso
 
 
 def dense(given: object, device: torch.device, dtype: torch.dtype | None = None) -> Tensor | None:
-    """A tensor, array or nested lists as a dense tensor on a device, without a gradient; ``dtype`` None keeps its own.
+    """Return a tensor, array or nested lists as a dense tensor on a device, detached; ``dtype`` None keeps the type.
 
-    None where it is no array of real numbers.
+    Returns None if the input is no array of real numbers.
     """
     try:
-        # In C's order: torch takes no array that is read backwards.
+        # C order, because torch does not accept arrays with negative strides.
         tensor = given.detach() if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, order="C"))
         usable = tensor.layout == torch.strided and not tensor.is_complex()
         return tensor.to(device=device, dtype=dtype) if usable else None
@@ -73,7 +73,7 @@ def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
 
 
 def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Which of some rows (indices, (k,)) hold a number that is not finite or out of bounds, bool (k,)."""
+    """Return whether each of some rows (indices, (k,)) has a number out of bounds or not finite, bool (k,)."""
     bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for name, value in fields.items():  # a comparison with NaN is false
         limit = LARGEST if name in ("qpos", "qvel", "mocap_pos", "mocap_quat") else float(mujoco.mjMAXVAL)

@@ -1,4 +1,4 @@
-"""The Warp engine's own kernels, one thread a world or a number of a world: health and its launches, starts, weight.
+"""The Warp engine's own kernels, one thread per world or per number of a world: health, starts, gravity.
 
 Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
 """
@@ -24,7 +24,7 @@ Wrenches = wp.array2d[wp.spatial_vector]
 
 @wp.kernel(enable_backward=False)
 def watch(qpos: Numbers, qvel: Numbers, qacc: Numbers, limit: float, limit_of_qacc: float, failed: Flags):
-    """Marks worlds with a number that is not finite or beyond its limit (a comparison with NaN is false)."""
+    """Mark worlds with a number that is not finite or beyond its limit (a comparison with NaN is false)."""
     world, i = wp.tid()
     if not (wp.abs(qpos[world, i]) <= limit):
         failed[world] = True
@@ -38,7 +38,7 @@ def examine(
     time: Times, warmstart: Numbers, ctrl: Numbers, qfrc_applied: Numbers, xfrc_applied: Wrenches, limit: float,
     failed: Flags
 ):  # fmt: skip
-    """Marks worlds whose time, controls, forces or warm start are not finite or beyond the limit."""
+    """Mark worlds whose time, controls, forces or warm start are not finite or beyond the limit."""
     world, i = wp.tid()
     if not (wp.abs(time[world]) <= limit):
         failed[world] = True
@@ -59,7 +59,7 @@ def examine_poses(
     qpos: Numbers, quaternions: wp.array[int], mocap_pos: Points, mocap_quat: Turns, limit: float, shortest: float,
     longest: float, failed: Flags
 ):  # fmt: skip
-    """Marks worlds with a fixture out of bounds, or a quaternion (four entries of qpos each) that is no rotation."""
+    """Mark worlds with a fixture out of bounds, or a quaternion (four entries of qpos each) that is no rotation."""
     world, i = wp.tid()
     if i < quaternions.shape[0]:
         k = quaternions[i]
@@ -74,7 +74,7 @@ def examine_poses(
 
 @wp.kernel(enable_backward=False)
 def quarantine(failed: Flags, qpos0: Numbers, qpos: Numbers, qvel: Numbers, warmstart: Numbers):
-    """Puts failed worlds at rest at the reference pose."""
+    """Put failed worlds at rest at the reference pose."""
     world, i = wp.tid()
     if failed[world]:
         qpos[world, i] = qpos0[world % qpos0.shape[0], i]
@@ -88,7 +88,7 @@ def disarm(
     failed: Flags, mocap_pos0: Points, mocap_quat0: Turns, time: Times, ctrl: Numbers, qfrc_applied: Numbers,
     xfrc_applied: Wrenches, mocap_pos: Points, mocap_quat: Turns
 ):  # fmt: skip
-    """Takes controls and forces from failed worlds, and puts their fixtures back."""
+    """Clear controls and forces of failed worlds, and put their fixtures back."""
     world, i = wp.tid()
     if not failed[world]:
         return
@@ -108,7 +108,7 @@ def disarm(
 def place(
     mask: Flags, start: Numbers, limit: float, qpos: Numbers, mocap_pos: Points, mocap_quat: Turns, failed: Flags
 ):
-    """Writes starts where the mask is true: ``qpos``, then position and quaternion of each mocap body.
+    """Write starts into the worlds whose mask entry is true: ``qpos``, then position and quaternion of each mocap body.
 
     A start with a bad number is not written: its world stays at the reference pose and counts as failed.
     """
@@ -127,7 +127,7 @@ def place(
     for i in range(mocap_pos.shape[1]):
         k = nq + 7 * i
         mocap_pos[world, i] = wp.vec3(start[world, k], start[world, k + 1], start[world, k + 2])
-        # Four numbers in MuJoCo's order, w first, whatever Warp calls them.
+        # Four numbers in MuJoCo's order, w first; Warp names them differently.
         mocap_quat[world, i] = wp.quat(
             start[world, k + 3], start[world, k + 4], start[world, k + 5], start[world, k + 6]
         )
@@ -138,7 +138,7 @@ def carry(
     gravity: wp.array[wp.vec3], root: wp.array[int], mass: Numbers, share: Numbers, moved: wp.array2d[int],
     bodies: wp.array[int], xipos: Points, subtree_com: Points, cdof: Wrenches, qfrc_passive: Numbers
 ):  # fmt: skip
-    """Adds the gravity compensation of the given bodies, of which ``share`` tells how much each has."""
+    """Add the gravity compensation of the given bodies; ``share`` is each body's compensated fraction."""
     world, dof = wp.tid()
     force = float(0.0)
     for i in range(bodies.shape[0]):
@@ -153,10 +153,10 @@ def carry(
 
 
 class Guard:
-    """Finds broken worlds and keeps them from harm. Nothing here waits for the device."""
+    """Detection and quarantine of broken worlds. Nothing here waits for the device."""
 
     def __init__(self, model: mujoco.MjModel, data: mjw.Data) -> None:
-        """Allocates on the current device; ``keep`` must follow before the first step."""
+        """Allocate on the current device; ``keep`` must follow before the first step."""
         self.failed = wp.zeros(data.nworld, dtype=bool)
         """Which worlds broke since their last reset, shape (num,), bool."""
         self._quaternions = wp.array(quaternion_columns(model)[::4].astype(np.int32), dtype=int)
@@ -166,12 +166,12 @@ class Guard:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.failed.device)
 
     def keep(self, data: mjw.Data) -> None:
-        """Remembers where the fixtures of all worlds stand; broken worlds get theirs back there."""
+        """Store the fixture poses of all worlds, to which the fixtures of broken worlds return."""
         for kept, now in zip(self._fixtures, (data.mocap_pos, data.mocap_quat), strict=True):
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Before a control step: marks worlds that were broken by hand where no substep would, and disarms them."""
+        """Mark and disarm, before a control step, worlds broken by hand in numbers that no substep checks."""
         applied = [d.ctrl, d.qfrc_applied, d.xfrc_applied]
         width, fixtures = max(array.shape[1] for array in applied), d.mocap_pos.shape[1]
         limit = float(mujoco.mjMAXVAL)
@@ -182,6 +182,6 @@ class Guard:
         self._launch(disarm, (d.nworld, max(width, fixtures)), [self.failed, *self._fixtures], outputs)
 
     def watch(self, m: mjw.Model, d: mjw.Data) -> None:
-        """Marks worlds with a bad number (mj_checkPos, Vel, Acc); puts marked ones at rest at the reference pose."""
+        """Mark worlds with a bad number (mj_checkPos, Vel, Acc); put marked worlds at rest at the reference pose."""
         self._launch(watch, d.qpos.shape, [d.qpos, d.qvel, d.qacc, LARGEST, float(mujoco.mjMAXVAL)], [self.failed])
         self._launch(quarantine, d.qpos.shape, [self.failed, m.qpos0], [d.qpos, d.qvel, d.qacc_warmstart])

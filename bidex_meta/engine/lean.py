@@ -1,8 +1,8 @@
-"""A substep on mujoco_warp without what does nothing for the model at hand.
+"""A substep on mujoco_warp without the kernels that have no effect on the given model.
 
-mujoco_warp launches a kernel for each feature that a model may use, whether or not it does. Nothing is launched over
-nothing, so copies of the model whose counts say zero leave such kernels out. The state is that of ``mjw.step``, bit for
-bit.
+mujoco_warp launches a kernel for each feature that a model may use, even if the model does not use it. A kernel over
+zero items is not launched, so copies of the model with counts of zero skip these kernels. The state
+equals the state after ``mjw.step``, bit for bit.
 """
 
 from collections.abc import Callable
@@ -21,15 +21,15 @@ _IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
 
 @dataclass
 class Lean:
-    """The model as parts of a control step see it; the copies share its arrays.
+    """Copies of the model for the parts of a control step; the copies share its arrays.
 
     Attributes:
-        whole: All of it.
-        early: For the forward dynamics of substeps but the last.
-        last: For those of the last substep, which gives the sensors of forces.
+        whole: The complete model.
+        early: For the forward dynamics of all substeps but the last.
+        last: For the forward dynamics of the last substep, which gives the force sensors.
         integration: For the implicit integration of all substeps, if any.
         refresh: For positions, velocities and their sensors after the last substep.
-        solver: Of the fully implicit integrator, if it is the model's.
+        solver: The solver of the fully implicit integrator, if the model uses it.
     """
 
     whole: mjw.Model
@@ -40,14 +40,14 @@ class Lean:
     solver: ImplicitSolver | None
 
     def step(self, d: mjw.Data, last: bool) -> None:
-        """``mjw.step``; sensors are computed by the last substep alone, those of forces only."""
+        """Run ``mjw.step``; only the last substep computes sensors, and only force sensors."""
         model = self.last if last else self.early
         if self.integration is None:
             mjw.step(model, d)
             return
-        if not model.ntendon:  # else the forward dynamics do it
+        if not model.ntendon:  # otherwise the forward dynamics compute tendons
             mjw.tendon(self.whole, d)
-        if model.callback.passive is not self.whole.callback.passive:  # ours; it puts gravity back
+        if model.callback.passive is not self.whole.callback.passive:  # our callback switches gravity on again
             model.opt.disableflags |= int(mjw.DisableBit.GRAVITY)
         mjw.forward(model, d)
         if self.solver is None:
@@ -57,26 +57,26 @@ class Lean:
 
 
 def lean(m: mjw.Model) -> Lean:
-    """Looks through the arrays of a model; they must not be given a feature later that they lack now."""
+    """Make lean copies of a model, whose arrays must not gain a feature later that they lack now."""
     implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
     none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
     early, last, integration, refresh = "early", "last", "integration", "refresh"
     everywhere = (early, last, integration, refresh)
-    # For which parts, what is left out, and whether that does nothing.
+    # Each entry: the parts, the counts set to zero, and whether that changes nothing.
     table: list[tuple[tuple[str, ...], dict[str, Any], bool]] = [
-        # Lights serve pictures alone.
+        # Lights only serve pictures.
         (everywhere, {"nlight": 0}, True),
-        # Limits and equalities read what mjw.tendon found, by lists of their own; all else would add zeros.
+        # Limits and equalities read the results of mjw.tendon by separate lists; all other kernels would add zeros.
         (everywhere, {"ntendon": 0, "nJten": 0}, implicit and _tendons_limit_only(m)),
         # Without friction of joints and tendons there are no rows.
         (everywhere, {"disable": mjw.DisableBit.FRICTIONLOSS}, not _any(m.dof_frictionloss, m.tendon_frictionloss)),
-        # mujoco_warp asks every body for its share of every degree of freedom; few bodies have one.
+        # mujoco_warp computes every body's share of every degree of freedom; few shares are not zero.
         ((early, last), {"callback": replace(m.callback, passive=_carrier(m))}, implicit and _gravity_apart(m)),
-        # Only the last substep's sensors are read, of which the refresh redoes those of positions and velocities.
+        # Only the last substep's sensors are read, and the refresh recomputes the position and velocity sensors.
         ((early,), {"disable": mjw.DisableBit.SENSOR}, True),
         ((early,), {"nsite": 0}, not _sites_act(m)),
         ((last,), {"sensor_pos_adr": none, "sensor_vel_adr": none}, True),
-        # The derivative of actuators' forces by velocity is zero, and no activation moves on.
+        # The derivative of the actuator forces by velocity is zero, and no activation changes.
         ((integration,), {"nactuator": 0}, not _actuators_damp(m)),
     ]
     parts: dict[str, mjw.Model] = dict.fromkeys(everywhere, m)
@@ -88,7 +88,7 @@ def lean(m: mjw.Model) -> Lean:
 
 
 def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
-    """What mujoco_warp calls at the end of passive forces, for which gravity was off and after which it must be on."""
+    """Return the callback that ends passive forces: gravity was off during them and is switched on again."""
     bodies = wp.array(np.flatnonzero(m.body_gravcomp.numpy().any(axis=0)), dtype=int, device=m.body_gravcomp.device)
     constants = [m.opt.gravity, m.body_rootid, m.body_mass, m.body_gravcomp, m.body_isdofancestor, bodies]
 
@@ -101,7 +101,7 @@ def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
 
 
 def _gravity_apart(m: mjw.Model) -> bool:
-    """Whether gravity compensation is the last of the passive forces, and they are computed at all."""
+    """Return whether passive forces are computed and gravity compensation is the last of them."""
     off = m.opt.disableflags
     none = mjw.DisableBit.SPRING | mjw.DisableBit.DAMPER
     last = not (m.has_fluid or m.flg_adhesion or _any(m.jnt_actgravcomp) or m.callback.passive)
@@ -117,20 +117,20 @@ def _any(*arrays: wp.array) -> bool:
 
 
 def _tendons_limit_only(m: mjw.Model) -> bool:
-    """Whether tendons are sums of joint positions, with no forces but those of limits and equalities."""
+    """Return whether tendons are sums of joint positions, with no forces but limit and equality forces."""
     forces = (m.tendon_stiffness, m.tendon_stiffnesspoly, m.tendon_damping, m.tendon_dampingpoly)
     driven = mjw.TrnType.TENDON in m.actuator_trntype.numpy()
     return m.wrap_jnt_adr.size == m.nwrap and not driven and not _any(*forces, m.tendon_armature, m.tendon_frictionloss)
 
 
 def _sites_act(m: mjw.Model) -> bool:
-    """Whether motion depends on where sites are: by actuators, equalities or tendons."""
+    """Return whether motion depends on site positions: by actuators, equalities or tendons."""
     by_joint = (mjw.TrnType.JOINT, mjw.TrnType.JOINTINPARENT, mjw.TrnType.TENDON)
     return not np.isin(m.actuator_trntype.numpy(), by_joint).all() or m.neq > 0 or m.wrap_jnt_adr.size < m.nwrap
 
 
 def _actuators_damp(m: mjw.Model) -> bool:
-    """Whether an actuator's force may depend on velocity or on an activation."""
+    """Return whether an actuator's force may depend on velocity or on an activation."""
     fixed = (m.actuator_gaintype.numpy() == mjw.GainType.FIXED).all()
     linear = np.isin(m.actuator_biastype.numpy(), (mjw.BiasType.NONE, mjw.BiasType.AFFINE)).all()
     return m.na > 0 or not (fixed and linear) or bool(m.actuator_biasprm.numpy()[..., 2].any())

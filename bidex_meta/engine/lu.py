@@ -1,7 +1,7 @@
-"""The implicit integrator's linear system, a warp of threads for each world (mujoco_warp: one thread).
+"""The implicit integrator's linear system, one warp of threads per world (mujoco_warp: one thread).
 
 The matrix has entries where one degree of freedom is the other's ancestor, or itself: mujoco_warp's D structure.
-Eliminating from the last one on fills none in. The numbers are mujoco_warp's, bit for bit.
+Eliminating from the last degree of freedom on fills no entry in. The results equal mujoco_warp's, bit for bit.
 """
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -20,7 +20,7 @@ Numbers = wp.array2d[float]
 
 @wp.func_native(snippet="WP_TILE_SYNC();")
 def _wait() -> None:
-    """Until all threads of the world are here."""
+    """Wait until all threads of the world are here."""
     ...
 
 
@@ -29,7 +29,7 @@ def _solve(
     lanes: int, rows: Indices, diagonal: Indices, columns: Indices, first_update: Indices, updates: wp.array2d[int],
     first_of_level: Indices, by_level: Indices, right: Numbers, lu: Numbers, x: Numbers
 ):  # fmt: skip
-    """Factorises ``lu`` in place and solves for ``x``; shapes (num, nD), (num, nv)."""
+    """Factorise ``lu`` in place and solve for ``x``; shapes (num, nD), (num, nv)."""
     world, lane = wp.tid()
     nv = diagonal.shape[0]
     for back in range(nv):
@@ -68,7 +68,7 @@ class ImplicitSolver:
     """``mjw.implicit`` of a model with the fully implicit integrator."""
 
     def __init__(self, m: mjw.Model) -> None:
-        """Lists what each elimination updates; arrays are on the model's device."""
+        """List the entries that each elimination updates; arrays are on the model's device."""
         starts, diagonal, columns = (a.numpy().astype(np.int32) for a in (m.D_rowadr, m.D_diag, m.D_colind))
         rows = np.append(starts, len(columns)).astype(np.int32)
         place = {(i, int(columns[k])): k for i in range(m.nv) for k in range(rows[i], rows[i + 1])}
@@ -77,19 +77,19 @@ class ImplicitSolver:
             ancestors = columns[rows[i] : rows[i] + diagonal[i]].tolist()
             updates += [(place[j, i], place[i, k], place[j, k]) for j in ancestors for k in ancestors]
             first.append(len(updates))
-        by_level = np.argsort(diagonal, kind="stable")  # of an ancestor fewer are above
+        by_level = np.argsort(diagonal, kind="stable")  # an ancestor has fewer ancestors
         levels = np.searchsorted(diagonal[by_level], np.arange(diagonal.max() + 2))
         arrays = (rows, diagonal, columns, first, np.reshape(updates, (-1, 3)), levels, by_level)
         self._arrays = [wp.array(np.asarray(a, dtype=np.int32), dtype=int, device=m.D_colind.device) for a in arrays]
 
     def solve(self, right: wp.array, lu: wp.array, x: wp.array) -> None:
-        """Factorises ``lu``, shape (num, nD), in place; ``x``, shape (num, nv), times it is ``right``."""
+        """Factorise ``lu``, shape (num, nD), in place, and solve ``lu x = right`` for ``x``, shape (num, nv)."""
         lanes = _LANES if lu.device.is_cuda else 1
         inputs = [lanes, *self._arrays, right]
         wp.launch(_solve, (lu.shape[0], lanes), inputs, [lu, x], device=lu.device, block_dim=lanes)
 
     def integrate(self, m: mjw.Model, d: mjw.Data) -> None:
-        """A step from the state and its accelerations; ``m`` may be a leaner copy of the model."""
+        """Advance one step from the state and its accelerations; ``m`` may be a leaner copy of the model."""
         forward.implicit_qlu(m, d)
         qacc = wp.empty((d.nworld, m.nv), dtype=float)
         self.solve(d.efc.Ma, d.qLU, qacc)

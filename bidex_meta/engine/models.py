@@ -1,4 +1,4 @@
-"""Compiled models beside each other: which may share one batch, and whose trajectories are comparable."""
+"""Comparison of compiled models: may they share one batch, and are their trajectories comparable?"""
 
 import hashlib
 import inspect
@@ -13,10 +13,10 @@ _LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
 
 
 def model_identity(model: mujoco.MjModel) -> str:
-    """Twelve hexadecimal digits of all options of the solver and all numbers of bodies, joints, geoms and actuators.
+    """Return 12 hexadecimal digits of all solver options and all numbers of bodies, joints, geoms and actuators.
 
     Names, looks and MuJoCo's version do not enter. Numbers enter with six digits, so that a processor that rounds the
-    compiler's sums otherwise gives the same.
+    compiler's sums differently gives the same digits.
     """
     digest = hashlib.sha256()
     numbers = {name: value for name, value in _members(model).items() if name.startswith(_PARTS)}
@@ -28,25 +28,25 @@ def model_identity(model: mujoco.MjModel) -> str:
 
 
 def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
-    """The same of several models, by name."""
+    """Return the common ``model_identity`` of several models, by name."""
     texts = [f"{name} {model_identity(models[name])}" for name in sorted(models)]
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 
 
 def _members(owner: object) -> dict[str, object]:
-    """Its attributes by name, sorted."""
+    """Return the attributes of an object by name, sorted."""
     return {name: value for name, value in inspect.getmembers(owner) if not name.startswith("_")}
 
 
 def _rounded(values: np.ndarray) -> bytes:
-    """The numbers with six digits, what is smaller than 1e-12 as zero."""
+    """Return the numbers rounded to six digits; numbers below 1e-12 become zero."""
     size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12)))
     unit = 10.0 ** (size - 5)
     return (np.where(np.abs(values) < 1e-12, 0.0, np.round(values / unit)) + 0.0).tobytes() + size.tobytes()
 
 
 # Numbers that mujoco_warp 4.0 keeps per world (arrays of its Model with a first dimension "*"); the C engine takes a
-# whole model per simulation and is freer, but both engines shall group alike.
+# whole model per simulation and is freer, but both engines must group models in the same way.
 _PER_WORLD_FIELDS = """
     qpos0 qpos_spring
     body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia body_invweight0 body_gravcomp
@@ -62,13 +62,13 @@ _PER_WORLD_FIELDS = """
     actuator_lengthrange
 """
 _PER_WORLD = frozenset(_PER_WORLD_FIELDS.split())
-# Names, pictures, and numbers that follow from those above.
+# Names, pictures, and numbers that are derived from the fields above.
 _FREE_PREFIXES = ("name", "light_", "cam_", "mat_", "tex_", "vis", "bvh_", "site_rgba")
 _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
-    """Names of the array fields in which two models differ."""
+    """Return the names of the array fields in which two models differ."""
     ours, theirs = (
         {n: value for n, value in _members(model).items() if isinstance(value, np.ndarray)} for model in (a, b)
     )
@@ -76,7 +76,7 @@ def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
 
 
 def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
-    """Whether two models differ only in numbers that may differ from row to row of one batch."""
+    """Return whether two models differ only in numbers that may differ from row to row of one batch."""
     return _sizes(a) == _sizes(b) and all(
         name in _PER_WORLD or name in _FREE or name.startswith(_FREE_PREFIXES) for name in differing_fields(a, b)
     )

@@ -1,4 +1,4 @@
-"""What the world asks of an engine."""
+"""The protocol between the world and an engine."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
@@ -14,8 +14,8 @@ class Engine(Protocol):
     """A batch of simulations of equal structure.
 
     The views are created once and stay; the world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
-    Whatever it writes, a step costs a broken row no more than others: it is looked for before each step (``health.py``)
-    and continues from the model's reference pose until its reset.
+    A broken row costs no more time than other rows, whatever the world writes: each step first looks for broken rows
+    (``health.py``). A broken row continues from the model's reference pose until its reset.
     """
 
     num: int
@@ -29,67 +29,68 @@ class Engine(Protocol):
     xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
     sensordata: Tensor  # shape (num, nsensordata)
     _state: dict[str, Tensor]  # views of what a state holds
-    _mocap: list[Tensor]  # positions and quaternions of fixtures that may stand elsewhere, or nothing
+    _mocap: list[Tensor]  # positions and quaternions of movable fixtures, or empty
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.
+        """Advance all simulations, or those of the mask ``active`` (num,), and refresh their sensors.
 
-        Sensors of positions and velocities then describe the new state; those of forces the last substep.
+        Position and velocity sensors then describe the new state; force sensors describe the last substep.
         """
 
     def placement(self) -> Tensor:
-        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        """Return a copy of every simulation's present placement, as ``reset`` takes it. Shape (num, nq + 7 nmocap)."""
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of all bodies, world frame.
+        """Return positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of bodies, world frame.
 
-        Of the state that sensors describe: views that each step writes anew.
+        Both are views of the state that the sensors describe; each step overwrites them.
         """
         ...
 
     def unstable(self) -> Tensor:
-        """Which broke (numbers out of bounds or not finite, no room for contacts) since their reset, bool (num,)."""
+        """Return which simulations broke since their reset (bad numbers or no room for contacts), bool (num,)."""
         ...
 
     def warnings(self) -> Tensor:
-        """How many kinds of trouble each simulation has reported since its last reset. Shape (num,), int64."""
+        """Return the number of kinds of warnings of each simulation since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Starts the simulations of a mask (num,), bool, anew.
+        """Restart the simulations of a mask (num,), bool.
 
-        ``start``: ``qpos``, then position and quaternion (w, x, y, z) of each fixture that may stand elsewhere from
-        task to task. One row for each true entry, (k, nq + 7 nmocap); where the engine is ``masked`` and must not count
-        them one for every simulation, of which those outside the mask are ignored.
+        ``start``: ``qpos``, then position and quaternion (w, x, y, z) of each fixture whose place differs from
+        task to task. It has one row for each true entry, (k, nq + 7 nmocap). If the engine is ``masked`` and must not
+        count them, it has one row for every simulation, and rows outside the mask are ignored.
         """
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything that decides the future of the simulations, copied."""
+        """Return a copy of everything that decides the future of the simulations."""
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores a ``state_dict``; BidexError for one of another model or number of rows, or not finite."""
+        """Restore a ``state_dict``; BidexError if its model or number of rows differs, or numbers are not finite."""
 
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
-        """Fields of the model that each simulation has for itself from now on: views (num, n, k) to write, by name.
+        """Give each simulation its own copy of some model fields: returns writable views (num, n, k), by name.
 
-        They hold what was; fields that the engine does not have are left out. What follows from them is the caller's.
+        The views hold the old values; fields that the engine does not have are left out. The caller updates
+        derived fields.
         """
         ...
 
     def model(self, row: int) -> mujoco.MjModel:
-        """The model of a simulation, for pictures and checks."""
+        """Return the model of a simulation, for pictures and checks."""
 
     def data(self, row: int) -> mujoco.MjData:
-        """A copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
+        """Return a copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
 
     def contact_depth(self, row: int) -> float:
-        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        """Return the deepest penetration among a simulation's contacts, metres, 0 without contact."""
         ...
 
 
 EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int], Capacity], Engine]
-"""Makes an engine of models of equal structure, for each simulation the index of its model, and room for contacts."""
+"""Makes an engine from models of equal structure, the model index of each simulation, and the room for contacts."""

@@ -1,4 +1,4 @@
-"""Memory for what a step on mujoco_warp makes and throws away, kept from one recording of a graph to the next."""
+"""Memory for the temporary arrays of a mujoco_warp step, kept from one graph recording to the next."""
 
 from collections import defaultdict
 
@@ -7,14 +7,14 @@ import warp as wp
 
 
 class Scratch:
-    """A memory allocator for Warp: what was given back is handed out again, by size.
+    """A memory allocator for Warp that reuses returned memory by size.
 
-    Each allocation of Warp's own in a recording becomes two nodes of the graph, about a hundred and fifty pairs a
-    control step. Here none does whose size was asked for before, outside a recording, as often as now at once.
+    In a recording each allocation of Warp's own becomes two nodes of the graph, about 150 pairs per control step. Here
+    an allocation adds no node if enough memory of its size was allocated before the recording.
 
-    What is given back may still be read by kernels that were launched, or recorded, before. So users must launch all
-    work on one stream, where whoever gets the memory next comes later, and must keep this as long as their graphs.
-    Arrays that live on are safe: they keep their memory, and this, until Python frees them.
+    Kernels that were launched or recorded earlier may still read returned memory. So users must launch all work
+    on one stream, on which the next user of the memory runs later, and must keep this object as long as the graphs.
+    Arrays that live on are safe: they keep their memory and this object until Python frees them.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -25,21 +25,21 @@ class Scratch:
 
     @property
     def size(self) -> int:
-        """Bytes kept, in use or not."""
+        """Return the number of bytes kept, in use or not."""
         return sum(len(memory) for memory in self._memory.values())
 
     def allocate(self, size_in_bytes: int) -> int:
-        """Returns a pointer to memory that nobody else uses."""
+        """Return a pointer to memory that nobody else uses."""
         if self._free[size_in_bytes]:
             return self._free[size_in_bytes].pop()
-        if self._device.is_capturing:  # nothing but Warp's own allocators may be asked now
+        if self._device.is_capturing:  # only Warp's own allocators may allocate now
             return self._warp.allocate(size_in_bytes)
         memory = torch.empty(size_in_bytes, dtype=torch.uint8, device=wp.device_to_torch(self._device))
         self._memory[memory.data_ptr()] = memory
         return memory.data_ptr()
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Takes memory back, at any time, also during a recording."""
+        """Take memory back, at any time, also during a recording."""
         if ptr in self._memory:
             self._free[size_in_bytes].append(ptr)
         else:

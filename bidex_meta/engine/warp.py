@@ -1,7 +1,7 @@
 """MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
 
-Different from C on purpose: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
-freedom), a solver tolerance of 1e-6 (its least), fixed room for contacts. Tests run it on the Warp CPU device.
+Deliberate differences from C: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
+freedom), a solver tolerance of 1e-6 (its minimum), fixed room for contacts. Tests use the Warp CPU device.
 """
 # ruff: noqa: D102 (``Engine`` says what the methods do)
 
@@ -28,11 +28,11 @@ from bidex_meta.engine.protocol import Engine
 from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
 
-# What a step changes and later steps or readers see.
+# The arrays that a step changes and that later steps or readers see.
 _STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
-# Bits of a world whose contacts or constraints were dropped. Meeting an iteration limit is no fault: C stops there too.
+# Bits of a world whose contacts or constraints were dropped. An iteration limit is no fault: C stops there too.
 _LOST = sum(int(mjw.OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD"))
-# Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would leave others behind the state.
+# Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would not update other sensors.
 _SENSOR_NAMES = (
     "JOINTPOS JOINTVEL JOINTACTFRC FRAMEPOS FRAMEQUAT FRAMEXAXIS FRAMEYAXIS FRAMEZAXIS FRAMELINVEL FRAMEANGVEL "
     "FORCE TORQUE TOUCH"
@@ -44,11 +44,11 @@ class WarpEngine(Engine):
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after changing the model otherwise. On CUDA they run on a stream of the engine's own,
-    between what torch's current stream was given before and after the call.
+    place, and call ``recapture`` after changing the model otherwise. On CUDA graphs run on the engine's own stream,
+    between the work that torch's current stream got before the call and the work it gets afterwards.
 
-    A world with a bad number is reported by ``unstable`` and stands at the model's reference pose until its reset: left
-    alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
+    ``unstable`` reports a world with a bad number. The world stands at the model's reference pose until its reset: left
+    running, its NaNs would pass every broadphase test and take the room that other worlds' contacts need.
     """
 
     masked = True
@@ -57,12 +57,12 @@ class WarpEngine(Engine):
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], capacity: Capacity,
         device: str | torch.device = "cpu"
     ) -> None:  # fmt: skip
-        """Puts the distinct models on the device and compiles the kernels; ``rows``: each simulation's model."""
+        """Put the distinct models on the device and compile the kernels; ``rows``: each simulation's model."""
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
         self.num, self.device = len(rows), torch.device(device)
         self._models, self._rows = list(models), list(rows)
         self._device = wp.get_device(str(self.device))
-        # Of torch's making: CUDA's legacy stream, torch's default, waits for streams of Warp's making.
+        # torch makes the stream: CUDA's legacy stream, torch's default, waits for streams that Warp makes.
         priority = -1 if _is_slow(models[0]) else 0
         self._lent = torch.cuda.Stream(self.device, priority=priority) if self._device.is_cuda else None
         self._stream = wp.stream_from_torch(self._lent) if self._lent is not None else None
@@ -72,7 +72,7 @@ class WarpEngine(Engine):
             self._bind()
             self._substeps, self._scratch = 1, Scratch(self._device)
             with self._from_scratch():
-                self._advance()  # compiles all kernels and asks for memory, which a capture must not do
+                self._advance()  # compiles all kernels and allocates memory, which a capture must not do
                 self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
@@ -86,7 +86,7 @@ class WarpEngine(Engine):
             raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(sorted(kinds))}.")
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
         self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
-        # Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with
+        # The normals of an egg's contacts differed from C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with
         # this one; with 1e-10 some contacts were lost.
         self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
@@ -110,7 +110,7 @@ class WarpEngine(Engine):
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """Simulations outside the mask take the time but keep their state."""
+        """Step all simulations; simulations outside the mask take the same time but keep their state."""
         kept = [] if active is None else [value.clone() for value in self._stepped]
         self._substeps = substeps
         self._play(f"step {substeps}", self._advance)
@@ -119,7 +119,7 @@ class WarpEngine(Engine):
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
-        """All worlds share one pool of contacts; when it is full, whose were lost is unknown: all are unstable."""
+        """Return which worlds broke: all of them if the shared contact pool is full, since any may have lost some."""
         lost = (self._overflow & _LOST) != 0
         return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
 
@@ -130,17 +130,17 @@ class WarpEngine(Engine):
         return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """A start with a non-finite number makes its simulation unstable.
+        """Reset simulations; a start with a non-finite number makes its simulation unstable.
 
-        Position and velocity sensors of all simulations are refreshed, which changes only those whose state was written
-        by hand since their last step.
+        The reset refreshes position and velocity sensors of all simulations. That changes only simulations whose state
+        was written by hand since their last step.
         """
         self._mask_view.copy_(mask)
         self._start_view.copy_(start)
         self._play("reset", self._begin)
 
     def recapture(self) -> None:
-        """Forgets the graphs; the next calls record new ones."""
+        """Discard the graphs; the next calls record new ones."""
         self._graphs.clear()
         with self._on_device():
             self._lean = lean(self._m)
@@ -150,7 +150,7 @@ class WarpEngine(Engine):
         with self._on_device():
             for name in names:
                 field = getattr(self._m, name, None)
-                if field is None:  # bounding volumes, of which it has none
+                if field is None:  # mujoco_warp has no bounding volumes
                     continue
                 if len(field) != self.num:
                     field = wp.array(np.repeat(field.numpy(), self.num, axis=0), dtype=field.dtype)
@@ -160,7 +160,7 @@ class WarpEngine(Engine):
         return found
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """The state may be of the C engine. Refreshes position and velocity sensors."""
+        """Restore a state, also of the C engine, and refresh position and velocity sensors."""
         state = checked_state(state, self._state)
         self._mask_view.fill_(True)
         self._play("reset", self._begin)
@@ -187,7 +187,7 @@ class WarpEngine(Engine):
         return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
 
     def demand(self) -> tuple[int, int]:
-        """Candidate pairs, and contacts that the convex collider found, of the state as it stands, over all worlds."""
+        """Return the candidate pairs and the convex collider's contacts in the present state, over all worlds."""
         self._play("position", lambda: mjw.fwd_position(self._m, self._d, factorize=False))
         d = self._d
         candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
@@ -197,7 +197,7 @@ class WarpEngine(Engine):
         return int(candidates[0]), int(convex.sum())
 
     def _advance(self) -> None:
-        """The substeps of a control step, then position and velocity sensors of the new state."""
+        """Run the substeps of a control step, then refresh position and velocity sensors."""
         m, d = self._m, self._d
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
@@ -207,7 +207,7 @@ class WarpEngine(Engine):
         self._refresh()
 
     def _refresh(self) -> None:
-        """Position and velocity sensors of the state as it stands; force sensors are left alone."""
+        """Compute position and velocity sensors of the present state; force sensors do not change."""
         m, d = self._lean.refresh, self._d
         mjw.fwd_kinematics(m, d)
         mjw.com_vel(m, d)
@@ -222,7 +222,7 @@ class WarpEngine(Engine):
         self._refresh()
 
     def _play(self, name: str, work: Callable[[], None]) -> None:
-        """Runs recorded work on the engine's stream, between what torch did before and will do after."""
+        """Run recorded work on the engine's stream, between torch's earlier and later work."""
         with self._on_device():
             if name not in self._graphs:
                 self._graphs[name] = self._record(work)
@@ -244,12 +244,12 @@ class WarpEngine(Engine):
         return lambda: wp.capture_launch(graph, stream=self._stream)
 
     def _from_scratch(self) -> AbstractContextManager[Any]:
-        """Warp allocates from the engine's scratch memory, where it lets one choose: on CUDA."""
+        """Make Warp allocate from the engine's scratch memory on CUDA, the only device with a choice."""
         return wp.ScopedAllocator(self._device, self._scratch) if self._device.is_cuda else nullcontext()
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:
-        """Warp allocates and launches on the engine's stream, which waits for torch's, and torch's for it."""
+        """Run Warp on the engine's stream, which waits for torch's stream before, as torch's does for it after."""
         if self._lent is None:
             with wp.ScopedDevice(self._device):
                 yield
@@ -263,7 +263,7 @@ class WarpEngine(Engine):
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """An old graph collected during a capture would record its own destruction."""
+    """Pause garbage collection: a graph collected during a capture would record its own destruction."""
     finish = gc.enable if gc.isenabled() else gc.disable
     gc.disable()
     try:
@@ -273,26 +273,28 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of a model with what mujoco_warp takes for the same physics."""
+    """Return a copy of a model with the options that give the same physics in mujoco_warp."""
     model = copy.copy(model)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    # C meets two boxes with a routine of their own and up to eight contacts. So does mujoco_warp with this flag (that
+    # C has a separate routine for two boxes with up to eight contacts. So has mujoco_warp with this flag (which
     # has no other effect there); without it, boxes go through the convex collider, which gives four.
     model.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it has none, and refuses the flag
+    model.opt.disableflags &= ~int(
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    )  # mujoco_warp has no autoreset and refuses the flag
     return model
 
 
 def _is_slow(model: mujoco.MjModel) -> bool:
-    """Whether a group's kernels make the longest chain: where they go first, MT20's 8,192 rows take 38.6, not 42.3 ms.
+    """Return whether a group's kernels make the longest chain: many substeps, or one thread per matrix.
 
-    It is where substeps are many, or one thread factorises a world's whole matrix.
+    Launching these groups first cuts a step of MT20's 8,192 rows from 42.3 to 38.6 ms.
     """
     return model.opt.timestep < 1.0 / 200.0 or model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT
 
 
 def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Model:
-    """One model on the device, in which the fields in which the given ones differ are per world."""
+    """Return one model on the device; fields in which the given models differ are per world."""
     singles = [mjw.put_model(model) for model in models]
     names = [name for name, value in vars(singles[0]).items() if isinstance(value, wp.array)]
     values = {name: [vars(single)[name].numpy() for single in singles] for name in names}
@@ -306,7 +308,7 @@ def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Mo
 
 
 def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> None:
-    """Frames of the geoms that never move are computed nowhere in a step; here each world gets its own model's."""
+    """Write each world's frames of static geoms, which no step computes, from its own model."""
     frames = [mujoco.MjData(model) for model in models]
     for model, one in zip(models, frames, strict=True):
         mujoco.mj_kinematics(model, one)

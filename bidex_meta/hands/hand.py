@@ -12,7 +12,7 @@ from bidex_meta.utils import paths
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 """Fingers in the order of Table 7."""
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
-"""The hand's centre of mass in the mount frame at zero pose, metres: where a moving base is driven
+"""The hand's centre of mass in the mount frame at zero pose, metres: the point at which a moving base is driven
 (docs/figures.md, base)."""
 LINEAR_DAMPING, ANGULAR_DAMPING = (501.0, 501.0, 501.0), (2.60, 2.65, 1.12)
 """Damping of a moving base, N s/m, and about its own axes, N m s/rad: the hand's 5.011 kg and inertia times the
@@ -27,7 +27,7 @@ DISTAL_PER_MIDDLE = 0.00805 / 0.00705
 class Hand:
     """Joint tables of the hand in the order of Table 7: names and limits (rad) of 24 joints.
 
-    Of the 20 actuated ones their indices and the ends of their position targets, rad.
+    It also has the indices of the 20 actuated joints and the limits of their position targets, rad.
     """
 
     joints: tuple[str, ...]
@@ -38,18 +38,18 @@ class Hand:
     control_high: np.ndarray
 
     def index(self, *names: str) -> list[int]:
-        """Positions of the named joints among the 24."""
+        """Return the positions of the named joints among the 24."""
         return [self.joints.index(name) for name in names]
 
 
 def hand_spec() -> mujoco.MjSpec:
-    """A fresh, editable copy of the hand's MJCF."""
+    """Return a new, editable copy of the hand's MJCF."""
     return mujoco.MjSpec.from_file(str(paths.assets_dir() / "hands" / "shadow_hand.xml"))
 
 
 @lru_cache(maxsize=1)
 def hand() -> Hand:
-    """The hand's joint tables, read once."""
+    """Return the hand's joint tables, read once."""
     model = hand_spec().compile()
     low, high = model.jnt_range.T
     return Hand(
@@ -62,19 +62,19 @@ def hand() -> Hand:
 
 
 SIDES = ("right", "left")
-"""Both hands are the same right-hand model; the order is that of every table."""
+"""Both hands use the same right-hand model; every table has this order."""
 
 RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
-"""Contact bits. Geoms of one hand never meet by bits (its 18 listed pairs do); every other two kinds do,
-save fixtures among themselves. INNER is what an object's file calls a geom that no table can meet before another of the
-object does, so that tables need not look for it."""
+"""Contact bits. Geoms of one hand never collide by bits (only by its 18 listed pairs), nor do fixtures with each
+other; all other kinds collide. An object's file marks a geom INNER if a table always touches another geom of the object
+first, so that tables need not test it."""
 _ALL = RIGHT | LEFT | OBJECT
 _COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: _ALL, FIXTURE: _ALL, INNER: _ALL | INNER}
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}
 
 
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
-    """Gives geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER ones stay what they are."""
+    """Give geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER geoms keep theirs."""
     for geom in geoms:
         if geom.contype:  # others are visual only
             own = INNER if geom.contype == INNER else kind
@@ -82,7 +82,7 @@ def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
 
 
 def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool) -> None:
-    """Adds both hands with the start poses of their mounts; names get the prefixes ``right/`` and ``left/``.
+    """Add both hands with the start poses of their mounts; names get the prefixes ``right/`` and ``left/``.
 
     Moving bases are free joints at the centre of mass (damped by ``damp_bases``); others are welded.
     """
@@ -98,7 +98,7 @@ def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: boo
 
 
 def damp_bases(model: mujoco.MjModel) -> None:
-    """Damps the free joints of moving bases: MJCF has one figure for all six axes, the hand needs three inertias'."""
+    """Damp the free joints of moving bases: MJCF has one value for all six axes, but the inertias differ."""
     for side in SIDES:
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{side}/free")
         if joint >= 0:
@@ -107,7 +107,7 @@ def damp_bases(model: mujoco.MjModel) -> None:
 
 
 def base_position(pose: HandPose) -> np.ndarray:
-    """World position of the base frame, which lies at the hand's centre of mass, metres, shape (3,)."""
+    """Return the world position of the base frame, which lies at the hand's centre of mass, metres, shape (3,)."""
     offset = np.zeros(3)
     mujoco.mju_rotVecQuat(offset, np.array(CENTRE_OF_MASS), np.array(pose.quaternion))
     return np.array(pose.position) + offset

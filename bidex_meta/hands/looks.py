@@ -1,4 +1,4 @@
-"""What a hand looks like in pictures: tapered links, palm and forearm, lofted here. Physics knows nothing of it."""
+"""Meshes of a hand for pictures: tapered links, palm and forearm, lofted here. Physics does not use them."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -21,7 +21,7 @@ _Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def loft(sections: Sequence[Section], low: float, high: float, power: float = 2.0) -> _Mesh:
-    """A closed skin through sections with ascending z, its ends rounded within ``low`` and ``high``, millimetres.
+    """Return a closed skin through sections with ascending z, its ends rounded within ``low`` and ``high``, mm.
 
     ``power``: 2 for ellipses, more for rounded rectangles.
     """
@@ -46,7 +46,7 @@ def loft(sections: Sequence[Section], low: float, high: float, power: float = 2.
 
 
 def _smooth(given: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Sections at heights ``z``, by cubics through the given ones that do not overshoot (Fritsch and Carlson 1980)."""
+    """Interpolate sections at heights ``z`` by cubics without overshoot (Fritsch and Carlson 1980)."""
     step = np.diff(given[:, 0])[:, None]
     slope = np.diff(given[:, 1:], axis=0) / step
     inner = np.where(slope[1:] * slope[:-1] > 0.0, 2.0 * slope[1:] * slope[:-1], 0.0)
@@ -60,7 +60,7 @@ def _smooth(given: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _triangles(rings: int) -> np.ndarray:
-    """Between neighbouring rings, and across the first and the last."""
+    """Return the triangles between neighbouring rings, and across the first and the last ring."""
     first = np.arange(_AROUND)
     a, b = first, (first + 1) % _AROUND
     sides = [np.stack((a, b, b + _AROUND, a, b + _AROUND, a + _AROUND), axis=1).reshape(-1, 3) + _AROUND * r
@@ -71,7 +71,7 @@ def _triangles(rings: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _meshes() -> dict[str, _Mesh]:
-    """Skins by name. A palm looks to -y, a thumb stands at +x."""
+    """Return the skins by name. A palm faces -y, a thumb stands at +x."""
     return {
         "proximal": loft([(5, 0, 0, 8.6, 8.8), (20, 0, 0, 7.9, 8.6), (37, 0, 0, 7.2, 7.4)], 3, 3, 2.6),
         "middle": loft([(5, 0, 0, 7.2, 7.4), (13, 0, 0, 6.7, 7.2), (19, 0, 0, 6.5, 6.6)], 2.5, 2.5, 2.6),
@@ -102,7 +102,7 @@ _THUMB_PINS = {"thproximal": (12.4, 11.0), "thmiddle": (10.4, 9.6), "thdistal": 
 
 
 def dress(scene: mujoco.MjSpec) -> None:
-    """Shows both hands of a scene by skins, and hides what collides of them; bodies and joints stay as they are."""
+    """Show both hands of a scene by skins and hide their colliding geoms; bodies and joints do not change."""
     for geom in scene.geoms:
         if geom.name.startswith(_OF_HANDS):
             geom.group = _HIDDEN_GROUP
@@ -113,13 +113,13 @@ def dress(scene: mujoco.MjSpec) -> None:
 
 
 class _Tailor:
-    """Puts skins onto one hand's bodies."""
+    """Attaches skins to one hand's bodies."""
 
     def __init__(self, scene: mujoco.MjSpec, side: str) -> None:
         self._scene, self._side = scene, side
 
     def _add(self, body: str, material: str, **shape: object) -> None:
-        # A mass of 0 and no contact: bodies state their inertia.
+        # Skins have no mass and no contacts, because bodies state their inertia.
         self._scene.body(f"{self._side}/{body}").add_geom(
             material=f"{self._side}/{material}", contype=0, conaffinity=0, mass=0, group=0, **shape
         )

@@ -1,4 +1,4 @@
-"""Where a hand starts: its mount's position and orientation in the world (docs/figures.md, start poses)."""
+"""Start poses of hands: the mount's position and orientation in the world (docs/figures.md, start poses)."""
 
 import math
 from dataclasses import dataclass
@@ -40,5 +40,5 @@ class HandPose:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """Orientation (w, x, y, z) of the mount in the world."""
+        """Return the orientation (w, x, y, z) of the mount in the world."""
         return quaternion_product(quaternion_from_rpy(self.rpy), MOUNT_QUATERNION)

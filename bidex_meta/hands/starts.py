@@ -33,16 +33,16 @@ _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Where on a link's centre line its distance to a box is measured, from its joint on."""
+"""Positions on a link's centre line, from its joint on, at which its distance to a box is measured."""
 _SLACK = 0.002
-"""Overlap left at a start, metres: contacts carry the object from the first step; 5 mm would be allowed."""
+"""Overlap left at a start, metres, so that contacts carry the object from the first step; 5 mm is allowed."""
 _MAX_CROSSING = 0.1
 """Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
 roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
 
 
 _Support = Callable[[Tensor, Tensor], Tensor]
-"""How far a body reaches against vectors (n, ..., 3) of these lengths (n, ...), from its origin, metres."""
+"""Extent of a body from its origin against vectors (n, ..., 3) of the given lengths (n, ...), metres."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ def _indices(device: torch.device) -> _Indices:
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
-    """Joint angles (n, 24), rad: clip(scale * range * u, limits), distal joints coupled, neighbours uncrossed.
+    """Return joint angles (n, 24), rad: clip(scale * range * u, limits), distal joints coupled, neighbours uncrossed.
 
-    Draws u in [-1, 1], shape (n, 24); the scale is a share of each joint's range.
+    The draws u are in [-1, 1], shape (n, 24); the scale is a share of each joint's range.
     """
     low, high = (constant(tuple(x.tolist()), draws) for x in (hand().low, hand().high))
     where = _indices(draws.device)
@@ -77,7 +77,7 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
 
 
 def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
-    """Lifts an egg off the palm and opens the fingers that noise would push into it.
+    """Lift an egg off the palm and open the fingers that noise would push into it.
 
     Joint angles, rad, (n, 24); the egg's centre and long axis (unit) in the mount frame, (n, 3); its short and long
     semi-axis. Returns the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres.
@@ -97,10 +97,10 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
 
 def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """As ``make_room`` for the convex hull of some balls; the thumb is laid flat and cleared too.
+    """Do what ``make_room`` does for the convex hull of some balls, and lay the thumb flat and clear it too.
 
-    The object's origin (n, 3) in the mount frame, the balls' centres relative to it (n, k, 3), turned as the object
-    is, and their radii (k,), 0 for corners; metres.
+    Arguments: the object's origin (n, 3) in the mount frame; the balls' centres relative to it (n, k, 3), turned with
+    the object; their radii (k,), 0 for corners; metres.
     """
     joints = joints.clone()
     joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0
@@ -113,7 +113,7 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
         return (towards @ points.transpose(1, 2) + radii).amax(dim=2).reshape(length.shape)
 
     reach = (points[..., 1] + radii).amax(dim=1)
-    # A thumb that lies flat stands out above the palm; what would meet it starts above it.
+    # A thumb that lies flat stands out above the palm; an object that would touch it starts above it.
     lowest = _SLACK - _PALM_HALF_THICKNESS - reach
     rest = torch.stack((centre[:, 0], centre[:, 1].minimum(lowest), centre[:, 2]), dim=1)
     low, high = (constant(end, rest).expand_as(rest) for end in _THUMB)
@@ -124,10 +124,10 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
 
 
 def meets_box(joints: Tensor, pose: HandPose, box: Tensor, half: tuple[float, float, float]) -> Tensor:
-    """Tell in which starts a finger sticks in a box by more than the slack. Shape (n,), bool.
+    """Return in which starts a finger penetrates a box by more than the slack. Shape (n,), bool.
 
     Joint angles, rad, (n, 24), of a hand that starts at ``pose``; the box's poses (n, 7), quaternion (x, y, z, w), and
-    its half sizes, metres. A link is looked at in five points of its centre line.
+    its half sizes, metres. Each link is tested at five points of its centre line.
     """
     start, along, length = _finger_segments(joints)
     share = constant(_SHARES, joints)
@@ -154,7 +154,7 @@ def _wrist_axis(joints: Tensor) -> Tensor:
 
 
 def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:
-    """Joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
+    """Return joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
     start, along, length = _finger_segments(joints)
@@ -170,7 +170,7 @@ def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, suppor
 
 
 def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length: Tensor) -> Tensor:
-    """Lower bound of the distance between a body and line segments, by its support towards the nearest point."""
+    """Return a lower bound of the gap between a body and line segments, by the support towards the nearest point."""
     to_centre = centre - start
     t = dot(to_centre, along).clamp(min=0.0).minimum(length)
     gap_vector = to_centre - t[..., None] * along
@@ -179,7 +179,7 @@ def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length
 
 
 def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
-    """Whether LFJ4 (n,) lifts the little finger's metacarpal into an egg, (n,)."""
+    """Return whether LFJ4 (n,) lifts the little finger's metacarpal into an egg, (n,)."""
     low, high = (
         torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1)
         for x, rise, z in _METACARPAL
@@ -200,7 +200,7 @@ def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre lines of the four fingers' capsules in the palm frame: starts, directions (n, 4, 3, 3), lengths (3,)."""
+    """Return the centre lines of the fingers' capsules, palm frame: starts, directions (n, 4, 3, 3), lengths (3,)."""
     where = _indices(joints.device)
     side = joints[:, where.side]
     bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)

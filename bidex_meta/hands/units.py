@@ -16,7 +16,7 @@ from bidex_meta.utils.files import expanded, read_toml
 from bidex_meta.utils.validation import Text, parse
 
 UNITS: dict[str, str] = {"palm": "WR", "first": "FF", "middle": "MF", "ring": "RF", "little": "LF", "thumb": "TH"}
-"""The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base where it
+"""The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base if it
 moves."""
 NAMED = ("single", "hands", "fingers")
 """Partitions that need no list."""
@@ -31,7 +31,7 @@ class _Partition:
 
 
 def partition_line(agents: Agents) -> str:
-    """A partition as one line: a name of :data:`NAMED`, or agents with their units, which ``agent_views`` checks.
+    """Return a partition as one line: a name of :data:`NAMED`, or agents with units, which ``agent_views`` checks.
 
     Raises BidexError for a file that cannot be read or has no agents.
     """
@@ -46,7 +46,7 @@ def partition_line(agents: Agents) -> str:
 
 
 def units_by_agent(line: str) -> dict[str, list[str]]:
-    """The units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
+    """Return the units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
     found: dict[str, list[str]] = {}
     for part in line.split(";"):
         name, equals, units = (each.strip() for each in part.partition("="))

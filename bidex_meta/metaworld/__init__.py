@@ -1,6 +1,6 @@
 """Meta-World's interface on the classes of this benchmark: change the import and the names, keep the code.
 
-docs/metaworld.md lists what is the same, what is not, and what is faster. Importing it fixes Meta-World's own
+docs/metaworld.md lists the differences and the speed. Importing this module fixes Meta-World's own
 environments in this process, which MuJoCo 4 breaks (``library.mended``), and makes `Benchmark` one of Meta-World's.
 """
 
@@ -25,7 +25,7 @@ _CLASSES = "ALL_V3_ENVIRONMENTS"
 
 
 def __getattr__(name: str) -> Any:
-    """Meta-World's other names: its wrappers; an error that names the alternative for its suites and classes."""
+    """Return Meta-World's wrappers by name; raise an error that names the alternative for its suites and classes."""
     if name == _CLASSES:
         return {task: MT1(task).train_classes[task] for task in MT1.ENV_NAMES}
     if name in _ABSENT:

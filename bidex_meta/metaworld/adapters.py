@@ -1,7 +1,7 @@
 """Adapters between here and Meta-World's evaluation, for agents and worlds in both directions (docs/metaworld.md).
 
 The agents' protocols have the same names and order of calls (``bidex_meta/agents.py``); Meta-World uses NumPy arrays,
-does not say which environments share a task, and calls ``reset`` before and during evaluation alone.
+does not say which environments share a task, and calls ``reset`` only before and during evaluation.
 """
 
 from collections import namedtuple
@@ -23,14 +23,14 @@ from bidex_meta.utils.validation import real_numbers, true_or_false
 from bidex_meta.world.contract import Info, Options, PooledWorld
 
 MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
-"""The six entries of Meta-World's own, for agents that unpack them."""
+"""The six entries of Meta-World's own Timestep, for agents that unpack it."""
 
 
 class ForMetaWorld:
     """One of our agents as ``metaworld.evaluation`` takes it: NumPy arrays in and out.
 
     ``agent`` is an Agent for ``evaluation``, a MetaLearningAgent for ``metalearning_evaluation``; ``task_of_row``
-    numbers the task of each environment from 0 on, None: each has its own.
+    numbers the task of each environment from 0 on. None: each environment has its own task.
     """
 
     @checked_arguments
@@ -45,11 +45,11 @@ class ForMetaWorld:
         self._begins = True
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
-        """Actions (num_envs, a), float32, for observations (num_envs, d); no exploration."""
+        """Return actions (num_envs, a), float32, for observations (num_envs, d), without exploration."""
         return _array(self._agent.eval_action(self._tensor(observations)))
 
     def reset(self, env_mask: np.ndarray) -> None:
-        """New episodes in the environments of a bool mask (num_envs,), which may be empty."""
+        """Start new episodes in the environments of a bool mask (num_envs,), which may be empty."""
         mask = self._tensor(env_mask)
         if mask.dtype != torch.bool or mask.dim() != 1:
             raise BidexError(f"env_mask: expected bool of shape (num_envs,), got {shortened(env_mask)}.")
@@ -57,31 +57,31 @@ class ForMetaWorld:
             self._agent.reset(mask)
 
     def init(self) -> None:
-        """Resets to what was meta-learned."""
+        """Reset the agent to its meta-learned state."""
         if hasattr(self._agent, "assign"):
             self._agent.assign(self._task_of_row)
         self._agent.init()
         self._begins = True
 
     def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, Info]:
-        """Exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
+        """Return exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
         obs = self._tensor(observations)
-        if self._begins:  # Meta-World resets the environments here, and does not say so
+        if self._begins:  # Meta-World resets the environments here without calling reset
             self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
             self._begins = False
         action, outputs = checked_outputs(self._agent, self._agent.adapt_action(obs))
         return _array(action), {k: _array(v) if isinstance(v, Tensor) else v for k, v in outputs.items()}
 
     def step(self, timestep: tuple) -> None:
-        """Takes in one transition of every environment: Meta-World's Timestep, or its first six entries."""
+        """Pass on one transition of every environment: Meta-World's Timestep, or its first six entries."""
         obs, action, reward, terminated, truncated, outputs = timestep[:6]
         tensors = [self._tensor(value) for value in (obs, action, reward, terminated, truncated)]
         outputs = {k: self._tensor(v) if isinstance(v, np.ndarray) else v for k, v in outputs.items()}
         self._agent.step(Timestep._make([*tensors, outputs, None, None]))
-        self.reset(np.logical_or(terminated, truncated))  # these go on with their next episodes
+        self.reset(np.logical_or(terminated, truncated))  # ended environments start their next episodes
 
     def adapt(self) -> None:
-        """Learns from the transitions since the last ``adapt`` or ``init``."""
+        """Learn from the transitions since the last ``adapt`` or ``init``."""
         self._agent.adapt()
         self._begins = True
 
@@ -89,15 +89,15 @@ class ForMetaWorld:
         tensor = dense(value, self._device)
         if tensor is None:
             raise BidexError(f"ForMetaWorld: expected an array of numbers, got {shortened(value)}.")
-        # A copy: an environment may write into its array again.
+        # A copy, because an environment may write into its array again.
         return tensor.to(torch.float32 if tensor.is_floating_point() else tensor.dtype, copy=True)
 
 
 class FromMetaWorld:
     """An agent with NumPy arrays for Meta-World's ``metalearning_evaluation`` as ``meta_evaluate`` takes it.
 
-    Where Meta-World starts an environment's next episode, ours leaves it frozen until all have ended. The agent sees it
-    go on without reward and without an end.
+    When an episode ends, Meta-World starts the environment's next one; ours freezes it until all have ended. The agent
+    sees the frozen episode go on without reward and without an end.
     """
 
     @checked_arguments
@@ -107,28 +107,28 @@ class FromMetaWorld:
         self._over: Tensor | None = None
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Actions (num_envs, a) for observations (num_envs, d)."""
+        """Return actions (num_envs, a) for observations (num_envs, d)."""
         if self._begun is not None:
             self._agent.reset(_array(self._begun))
             self._begun = None
         return torch.as_tensor(self._agent.eval_action(_array(obs)), device=obs.device)
 
     def reset(self, env_mask: Tensor) -> None:
-        """New episodes where a bool mask (num_envs,) is set; passed on to the agent in evaluation alone."""
+        """Start new episodes in a bool mask (num_envs,); only evaluation resets reach the agent."""
         self._begun, self._over = env_mask, ~env_mask
 
     def init(self) -> None:
-        """Resets to what was meta-learned."""
+        """Reset the agent to its meta-learned state."""
         self._agent.init()
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
-        """Exploring actions (num_envs, a), and the agent's other outputs unchanged."""
+        """Return exploring actions (num_envs, a), and the agent's other outputs unchanged."""
         self._begun = None
         action, outputs = checked_outputs(self._agent, self._agent.adapt_action(_array(obs)))
         return torch.as_tensor(action, device=obs.device), outputs
 
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every environment."""
+        """Pass on one transition of every environment."""
         assert self._over is not None  # reset comes first
         running = ~self._over
         ended = (timestep.terminated | timestep.truncated) & running
@@ -139,14 +139,14 @@ class FromMetaWorld:
         self._over = self._over | ended
 
     def adapt(self) -> None:
-        """Learns from the transitions since the last ``adapt`` or ``init``."""
+        """Learn from the transitions since the last ``adapt`` or ``init``."""
         self._agent.adapt()
 
 
 class MetaWorldEnvs(VectorEnv):
     """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
-    Raises BidexError unless its autoreset mode is DISABLED: episodes are started here, since success may end them.
+    Raises BidexError unless the world's autoreset mode is DISABLED: the class starts episodes, as success may end them.
     """
 
     @checked_arguments
@@ -166,18 +166,18 @@ class MetaWorldEnvs(VectorEnv):
 
     @checked_arguments
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts an episode in every environment: observations (num_envs, d)."""
+        """Start an episode in every environment and return observations (num_envs, d)."""
         obs, _ = self.world.reset(seed=seed)
         self._returns.zero_()
         self._lengths.zero_()
         return obs.cpu().numpy(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Advances every environment by actions (num_envs, a) in [-1, 1].
+        """Advance every environment by actions (num_envs, a) in [-1, 1].
 
-        Returns observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
-        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). Where success
-        counts at the end of an episode there is none before its last step, and ``terminate_on_success`` shortens none.
+        Returns observations (num_envs, d), the next episode's if one ended; rewards, terminated, truncated, and
+        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). If success counts
+        at the end of an episode, ``success`` is false before the last step and ``terminate_on_success`` has no effect.
         """
         obs, reward, terminated, truncated, info = self.world.step(actions)  # type: ignore[arg-type]
         success = info["success"]
@@ -201,16 +201,16 @@ class MetaWorldEnvs(VectorEnv):
         return (*arrays, ended_info)  # type: ignore[return-value]
 
     def toggle_terminate_on_success(self, on: bool) -> None:
-        """Whether an episode ends at its first success."""
+        """Choose whether an episode ends at its first success."""
         self.terminate_on_success = true_or_false("on", on)
 
     def toggle_sample_tasks_on_reset(self, on: bool) -> None:
-        """Environments keep their tasks until ``sample_tasks``: raises BidexError when switched on."""
+        """Raise BidexError when switched on: environments keep their tasks until ``sample_tasks``."""
         if on:
             raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
 
     def sample_tasks(self) -> None:
-        """Takes the next tasks of each pool, one for each environment, in turn; they hold from the next reset on."""
+        """Choose the next tasks of each pool, one per environment, in turn; the tasks apply from the next reset on."""
         chosen = {}
         for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_env_ids, strict=True):
             count = rows.stop - rows.start
@@ -219,21 +219,21 @@ class MetaWorldEnvs(VectorEnv):
         self._samples += 1
 
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """An attribute for each environment."""
+        """Return an attribute for each environment."""
         value = getattr(self, name)
         return tuple(value) if name == "task_name" else (value,) * self.num_envs
 
     def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
-        """Calls a method (or reads an attribute) once; its result for each environment."""
+        """Call a method (or read an attribute) once and return the result for each environment."""
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
     def set_attr(self, name: str, values: object) -> None:
-        """Sets an attribute."""
+        """Set an attribute."""
         setattr(self, name, values)
 
     def close_extras(self, **kwargs: object) -> None:
-        """Frees the world."""
+        """Free the world."""
         self.world.close()
 
 

@@ -1,4 +1,4 @@
-"""Meta-World's MT suites as a world, stepped one by one: tasks, rewards and physics that no one here wrote."""
+"""Meta-World's MT suites as a world, stepped one by one, with Meta-World's own tasks, rewards and physics."""
 
 from collections.abc import Mapping, Sequence
 
@@ -30,11 +30,11 @@ from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 class MetaWorldWorld(ForeignWorld):
     """A suite of Meta-World's on the CPU, a key of ``suite.METAWORLD_SUITES``: a world whose slots are the classes.
 
-    Observations are Meta-World's 39 numbers (goal visible) with the class's one-hot behind them; rewards its "v2" in
-    [0, 10]; an episode is 500 steps, ended by the time limit alone. Starts are part of Meta-World's tasks: an episode
-    depends on its task and actions alone. A task's variation is its number among the class's fifty. ``seed`` chooses
-    Meta-World's tasks, and the draws of tasks until ``reset(seed=...)``; other keywords as of ``bidex_meta.World``.
-    Raises BidexError for an unknown suite or mode, fewer environments than classes, or where Meta-World is not
+    Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are its "v2" in
+    [0, 10]; an episode is 500 steps, ended only by the time limit. Starts are part of Meta-World's tasks: an episode
+    depends only on its task and actions. A task's variation is its number among the class's fifty. ``seed`` chooses
+    Meta-World's tasks, and the draws of tasks until ``reset(seed=...)``; other keywords are those of ``World``.
+    Raises BidexError for an unknown suite or mode, for fewer environments than classes, or if Meta-World is not
     installed.
     """
 
@@ -57,7 +57,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replaces pools by numbers of tasks, (n,) or (n, 1), from the next full reset on; else BidexError."""
+        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset on; BidexError for other values."""
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:
@@ -73,7 +73,7 @@ class MetaWorldWorld(ForeignWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Numbers of the tasks of each class, each (n, 1), int64."""
+        """Return the task numbers of each class, each (n, 1), int64."""
         return [np.array(self._pools[name])[:, None] for name in self.task_names]
 
     def _place(self, mask: Tensor) -> None:
@@ -99,7 +99,7 @@ class MetaWorldWorld(ForeignWorld):
         return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
 
     def state_dict(self) -> State:
-        """All that decides the world's future: tensors and plain values, copied."""
+        """Return a copy of the state that decides the world's future: tensors and plain values."""
         own = {"actions": self._actions.clone()}
         return {**super().state_dict(), **own, "pools": {name: list(pool) for name, pool in self._pools.items()}}
 
@@ -107,7 +107,7 @@ class MetaWorldWorld(ForeignWorld):
         return super()._made() | {"suite": self.suite, "seed of tasks": str(self._task_seed)}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores a ``state_dict``; raises BidexError for one of another suite, seed or size.
+        """Restore a ``state_dict``; raises BidexError if its suite, seed or size differs.
 
         Each running episode is played again from its start, exactly: Meta-World keeps part of its state in Python.
         """
@@ -115,7 +115,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks(state["pools"])
         self._restore(state)
         self._actions = state["actions"].clone()
-        # What waits for a reset, or was never started, is not looked at before its next start.
+        # Environments that wait for a reset, or were never started, are not checked before their next start.
         running = ~self.episodes.finished & (self.episodes.number >= 0)
         for row in running.nonzero().squeeze(1).tolist():
             self._singles[row].start(self._task(row))
@@ -123,7 +123,7 @@ class MetaWorldWorld(ForeignWorld):
                 self._singles[row].step(action)
 
     def close_extras(self, **kwargs: object) -> None:
-        """Frees the environments."""
+        """Free the environments."""
         for single in self._singles:
             single.close()
 
@@ -131,11 +131,11 @@ class MetaWorldWorld(ForeignWorld):
 def evaluate_all_tasks(
     agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int = EVALUATION_SEED
 ) -> Evaluation:
-    """``evaluate`` over all tasks of all classes, as many at a time as the world has environments.
+    """Run ``evaluate`` over all tasks of all classes, in batches of the world's number of environments.
 
-    An environment takes some 10 MB, so there is not one for each of MT10's five hundred tasks. Without noise a policy
-    plays every episode of a task alike, and one is enough. ``world`` is a ``MetaWorldWorld`` in autoreset mode
-    DISABLED; it is left with other pools.
+    An environment takes about 10 MB, too much for one for each of MT10's 500 tasks. A policy without noise plays every
+    episode of a task identically, so one episode is enough. ``world`` is a ``MetaWorldWorld`` in autoreset mode
+    DISABLED; this function changes its pools.
     """
     protocol = Protocol(seed=seed, episodes_per_task=episodes_per_task)
     check_world(world)

@@ -1,6 +1,6 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
-As there, `MT1` and `ML1` are of any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
+As in Meta-World, `MT1` and `ML1` take any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
 `("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. Hands move, as in every suite;
 `seed` chooses the tasks, None: 0.
 """
@@ -29,7 +29,7 @@ class MT1(Benchmark):
 
 
 class ML1(Benchmark):
-    """One class with its goal hidden: 50 tasks to train on, 50 others to be tested on."""
+    """One class with its goal hidden: 50 tasks for training, 50 other tasks for testing."""
 
     ENV_NAMES: ClassVar[list[str]] = _ENV_NAMES
 
@@ -47,7 +47,7 @@ class CustomMT(Benchmark):
 
 
 class CustomML(Benchmark):
-    """Other classes to train on than to be tested on (else BidexError), goals hidden, 50 tasks each."""
+    """Disjoint classes for training and testing (else BidexError), goals hidden, 50 tasks each."""
 
     @checked_arguments
     def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:
@@ -72,11 +72,11 @@ class MT20(_Shipped):
 
 
 class ML4(_Shipped):
-    """The suite ML4: three classes, tested on a fourth."""
+    """The suite ML4: three training classes, one test class."""
 
 
 class ML20(_Shipped):
-    """The suite ML20: fifteen classes, tested on five others."""
+    """The suite ML20: 15 training classes, five test classes."""
 
 
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
@@ -106,5 +106,5 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
 
 
 def _named(envs: Sequence[str]) -> list[str]:
-    """The classes of a list, each once, as they are written."""
+    """Return the resolved class names of a list, each once."""
     return list(dict.fromkeys(registry.resolve(name) for name in envs))

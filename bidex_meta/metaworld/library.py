@@ -22,10 +22,10 @@ _BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNIN
 
 
 def mended() -> ModuleType:
-    """Meta-World's module, its environments fixed in this process; raises ModuleNotFoundError without it.
+    """Return Meta-World's module, its environments fixed in this process; ModuleNotFoundError if not installed.
 
     Meta-World 3.0.0 sets the hand's weld by eleven numbers for a whole row of ``eq_data``, which is twelve wide since
-    MuJoCo 3.17: no environment could be made. Here they go to its first eleven entries.
+    MuJoCo 3.17, so no environment could be made. The fix writes the numbers to the first eleven entries.
     """
     import_module("metaworld.sawyer_xyz_env").SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
     return import_module("metaworld")
@@ -48,12 +48,12 @@ def _library() -> ModuleType:
     return library
 
 
-@functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
+@functools.lru_cache(maxsize=8)  # drawing tasks resets each class 50 times, which takes seconds
 def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
-    """Meta-World's own fifty tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
+    """Return Meta-World's 50 tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
 
-    Those of MT10 are ``metaworld.MT10(seed)``'s, others ``metaworld.MT1(name, seed)``'s. Raises BidexError for an
-    unknown suite, or without Meta-World.
+    MT10's tasks come from ``metaworld.MT10(seed)``, other suites' from ``metaworld.MT1(name, seed)``. Raises BidexError
+    for an unknown suite, or if Meta-World is not installed.
     """
     names, library, seed = metaworld_classes(suite), _library(), seed % 2**32  # the range of NumPy's old generator
     whole = suite == "metaworld/MT10"
@@ -69,18 +69,18 @@ class Single:
         self._env = _library().ALL_V3_ENVIRONMENTS[name]()
 
     def start(self, task: object) -> np.ndarray:
-        """Begins an episode of a task; the observation, (39,), float64, with the goal in the last three entries."""
+        """Begin an episode of a task; returns the observation, (39,), float64, its last three entries the goal."""
         self._env.set_task(task)
         return self._env.reset()[0]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """Advances 1/80 s by an action (4,): observation (39,), reward in [0, 10], success, broken physics."""
+        """Advance 1/80 s by an action (4,); returns observation (39,), reward in [0, 10], success, broken physics."""
         obs, reward, _, _, info = self._env.step(action)
-        # MuJoCo goes on from its default state after a bad number; only its counters tell.
+        # After a bad number MuJoCo continues from its default state; only its counters show it.
         broken = bool(np.any(self._env.data.warning.number[_BROKEN]))
         broken = broken or not (np.isfinite(obs).all() and np.isfinite(reward))
         return obs, float(reward), bool(info["success"]), broken
 
     def close(self) -> None:
-        """Frees the environment."""
+        """Free the environment."""
         self._env.close()

@@ -1,7 +1,7 @@
-"""Meta-World's functions that make environments: `make_mt_envs`, `make_ml_envs`, and what its Gymnasium ids take.
+"""Meta-World's functions that make environments: `make_mt_envs`, `make_ml_envs`, and the makers of its Gymnasium ids.
 
-Single environments in Meta-World's own wrappers, side by side in Gymnasium's vector environments; each keyword does
-what it does there.
+Single environments in Meta-World's own wrappers run in Gymnasium's vector environments; each keyword has Meta-World's
+meaning.
 """
 
 import warnings
@@ -31,9 +31,9 @@ _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 def make_mt_envs(
     name: str, seed: int | None = None, num_tasks: Few | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
-    """Environments that show their goals and draw a task at each reset: one of a class, or one of each of a suite's.
+    """Make environments that show their goals and draw a task at each reset: one, or one per class of a suite.
 
-    `seed` chooses the tasks (None: 0), the starts and the task draws (None: others each time); `num_tasks` is the size
+    `seed` chooses the tasks (None: 0), the starts and the task draws (None: random); `num_tasks` is the size
     of the one-hot that `use_one_hot=True` appends, by default the number of classes. Options: `vector_strategy`,
     `autoreset_mode` and those of `make_env`. Raises BidexError for an unknown name, or a suite that hides its goals.
     """
@@ -57,11 +57,12 @@ def make_ml_envs(
     split: str = "train",
     **options: Option,
 ) -> VectorEnv:
-    """Environments of a class or meta suite that hide their goals, each with an equal share of its class's tasks.
+    """Make environments of a class or meta suite with hidden goals, each with an equal share of its class's tasks.
 
-    `meta_batch_size` is how many, evenly over the classes of the split, by default one of each; `total_tasks_per_cls`
-    is how many of each class's tasks they share, by default all. `seed` and options as in `make_mt_envs`. Raises
-    BidexError for an unknown name, a suite that shows its goals, or a size that does not divide evenly.
+    `meta_batch_size` is the number of environments, split evenly over the classes, by default one per class;
+    `total_tasks_per_cls` is the number of each class's tasks that they share, by default all. `seed` and options as in
+    `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or a size that does not divide
+    evenly.
     """
     benchmark = ML1(name, seed) if _is_class(name) else Benchmark(name, seed or 0)
     return _meta(benchmark, seed, meta_batch_size, total_tasks_per_cls, split, **options)
@@ -75,7 +76,7 @@ make_ml_envs_test = partial(make_ml_envs, terminate_on_success=True, task_select
 def make_split(
     suite: str, split: str, task_seed: int, seed: int, env_name: str | None = None, **options: Option
 ) -> VectorEnv:
-    """The environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
+    """Make the environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
     `task_seed` chooses the tasks, `seed` the starts and the task draws. For the ids of ML1 `env_name` replaces the
     suite by this class in the id's version, as in Meta-World; with another suite it raises BidexError. Options are
@@ -89,9 +90,9 @@ def make_split(
 
 
 def _of_one_class(suite: str, env_name: str, seed: int) -> Benchmark:
-    """Make the benchmark that `env_name` asks for: ML1 of a class in the version of the suite.
+    """Make the benchmark of `env_name`: ML1 of a class in the version of the suite.
 
-    Raises BidexError for another suite than ML1, and for a class's name of another version.
+    Raises BidexError for a suite other than ML1, and for a class name of another version.
     """
     rules = load_suite(suite).rules
     given = registry.resolve(env_name)
@@ -115,10 +116,11 @@ def make_custom(
     num_envs: int | None = None,
     **options: Option,
 ) -> VectorEnv:
-    """The environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
+    """Make the environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
 
-    Classes of `envs_list` show their goals; others hide them, those of `train_envs` play, or with `split="test"` those
-    of `test_envs`. `num_envs` is ignored, as there. Options are those of `make_mt_envs` or `make_ml_envs`.
+    Classes of `envs_list` show their goals; the other classes hide their goals: `train_envs` play, or with
+    `split="test"` `test_envs`. `num_envs` is ignored, as in Meta-World. Options are those of `make_mt_envs` or
+    `make_ml_envs`.
     """
     if envs_list is not None:
         return _multi_task(CustomMT(envs_list, seed), seed, **options)
@@ -180,9 +182,9 @@ def make_env(
     reward_alpha: float = 0.001,
     **options: Option,
 ) -> gymnasium.Env:
-    """One environment in Meta-World's wrappers, by Meta-World's keywords: it draws its tasks itself.
+    """Make one environment in Meta-World's wrappers, by Meta-World's keywords; the environment draws its tasks.
 
-    `seed` is of starts and task draws (None: another one each time); `use_one_hot` appends the one-hot of `env_id`
+    `seed` determines starts and task draws (None: random); `use_one_hot` appends the one-hot of `env_id`
     among `num_tasks`, `recurrent_info_in_obs` the last action, the last reward (divided by 10 if normalised) and
     whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
     turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
@@ -197,7 +199,7 @@ def make_env(
     if use_one_hot:
         if env_id is None or num_tasks is None:
             raise BidexError("use_one_hot: expected env_id and num_tasks with it, got none. Give both.")
-        with warnings.catch_warnings(action="ignore"):  # its space is made of float64 bounds
+        with warnings.catch_warnings(action="ignore"):  # Meta-World's space has float64 bounds
             env = wrappers.OneHotWrapper(env, env_id, num_tasks)
     if recurrent_info_in_obs:
         env = wrappers.RNNBasedMetaRLWrapper(env, normalize_reward=normalize_reward_in_recurrent_info)
@@ -230,7 +232,7 @@ def _make_vector(
 
 
 def _split_tasks(tasks: Sequence[Task], envs: int) -> list[list[Task]]:
-    """The tasks of a class over its environments; raises BidexError where they do not divide evenly."""
+    """Split a class's tasks over its environments; raises BidexError if the tasks do not divide evenly."""
     if len(tasks) % envs:
         fitting = len(tasks) - len(tasks) % envs
         raise BidexError(
@@ -241,7 +243,7 @@ def _split_tasks(tasks: Sequence[Task], envs: int) -> list[list[Task]]:
 
 
 def _is_class(name: str) -> bool:
-    """Whether it names a class; raises BidexError where it names no suite either."""
+    """Return whether a name is a class; raises BidexError if the name is neither a class nor a suite."""
     folded = {known.casefold() for known in registry.names()}
     is_class = plain_name(name).casefold() in folded
     if not is_class and not name.endswith(".toml"):

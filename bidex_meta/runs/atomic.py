@@ -1,4 +1,4 @@
-"""Write a file so that a crash leaves either the old content or the new one, never a torn one."""
+"""Atomic writes: a crash leaves either the old or the new content of a file, never a torn file."""
 
 import contextlib
 import errno
@@ -19,7 +19,7 @@ Json = dict[str, Any]  # an object of JSON
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Call ``write`` on a temporary file beside ``path``, force it to the disk and rename it over ``path``."""
+    """Call ``write`` on a temporary file next to ``path``, force it to the disk and rename it over ``path``."""
     temporary = temporary_name(path)
     try:
         with temporary.open("xb") as file:
@@ -29,7 +29,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         os.replace(temporary, path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # torch.save tells of what the system refuses, such as a full disk, as of an error of its own.
+        # torch.save reports errors of the system, such as a full disk, as its own kind of error.
         if isinstance(error, RuntimeError) and isinstance(why := error.__context__, OSError):
             raise OSError(why.errno, why.strerror, str(path)) from None
         raise
@@ -39,7 +39,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 def temporary_name(path: Path) -> Path:
     """Return an unused name in the folder of ``path``: a rename is atomic only within one file system.
 
-    ``tempfile`` would create the file with mode 0600, or 0600 made 0644 whatever the umask; ``open`` asks the umask.
+    ``open`` creates the file with the umask's mode; ``tempfile`` would ignore the umask and use mode 0600.
     """
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{TEMPORARY_SUFFIX}")
 
@@ -90,15 +90,15 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Raises BidexError for links among a run's own files: what is written or deleted there would be another's."""
+    """Raise BidexError for links among a run's own files: writing through them would change foreign files."""
     for path in (path for path in paths if path.is_symlink()):
         raise BidexError(f"{path} is a link, and what a run writes stays in its folder. Put a folder or file there.")
 
 
 def check_writable(path: Path) -> None:
-    """Raises BidexError, before long work, where ``path`` is no file or cannot be written at the end of it.
+    """Raise BidexError, before long work, if ``path`` is no file or could not be written after the work.
 
-    The name may be too long, the folder not ours, the disk full; folders above it may be missing, and stay so.
+    Reasons are a long name, missing permission or a full disk. Missing parent folders are allowed and not created.
     """
     if exists(path) and not path.is_file():
         raise BidexError(f"Expected a file to write at {path}, but there is something else. Name another.")
@@ -107,7 +107,7 @@ def check_writable(path: Path) -> None:
         for folder in reversed([folder for folder in path.parents if not exists(folder)]):
             folder.mkdir()
             created.append(folder)
-        # As long a name as the file's own will have while it is written.
+        # The temporary name is as long as the one that the file will have while it is written.
         temporary = temporary_name(path)
         try:
             with temporary.open("xb") as file:
@@ -123,7 +123,7 @@ def check_writable(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Forces a folder's names to the disk: without this a power cut may lose a rename."""
+    """Force a folder's names to the disk: without this a power cut may lose a rename."""
     # Windows cannot open folders, and needs no such call.
     if os.name == "posix":
         descriptor = os.open(folder, os.O_RDONLY)

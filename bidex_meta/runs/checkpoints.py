@@ -1,7 +1,7 @@
 """Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``; written atomically, read without any code.
 
-Each has a format number and a digest of every number and tensor in it: ``torch.load`` checks no checksum, so a flipped
-bit would be loaded as another weight.
+Each file has a format number and a digest of all its numbers and tensors: ``torch.load`` checks no checksum, so it
+would load a flipped bit as another weight.
 """
 
 import contextlib
@@ -37,12 +37,12 @@ class Checkpoints:
 
     @property
     def last(self) -> Path:
-        """The newest checkpoint; exists after the first ``save``."""
+        """Return the path of the newest checkpoint, which exists after the first ``save``."""
         return self.folder / "last.pt"
 
     @property
     def best(self) -> Path:
-        """The policy that did best in an evaluation while training; exists if there was one."""
+        """Return the path of the policy that did best in an evaluation during training; it exists if there was one."""
         return self.folder / "best.pt"
 
     @checked_arguments
@@ -54,7 +54,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def room(self, size: int) -> Iterator[None]:
-        """Hold the room of the first checkpoint, of ``size`` bytes at most, until it is saved, so that it cannot fail.
+        """Reserve ``size`` bytes for the first checkpoint until it is saved, so that saving cannot fail.
 
         Raises BidexError if there is no such room.
         """
@@ -64,9 +64,9 @@ class Checkpoints:
             yield
 
     def finish(self, step: int) -> None:
-        """Does what a :meth:`save` that was killed left undone.
+        """Complete a :meth:`save` that was killed.
 
-        ``step`` is of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
+        ``step`` is the loaded checkpoint's. If a newer checkpoint exists, which is then damaged, all files stay.
         """
         if not self.folder.is_dir():
             return
@@ -87,7 +87,7 @@ class Checkpoints:
         write_atomic(path, lambda file: _torch().save(content, file))
 
     def _follow(self, newest: Path) -> None:
-        """Makes ``last.pt`` a copy of the newest, then deletes the oldest."""
+        """Copy the newest checkpoint to ``last.pt``, then delete the oldest."""
         with newest.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
@@ -95,17 +95,17 @@ class Checkpoints:
 
     @checked_arguments
     def save_best(self, policy: State, step: int, found: dict[str, float]) -> None:
-        """Write ``best.pt``: a policy alone (entry ``learner.policy`` of a checkpoint), and its results."""
+        """Write ``best.pt``: only a policy (entry ``learner.policy`` of a checkpoint) and its results."""
         self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": found})
 
     def found_of_best(self) -> dict[str, float] | None:
-        """The results of the policy in ``best.pt``; None where there is none that can be read."""
+        """Return the results of the policy in ``best.pt``; None if there is no readable one."""
         content = _read(self.best, "none is known") if exists(self.best) else None
         return None if content is None else content.get("found")
 
     @checked_arguments
     def load_one(self, path: Path) -> tuple[State, int]:
-        """A certain checkpoint as ``load`` gives it; raises BidexError where it is missing or cannot be read."""
+        """Load one given checkpoint as ``load`` returns it; raises BidexError if it is missing or unreadable."""
         if not is_file(path):
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
@@ -116,15 +116,15 @@ class Checkpoints:
         return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
-        """Environment steps of the newest checkpoint, by the names of the files; None where there is none yet."""
+        """Return the environment steps of the newest checkpoint, by the file names; None if there is none yet."""
         files = self._step_files()
         return int(files[0].stem.removeprefix("step_")) if files else None
 
     def load(self) -> tuple[State, int] | None:
-        """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
+        """Load the newest readable checkpoint as ``(state, step)``, tensors on the CPU; None if there is none yet.
 
-        A damaged file is passed over with a line on stderr, which names the one that is taken in its place. Raises
-        BidexError where none of them can be read.
+        A damaged file is skipped with a line on stderr that names the file used instead. Raises BidexError if no
+        checkpoint can be read.
         """
         # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
         candidates = [path for path in [*self._step_files(), self.last] if exists(path)]
@@ -141,7 +141,7 @@ class Checkpoints:
         return None
 
     def _step_files(self) -> list[Path]:
-        """``step_<N>.pt``, newest first."""
+        """Return the paths ``step_<N>.pt``, newest first."""
         paths = self.folder.iterdir() if self.folder.is_dir() else ()
         found = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
         return [path for _, path in sorted(found, reverse=True)]
@@ -167,7 +167,7 @@ def _reason(error: Exception) -> str:
 
 
 def _opened(path: Path) -> State:
-    """A file's content, at least ``step`` and ``state``; torch raises a dozen kinds of errors where it is damaged."""
+    """Return a file's content, at least ``step`` and ``state``; torch raises many kinds of errors if it is damaged."""
     with open_regular(path, "a checkpoint") as file:
         _check_archive(file)
         # weights_only: a checkpoint from somebody else must not be able to run code.
@@ -186,7 +186,7 @@ def _opened(path: Path) -> State:
 
 
 def _check_archive(file: IO[bytes]) -> None:
-    """Refuses an archive that is damaged, or whose parts are larger than the file: torch stores them as they are."""
+    """Refuse an archive that is damaged, or whose parts are larger than the file: torch stores parts uncompressed."""
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
             if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:
@@ -198,7 +198,7 @@ def _check_archive(file: IO[bytes]) -> None:
 
 
 def weights_digest(policy: State) -> str:
-    """Return 32 hexadecimal digits of a policy's tensors, with which two copies of one run are found.
+    """Return 32 hexadecimal digits of a policy's tensors, which identify copies of one run.
 
     Numbers enter in half precision, in which published policies are stored.
     """
@@ -219,14 +219,14 @@ def _digest(content: State) -> str:
 
 
 def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
-    """Feeds a hash with a value, its type and its shape, so that no two contents look alike."""
+    """Feed a hash with a value, its type and its shape, so that different contents give different hashes."""
     torch = _torch()
     if depth > _DEEPEST:
         raise ValueError(f"it is nested more than {_DEEPEST} deep")
     if isinstance(value, torch.Tensor):
         found.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
         flat = value.detach().cpu().contiguous()
-        # Of a single number the stride can be any, and a view of bytes asks for 1.
+        # A single number can have any stride, but a view of bytes requires 1.
         flat = flat.as_strided((flat.numel(),), (1,))
         found.update(flat.view(torch.uint8).numpy().data)
     elif isinstance(value, dict):
@@ -239,7 +239,7 @@ def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
         for each in value:
             _feed(each, found, depth + 1)
     else:
-        # Of floats repr gives every bit but NaN's.
+        # repr gives every bit of a float, except for NaN.
         content = value if isinstance(value, bytes) else repr(value).encode()
         found.update(f"{type(value).__name__} {len(content)}:".encode())
         found.update(content)

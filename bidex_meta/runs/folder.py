@@ -1,15 +1,15 @@
-"""The run folder: what was run, with what, and what came out.
+"""The run folder: config, versions, metrics, checkpoints, videos and evaluation of a run.
 
 ::
 
     runs/<suite>/<algo>/<UTC date-time>_seed<seed>/
         config.json     the resolved config: every value, also the defaults
         versions.json   Python, packages, machine, git commit; physics profile and version of the suite
-        metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
+        metrics.jsonl   one line per log call: {"step": ..., "time": ..., "Train/mean_return": ...}
         events.out...   the same for TensorBoard
         checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
         videos/         <name>_<N>.mp4
-        evaluation.json what the trained policy reaches
+        evaluation.json the final evaluation of the trained policy
 """
 
 import contextlib
@@ -33,11 +33,11 @@ from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 from bidex_meta.utils.validation import Whole
 
-AnyConfig = RunConfig[Any]  # A run's config, its learner's settings in whichever form
+AnyConfig = RunConfig[Any]  # A run's config, with its learner's settings in any form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
-"""In a run folder before its first iteration has ended, beside TensorBoard's file."""
+"""Entries of a run folder before the end of its first iteration, apart from TensorBoard's file."""
 _EVENTS = "events.out.tfevents."
-_MOST_LOOKED_AT = 2000  # entries that are looked at to find runs below a folder that is none
+_MOST_LOOKED_AT = 2000  # entries that are searched for runs below a folder that is no run
 
 
 class _Part:
@@ -64,8 +64,9 @@ class RunFolder:
     ) -> "RunFolder":
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
-        It is ``path``, or one under ``root`` named after the resolved config. ``identity`` distinguishes the run's
-        worlds from others of their name; it goes into ``versions.json``. Raises BidexError where ``path`` is not empty.
+        The folder is ``path``, or one under ``root`` named after the resolved config. ``identity`` distinguishes the
+        run's worlds from other worlds of the same name; it goes into ``versions.json``. Raises BidexError if ``path``
+        is not empty.
         """
         if path is None:
             path = _new_folder(config, root)
@@ -74,16 +75,16 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         folder = cls(path)
         for part in (folder.checkpoints_path, folder.videos_path):
-            part.mkdir(exist_ok=True)  # there where a start was killed before its config stood
+            part.mkdir(exist_ok=True)  # exists if a start was killed before its config was written
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
-        write_json(folder.config_path, config.to_json())  # last: a folder with a config.json is a complete one
+        write_json(folder.config_path, config.to_json())  # last, because a folder with a config.json counts as complete
         return folder
 
     @classmethod
     @checked_arguments
     def open(cls, path: str | Path) -> "RunFolder":
-        """An existing run; raises BidexError where there is no ``config.json``."""
+        """Open an existing run; raises BidexError if there is no ``config.json``."""
         folder = cls(Path(path))
         if not is_file(folder.config_path):
             near = sorted(map(str, _runs_below(folder.path)))[:3]
@@ -97,62 +98,62 @@ class RunFolder:
     metrics_path = _Part("metrics.jsonl")
     checkpoints_path = _Part("checkpoints")
     videos_path = _Part("videos")
-    evaluation_path = _Part("evaluation.json")  # when it has ended and was evaluated
+    evaluation_path = _Part("evaluation.json")  # exists after the run has ended and was evaluated
 
     @property
     def checkpoints(self) -> Checkpoints:
-        """The run's checkpoints."""
+        """Return the run's checkpoints."""
         return Checkpoints(self.checkpoints_path)
 
     def config(self) -> RunConfig[Json]:
-        """The resolved config; raises BidexError where ``config.json`` cannot be read, or is not a run's."""
+        """Return the resolved config; raises BidexError if ``config.json`` cannot be read, or is not a run's."""
         return read_config(self.config_path)
 
     @property
     def again(self) -> str:
-        """The command that writes its evaluation anew, for messages."""
+        """Return the command that writes the run's evaluation again, for messages."""
         return f"bidex-meta evaluate {self.path} --json > {self.evaluation_path}"
 
     @property
     def evaluated(self) -> bool:
-        """Whether there is an ``evaluation.json``."""
+        """Return whether there is an ``evaluation.json``."""
         return is_file(self.evaluation_path)
 
     def metrics(self) -> list[Json]:
-        """The rows of ``metrics.jsonl`` that can be read."""
+        """Return the rows of ``metrics.jsonl`` that can be read."""
         return read_metrics(self.metrics_path)
 
     @property
     def goal(self) -> int:
-        """Steps that it trains for; of a run that time, a return or a score has ended those it made."""
+        """Return the steps to train for; the steps done if time, a return or a score has ended the run."""
         rows = last_rows(self.metrics_path)
         return self.config().goal(rows[-1] if rows else {"step": 0})
 
     def versions(self) -> Json:
-        """``versions.json``; empty where there is none."""
+        """Return the content of ``versions.json``; empty if there is none."""
         return read_versions(self.path)
 
     def evaluation(self) -> Json:
-        """The final evaluation, or the meta-test of learners that adapt; raises BidexError where there is none."""
+        """Return the final evaluation, or the meta-test of learners that adapt; raises BidexError if there is none."""
         if not exists(self.evaluation_path):
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
         return read_evaluation(self.evaluation_path, self.again)
 
     @checked_arguments
     def change_config(self, config: AnyConfig) -> None:
-        """Replace ``config.json``, atomically, where it says something else."""
+        """Replace ``config.json``, atomically, if its content differs."""
         if read_json(self.config_path, "a run's config") != config.to_json():
             write_json(self.config_path, config.to_json())
 
     @checked_arguments
     def finish(self, step: Whole | None) -> None:
-        """Clears away what a killed process left half done in a locked folder; ``step`` is the loaded checkpoint's."""
+        """Clean up a locked folder after a killed process; ``step`` is the loaded checkpoint's."""
         remove_leftovers(self.path)
         if step is not None:
             self.checkpoints.finish(step)
 
     def check_own(self) -> None:
-        """Raises BidexError, before anything is built, where a part is a link or the folder cannot be written."""
+        """Raise BidexError, before anything is built, if a part is a link or the folder cannot be written."""
         refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
         for folder in (self.path, self.checkpoints_path):
             if folder == self.path or folder.exists():
@@ -160,9 +161,9 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self, message: str | None = None) -> Iterator[None]:
-        """Keeps other processes from training here; the lock ends with its process, and leaves no file.
+        """Keep other processes from training here; the lock ends with its process, and leaves no file.
 
-        Raises BidexError, with this message, where another process holds it.
+        Raises BidexError, with this message, if another process holds the lock.
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
@@ -175,14 +176,14 @@ class RunFolder:
                     message = message or f"Another process trains in {self.path}. Wait for its end, or stop it."
                     raise BidexError(message) from None
                 except OSError:
-                    pass  # a network's file system may lock no folders
+                    pass  # a network file system may not lock folders
             yield
         finally:
             os.close(handle)
 
 
 def _runs_below(path: Path) -> Iterator[Path]:
-    """Run folders up to three levels below: as deep as runs/SUITE/ALGO/RUN, and no walk over a whole disk."""
+    """Return run folders up to three levels below, as in runs/SUITE/ALGO/RUN, without walking a whole disk."""
     waiting, looked_at = deque([(path, 0)]), 0
     while waiting:
         folder, depth = waiting.popleft()
@@ -198,12 +199,12 @@ def _runs_below(path: Path) -> Iterator[Path]:
 
 
 def _torn_start(path: Path) -> bool:
-    """Whether a folder holds nothing but what a run makes before its first iteration has ended, and no result."""
+    """Return whether a folder only holds files that a run makes before the end of its first iteration."""
     try:
         entries = list(path.iterdir())
         found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
         known = all(entry.name in _ENTRIES or entry.name.startswith(_EVENTS) for entry in found)
-        # Where only a temporary file is there, it is of the config: the check whether it can be written was killed.
+        # A single temporary file belongs to the config: the check that the config can be written was killed.
         known = known and (bool(found) or all(entry.name.startswith(".config.json.") for entry in entries))
         known = known and not any(entry.is_symlink() for entry in found or entries)
         inner = [each for entry in found if entry.name in _ENTRIES[:2] for each in entry.iterdir()]
@@ -214,7 +215,7 @@ def _torn_start(path: Path) -> bool:
 
 
 def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:
-    """The folder of a run that is given none, by its config and the present time."""
+    """Return the default folder of a run, by its config and the present time."""
     # A suite may be a path to a TOML file, task and algo package.module:Class.
     subject = name_with_object(short_name(Path(config.suite or str(config.task)).stem), config.object)
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
@@ -227,7 +228,7 @@ def _new_folder(config: AnyConfig, root: Path) -> Path:
     path, count = base, 1
     while True:
         try:
-            path.mkdir()  # fails where it exists, so two runs started in one second never share a folder
+            path.mkdir()  # fails if it exists, so two runs started in one second never share a folder
             return path
         except FileExistsError:
             count += 1
@@ -235,10 +236,10 @@ def _new_folder(config: AnyConfig, root: Path) -> Path:
 
 
 def check_new(path: Path) -> None:
-    """Raises BidexError where a run cannot begin in a folder.
+    """Raise BidexError if a run cannot begin in a folder.
 
-    It holds something other than a run that ended before it had learned anything, another process trains there, or it
-    cannot be written.
+    A run cannot begin if the folder cannot be written, if another process trains there, or if it holds anything other
+    than a run that ended before its first iteration.
     """
     if exists(path) and not (path.is_dir() and (_torn_start(path) or not any(path.iterdir()))):
         raise BidexError(

@@ -1,4 +1,4 @@
-"""Metrics of a run: a line of JSON for each report, and a logger's point for each value, over environment steps."""
+"""Metrics of a run over environment steps: one line of JSON per report, and one point of a logger per value."""
 
 import json
 import math
@@ -16,14 +16,14 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
 from bidex_meta.utils.validation import Whole
 
-_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; a line an iteration is some kilobytes
+_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; one iteration writes a line of a few kilobytes
 _TAIL = 65_536
 
 
 class MetricsWriter:
     """Appends to ``metrics.jsonl`` in the run folder, and to a logger of ``bidex_meta.runs.writers``.
 
-    Of a resumed run, both lose what was logged after ``resume_step``, its checkpoint's: it is logged again.
+    In a resumed run both drop the points after ``resume_step``, the checkpoint's step, since they are logged again.
     """
 
     @checked_arguments
@@ -36,46 +36,46 @@ class MetricsWriter:
 
     @checked_arguments
     def log(self, metrics: Mapping[str, Any], step: Whole) -> None:
-        """Write one line, where a value that is not finite stands as null, and one point of the logger per value."""
+        """Write one line, with null for values that are not finite, and one point of the logger per value."""
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
-        self._file.flush()  # into the hands of the system: a killed process loses no line
+        self._file.flush()  # to the operating system, so that a killed process loses no line
         self.writer.scalars(values, step)
 
     def flush(self) -> None:
-        """Also hand the logger's buffered points over."""
+        """Write the logger's buffered points."""
         self.writer.flush()
 
     def close(self) -> None:
-        """Write what is buffered and close both."""
+        """Write buffered data and close the file and the logger."""
         self._file.close()
         self.writer.close()
 
 
 @checked_arguments
 def read_metrics(path: Path) -> list[Json]:
-    """The lines of a ``metrics.jsonl``, without those that cannot be read, such as a last one torn by a crash.
+    """Return the readable lines of a ``metrics.jsonl``; a crash may have torn the last line.
 
-    Raises BidexError where there is no such file.
+    Raises BidexError if there is no such file.
     """
     return [row for _, row in _lines(path, missing=False) if row is not None]
 
 
 @checked_arguments
 def last_rows(path: Path) -> list[Json]:
-    """The last lines of a ``metrics.jsonl`` that can be read, without reading all of a long file; errors as there."""
+    """Return the last readable lines of a ``metrics.jsonl`` without reading all of it; errors as ``read_metrics``."""
     with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         rows = [_row(line) for line in file.read().split(b"\n") if line.strip()]
-    return [row for row in rows if row is not None]  # a first one that was cut in two cannot be read
+    return [row for row in rows if row is not None]  # the first line may be cut and is then unreadable
 
 
 @checked_arguments
 def training_seconds(rows: Sequence[Json]) -> float:
-    """Wall time of the training, over all resumes, by the lines of a ``metrics.jsonl``.
+    """Return the wall time of the training, over all resumes, by the lines of a ``metrics.jsonl``.
 
-    Of runs that did not yet log it: the time of the iterations alone, without that of checkpoints.
+    For runs that did not yet log the time it is the time of the iterations, without the time of checkpoints.
     """
     logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
     parts = ("Perf/collection_time", "Perf/learning_time")
@@ -85,10 +85,10 @@ def training_seconds(rows: Sequence[Json]) -> float:
 
 @checked_arguments
 def mend(path: Path, step: Whole) -> list[Json]:
-    """The lines up to ``step`` of the run that goes on from there, whatever has become of its metrics.
+    """Return the lines up to ``step`` of a run that resumes from there, even if its metrics are damaged.
 
-    Where they are no file, or lines before the last cannot be read, all stay as ``metrics.jsonl.damaged``, which is
-    reported: a good checkpoint shall not wait for its metrics.
+    If the metrics are no file, or a line before the last cannot be read, they are kept as ``metrics.jsonl.damaged`` and
+    reported: damaged metrics must not prevent resuming from a good checkpoint.
     """
     try:
         lines = _lines(path)
@@ -98,7 +98,7 @@ def mend(path: Path, step: Whole) -> list[Json]:
         return []
     bad = sum(row is None for _, row in lines[:-1])
     if bad:
-        # A copy: the good lines go on in the file itself.
+        # A copy, because the file itself keeps the good lines.
         write_atomic(path.with_name(f"{path.name}.damaged"), lambda file: file.write(path.read_bytes()))
         print(f"{path}: {bad} lines cannot be read; all are kept in {path.name}.damaged.", file=sys.stderr)
         _keep(path, [line for line, row in lines if row is not None])
@@ -110,7 +110,7 @@ def _keep(path: Path, lines: Sequence[bytes]) -> None:
 
 
 def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
-    """Every line that is not empty, and its numbers by name, None where it cannot be read; the file may be missing."""
+    """Return every line that is not empty, and its numbers by name, None if unreadable; the file may be missing."""
     if missing and not exists(path):
         return []
     lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")
@@ -118,7 +118,7 @@ def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
 
 
 def _row(line: bytes) -> Json | None:
-    """A line's numbers by name; None where it holds anything else."""
+    """Return a line's numbers by name; None if the line holds anything else."""
     try:
         row = bounded(json.loads(line, parse_constant=lambda _: None))
     except (ValueError, RecursionError):  # ValueError: also bytes that are no text

@@ -15,7 +15,7 @@ from bidex_meta.runs.atomic import Json, write_atomic
 from bidex_meta.runs.schemas import check_evaluation
 from bidex_meta.utils.files import exists, read_json
 
-Figure = Any  # matplotlib's, which is not imported where nothing is drawn
+Figure = Any  # matplotlib's, which is only imported for drawing
 Axes = Any
 
 
@@ -29,24 +29,24 @@ class Curve:
     high: np.ndarray | None  # upper end
 
 
-Group = tuple[str, Mapping[str, Curve]]  # runs that are drawn in one colour: their label, and curves by tag
-Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval where it is known
+Group = tuple[str, Mapping[str, Curve]]  # runs drawn in one colour: a label, and curves by tag
+Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval if known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
 _STYLES = ("-", "--")
-_FEW = 60  # evaluations up to which each is a dot: more of them would hide the dashes
+_FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
-_MILLIONS = (1e6, _STEPS)  # of an axis: what is counted as one, and what it is called
+_MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
 def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "Eval")) -> Figure:
-    """Return and success of every task against environment steps, a line for each group of runs.
+    """Draw return and success of every task against environment steps, a line for each group of runs.
 
-    Each task has its own panels: their returns differ by orders of magnitude. Line styles are those of the families of
-    tags; evaluations while training are dashed. Raises BidexError where no episode has ended yet.
+    Each task has its own panels, because returns differ by orders of magnitude. Each family of tags has its line style;
+    evaluations during training are dashed. Raises BidexError if no episode has ended yet.
     """
     starts = [f"{family}/{measure}/" for measure in _MEASURES for family in families]
     tags = [tag for _, curves in groups for tag in curves]
@@ -69,7 +69,7 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
 
 
 def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
-    """Metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
+    """Draw metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
     figure, labels = _figure(5.2 * len(tags), 3.0), [label for label, _ in groups]
     for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
         _draw_groups(axis, groups, tag, range(len(groups)))
@@ -82,9 +82,9 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
 def draw_panels(
     panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
 ) -> Figure:
-    """A metric, labelled ``title``, against environment steps; a panel for each name's groups, all on one scale.
+    """Draw a metric, labelled ``title``, against environment steps; a panel per name, all on one scale.
 
-    ``unit``: what of ``Curve.steps`` is counted as one, and what it is called.
+    ``unit``: the size of one unit of ``Curve.steps``, and its name.
     """
     labels = list(dict.fromkeys(label for groups in panels.values() for label, _ in groups))
     figure = _figure(5.2 * len(panels), 3.6)
@@ -98,7 +98,7 @@ def draw_panels(
 
 
 def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
-    """Numbers of groups beside each other, as points with their intervals, a panel for each title."""
+    """Draw groups' numbers next to each other, as points with intervals, a panel for each title."""
     figure = _figure(5.2 * len(panels), 1.2 + 0.45 * max(len(bars) for bars in panels.values()))
     for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
         for number, (_, value, interval) in enumerate(bars):
@@ -113,10 +113,10 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
 
 
 def draw_adaptation(evaluation: Json, where: object) -> Figure:
-    """Return and success of every class against shots of adaptation, train classes first, then test classes.
+    """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError where ``evaluation`` (of evaluation.json or
-    of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names it in messages) holds no meta-test.
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if ``evaluation`` (of evaluation.json or
+    of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names the source in messages) holds no meta-test.
     """
     splits = evaluation.get("splits") if isinstance(evaluation, dict) else None
     if not splits:
@@ -133,7 +133,7 @@ def draw_adaptation(evaluation: Json, where: object) -> Figure:
 
 
 def read_evaluation(path: Path) -> Json:
-    """The content of an evaluation's file; raises BidexError where there is none, or it is not JSON."""
+    """Return the content of an evaluation's file; raises BidexError if it is missing or not JSON."""
     if not exists(path):
         raise BidexError(f"There is no {path}. {_AGAIN.format(path)}")
     return read_json(path, "an evaluation")
@@ -153,17 +153,17 @@ def _draw_shots(axis: Axes, rows: list[Json], measure: str, colour: str | None) 
 
 
 def _matplotlib() -> Any:
-    import_module("matplotlib.figure")  # only where something is drawn: it takes half a second
+    import_module("matplotlib.figure")  # imported only for drawing, because it takes half a second
     return import_module("matplotlib")
 
 
 def _figure(width: float, height: float) -> Figure:
-    """An empty figure, without matplotlib's global state."""
+    """Return an empty figure, without matplotlib's global state."""
     return _matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
 def _task_panels(blocks: Sequence[Sequence[str]]) -> tuple[Figure, list[list[tuple[Axes, Axes]]]]:
-    """A figure with two panels above each other, of return and success, for each name; each block begins a new row."""
+    """Return a figure with a panel of return above one of success for each name; each block begins a new row."""
     columns = [min(_COLUMNS, len(names)) for names in blocks]
     heights = [-(-len(names) // width) for names, width in zip(blocks, columns, strict=True)]
     figure = _figure(3.2 * max(columns), 4.0 * sum(heights))
@@ -194,7 +194,7 @@ def save(figure: Figure, out: Path, metadata: Mapping[str, str] | None = None) -
 
 
 def svg(figure: Figure) -> bytes:
-    """A figure as SVG, its words as text."""
+    """Return a figure as SVG, with words stored as text."""
     out = io.BytesIO()
     with _matplotlib().rc_context({"svg.fonttype": "none"}):
         figure.savefig(out, format="svg", metadata={"Date": None})
@@ -221,7 +221,7 @@ def _draw_groups(
 
 
 def _colour(number: int) -> Any:
-    """The colour of a group: ten strong ones, then their light twins, then again from the first."""
+    """Return the colour of a group: ten strong colours, then ten light ones, then again from the first."""
     colours = _matplotlib().colormaps["tab20"].colors
     return (colours[0::2] + colours[1::2])[number % len(colours)]
 
@@ -235,5 +235,5 @@ def _add_legend(figure: Figure, labels: Sequence[str]) -> None:
 
 
 def _plain(name: str) -> str:
-    """A user's name without formulas for matplotlib."""
+    """Return a user's name, escaped so that matplotlib sees no formula."""
     return name.replace("$", r"\$")

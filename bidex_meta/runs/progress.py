@@ -27,7 +27,7 @@ _RETURN = "Train/return/"
 
 
 class PlainConsole(Console):
-    """Raises BrokenPipeError where nobody reads what is printed; rich would end the process."""
+    """A console that raises BrokenPipeError if the reader is gone; rich would end the process."""
 
     @override
     def on_broken_pipe(self) -> None:
@@ -35,10 +35,10 @@ class PlainConsole(Console):
 
 
 class Progress:
-    """Shows steps per second, time left, mean return and success, and both per task, on stderr or ``stream``.
+    """A display of steps per second, time left, mean return and success, and both per task, on stderr or ``stream``.
 
-    Steps and seconds in all are those of the whole run; its training time is the metric ``Perf/training_time``. Where
-    there is a time, that is what is said to be done. Speed counts from ``start_step`` on, where this process began.
+    Total steps and seconds are those of the whole run; its training time is the metric ``Perf/training_time``. If there
+    is a time limit, progress is shown against it. Speed counts from ``start_step`` on, the first step of this process.
     """
 
     def __init__(
@@ -56,15 +56,15 @@ class Progress:
         )
 
     def start(self) -> None:
-        """Begin; speed counts from here."""
+        """Begin the display; speed counts from here."""
         self._start_time = time.monotonic()
         if self._live is not None:
             self._live.start()
 
     def update(self, metrics: Mapping[str, Any], step: int) -> None:
-        """Show the metrics of an iteration; those of earlier ones stay, since it may end no episode.
+        """Show an iteration's metrics; earlier values stay, because an iteration may end no episode.
 
-        Raises BrokenPipeError where the reader has ended or the terminal is gone; later output goes nowhere.
+        Raises BrokenPipeError if the reader has ended or the terminal is gone; later output is discarded.
         """
         self._shown.update({tag: value for tag, value in metrics.items() if value == value})
         self._step = step
@@ -80,7 +80,7 @@ class Progress:
             raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Restore the terminal, a line in the place of the table; quietly where it is gone."""
+        """Restore the terminal and replace the table by a line; errors of a closed terminal are ignored."""
         if self._live is not None:
             with contextlib.suppress(OSError):
                 self._live.stop()
@@ -113,7 +113,7 @@ class Progress:
         return (step - self._start_step) / max(time.monotonic() - self._start_time, 1e-9)
 
     def _seconds_left(self, step: int) -> float:
-        """Until the steps are done or the time is up, whichever comes first."""
+        """Return the seconds until the steps are done or the time is up, whichever comes first."""
         steps, rate = self._total - step, self._rate(step)
         by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
         return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
@@ -133,7 +133,7 @@ class Progress:
 
 
 def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
-    """The items; how many of ``total`` ``what`` there were is a bar in a terminal, plain lines elsewhere, on stderr."""
+    """Yield the items and show their count out of ``total`` on stderr: a bar in a terminal, plain lines elsewhere."""
     console = PlainConsole(file=stream or sys.stderr)
     if console.is_terminal:
         note("")  # the bar moves by itself
@@ -149,7 +149,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
 
 
 def _lines(parts: Iterable[str], width: int) -> list[str]:
-    """Join parts to lines of ``width`` at most; a part is broken nowhere."""
+    """Join parts to lines of at most ``width``; no part is broken."""
     lines: list[str] = []
     for part in parts:
         joined = f"{lines[-1]}  {part}" if lines else part

@@ -1,8 +1,8 @@
-"""What a run or an evaluation was made with, and how two such records differ: every reader of runs asks here.
+"""Records of the versions that a run or an evaluation was made with, and their differences, for all readers of runs.
 
 A record is ``versions.json`` of a run, ``conditions`` of an evaluation, or the present installation and suite:
-``packages`` (versions by name), ``physics``, ``suite_version`` and ``suite_digest``. What one of two records does not
-say is no difference.
+``packages`` (versions by name), ``physics``, ``suite_version`` and ``suite_digest``. An entry that only one of two
+records has is no difference.
 """
 
 from collections import defaultdict
@@ -18,11 +18,11 @@ _WORLD = ("physics", "suite_version", "suite_digest")
 _ENGINES = ("mujoco", "mujoco-warp", "metaworld")
 Value = str | int
 Subject = tuple[str | None, ...]
-"""What runs are trained on: two runs of one subject have the same worlds, if nobody has changed these."""
+"""The subject that runs are trained on: two runs of one subject have the same worlds, if nobody changed the worlds."""
 
 
 class Difference(NamedTuple):
-    """One entry of two records."""
+    """One entry whose value differs between two records."""
 
     name: str
     then: Value
@@ -30,7 +30,7 @@ class Difference(NamedTuple):
 
     @property
     def is_of_worlds(self) -> bool:
-        """Whether the worlds differ: rewards and successes of both are no samples of one distribution."""
+        """Return whether the worlds differ, so that rewards and successes do not come from one distribution."""
         return self.name in _ENGINES or self.name.replace(" ", "_") in _WORLD
 
     def __str__(self) -> str:
@@ -38,7 +38,7 @@ class Difference(NamedTuple):
 
 
 def differences(then: Json, now: Json) -> list[Difference]:
-    """Return the entries that both records have, with other values; ``now`` says which packages count."""
+    """Return the entries of both records whose values differ; packages missing in ``now`` do not count."""
     before = _values(then)
     return [
         Difference(name, before[name], value)
@@ -48,7 +48,7 @@ def differences(then: Json, now: Json) -> list[Difference]:
 
 
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
-    """Return of each run what tells its worlds from other worlds of the same subject among the runs; mostly nothing.
+    """Return for each run the entries that differ between runs of the same subject; usually none.
 
     Runs with different entries must not be pooled. Both the training and the evaluation count.
     """
@@ -65,7 +65,7 @@ def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
 
 
 def check_alike(runs: Sequence[Run]) -> None:
-    """Raises BidexError where runs that shall be seeds of one experiment were made with different worlds."""
+    """Raise BidexError if runs that should be seeds of one experiment were made with different worlds."""
     records = split_by_worlds(runs)
     for run, record in zip(runs, records, strict=True):
         for name, value in record.items():
@@ -77,12 +77,12 @@ def check_alike(runs: Sequence[Run]) -> None:
 
 
 def release_of(run: Run) -> Value | None:
-    """Return the version of this package that a run was made with; None where it is not recorded."""
+    """Return the version of this package that a run was made with; None if it is not recorded."""
     return _values(run.versions()).get("bidex-meta")
 
 
 def _values(record: Mapping[str, object]) -> dict[str, Value]:
-    """The known values of a record by name."""
+    """Return the known values of a record by name."""
     packages = record.get("packages")
     values: dict[str, object] = dict(packages) if isinstance(packages, dict) else {}
     values |= {name.replace("_", " "): record.get(name) for name in _WORLD}
@@ -90,7 +90,7 @@ def _values(record: Mapping[str, object]) -> dict[str, Value]:
 
 
 def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
-    """What decides the worlds of a run, of its training and of its evaluation."""
+    """Yield the entries that decide the worlds of a run's training and evaluation."""
     config = run.config()
     trained = _values(run.versions())
     engines = ["mujoco"]
@@ -101,7 +101,7 @@ def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
     names = [*engines, *(name.replace("_", " ") for name in _WORLD)]
     yield from ((name, trained[name]) for name in names if name in trained)
     if run.evaluated:
-        with suppress(BidexError):  # of an evaluation that cannot be read; who needs it says so
+        with suppress(BidexError):  # an unreadable evaluation is reported by the code that needs it
             evaluated = _values(run.evaluation().get("conditions", {}))
             yield from ((f"evaluated with {name}", evaluated[name]) for name in names if name in evaluated)
 

@@ -20,7 +20,7 @@ from bidex_meta.utils.validation import Seconds, Whole
 
 
 class Recorder:
-    """Records a training run. Use as a context manager, so that files are closed and the terminal is restored.
+    """The record of a training run. Use it as a context manager, so that files are closed and the terminal is restored.
 
     ``total_steps`` and ``total_seconds`` are for the progress display, which ``show_progress`` turns on;
     ``resume_step`` is of the checkpoint that the run continues from.
@@ -41,7 +41,7 @@ class Recorder:
         self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0) if show_progress else None
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Write metrics by tag after ``step`` environment steps, and renew the progress display."""
+        """Write metrics by tag after ``step`` environment steps, and update the progress display."""
         self._metrics.log(metrics, step)
         if self._progress is not None:
             self._progress.update(metrics, step)

@@ -1,4 +1,4 @@
-"""What ``evaluation.json`` and ``versions.json`` of a run folder must hold; entries beyond these are free."""
+"""Schemas of ``evaluation.json`` and ``versions.json`` of a run folder; other entries are allowed."""
 
 from pathlib import Path
 from typing import Annotated, NotRequired, TypedDict
@@ -61,21 +61,21 @@ class _Versions(_Made):
 
 
 def read_versions(folder: Path) -> Json:
-    """A run's ``versions.json``, checked; empty where it has none."""
+    """Return a run's ``versions.json``, checked; empty if the file is missing."""
     path = folder / "versions.json"
     return check_versions(read_json(path, "a run's versions"), str(path)) if exists(path) else {}
 
 
 def check_versions(content: Json, where: str) -> Json:
-    """The same versions; raises BidexError, which begins with ``where``, for the first entry of a wrong type."""
+    """Return the same versions; raises BidexError, which begins with ``where``, for an entry of a wrong type."""
     parse(content, _Versions, where)
     return content
 
 
 def read_evaluation(path: Path, again: str) -> Json:
-    """An evaluation, or a meta-test, as ``run`` and ``evaluate --json`` write it.
+    """Read an evaluation, or a meta-test, as ``run`` and ``evaluate --json`` write it.
 
-    Raises BidexError, with ``again`` as the command that writes it anew, where it cannot be read or is something else.
+    Raises BidexError if it cannot be read or is something else; ``again`` is the command that writes it again.
     """
     try:
         return check_evaluation(read_json(path, "an evaluation"), str(path))
@@ -84,7 +84,7 @@ def read_evaluation(path: Path, again: str) -> Json:
 
 
 def check_evaluation(content: Json, where: str) -> Json:
-    """The same evaluation; raises BidexError, which begins with ``where``, for the first entry of a wrong type."""
+    """Return the same evaluation; raises BidexError, which begins with ``where``, for an entry of a wrong type."""
     parse(content, _Evaluation, where)
     if "splits" not in content and "policy" not in content:
         parse(content, _Classes, where)

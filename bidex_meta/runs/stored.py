@@ -1,4 +1,4 @@
-"""The runs of a study in one file of JSON, for tables and pictures when their folders, with the weights, are gone.
+"""The runs of a study in one JSON file, for tables and pictures after the run folders and weights are deleted.
 
 ::
 
@@ -8,7 +8,7 @@
                "evaluation": {...}},
      ...}
 
-``python -m tools.collect`` of the repository writes such files. :func:`open_runs` reads them and run folders alike.
+``python -m tools.collect`` of the repository writes study files. :func:`open_runs` reads study files and run folders.
 """
 
 import json
@@ -27,7 +27,7 @@ from bidex_meta.runs.schemas import check_evaluation, check_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
-FORMAT = 1  # of a run in these files; raised where an older reader would misread it
+FORMAT = 1  # of a run in these files; increased if an older reader would misread it
 
 
 class _Content(TypedDict):
@@ -55,45 +55,45 @@ class StoredRun:
 
     @property
     def again(self) -> str:
-        """The command that writes it anew, for messages."""
+        """Return the command that writes the file again, for messages."""
         return f"python -m tools.collect RUN --into {str(self.path).rpartition(':')[0]}"
 
     @property
     def evaluated(self) -> bool:
-        """Always: what is not is never collected."""
+        """Return True, because only evaluated runs are collected."""
         return True
 
     @property
     def videos_path(self) -> Path:
-        """A folder that is not there."""
+        """Return a folder that does not exist."""
         return self.path / "videos"
 
     @property
     def arm(self) -> str:
-        """What its study calls it."""
+        """Return the run's arm in its study."""
         return self.content["arm"]
 
     def config(self) -> RunConfig[Json]:
-        """The resolved config; paths of own suites and of other runs are names alone."""
+        """Return the resolved config, in which paths of own suites and of other runs are reduced to names."""
         return config_of(self.content["config"], f"{self.path}: config")
 
     def metrics(self) -> list[Json]:
-        """Means over stretches of about equal length, at their ends."""
+        """Return means over intervals of about equal length, at the ends of the intervals."""
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
 
     @property
     def goal(self) -> int:
-        """Steps that it trained for: unfinished runs are never collected, so that fewer steps were its end."""
+        """Return the steps that the run trained for; only finished runs are collected, so all its steps count."""
         config, steps = self.config(), self.content["steps"]
         return steps if config.minutes is not None else min(steps, config.steps)
 
     def versions(self) -> Json:
-        """Packages, machine and git state."""
+        """Return packages, machine and git state."""
         return self.content["versions"]
 
     def evaluation(self) -> Json:
-        """The final evaluation."""
+        """Return the final evaluation."""
         return self.content["evaluation"]
 
 

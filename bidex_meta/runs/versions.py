@@ -1,4 +1,4 @@
-"""What a result depends on beside its config: the versions of everything, the machine and the state of the source."""
+"""The environment that a result depends on in addition to its config: versions, machine and state of the source."""
 
 import contextlib
 import os
@@ -14,7 +14,7 @@ _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymna
 
 
 def collect_versions() -> Json:
-    """Python, packages (None where not installed), machine, GPUs and git state, ready for JSON."""
+    """Return Python, packages (None if not installed), machine, GPUs and git state, ready for JSON."""
     import torch
 
     return {
@@ -26,7 +26,7 @@ def collect_versions() -> Json:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Of all packages that results depend on; None where one is not installed."""
+    """Return the versions of all packages that results depend on; None for a package that is not installed."""
     versions: dict[str, str | None] = dict.fromkeys(_PACKAGES)
     for name in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -35,10 +35,10 @@ def package_versions() -> dict[str, str | None]:
 
 
 def git_state(folder: Path) -> Json | None:
-    """Commit and whether anything was changed since; None where ``folder`` is not tracked by git.
+    """Return the commit and whether files changed since; None if ``folder`` is not tracked by git.
 
     An installed package inside somebody's project lies in *their* repository without being tracked: that commit
-    would say nothing about us, hence the question whether the folder's files are tracked.
+    would not describe this package, so the function checks that the folder's files are tracked.
     """
     if not _git(folder, "ls-files", "."):
         return None

@@ -13,7 +13,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
-"""Endings of films, and the media types that web pages know them by."""
+"""Suffixes of films, and their media types on web pages."""
 SUFFIXES = (".png", *FILMS)
 LABEL = 20
 """Height of a name under a tile, pixels."""
@@ -21,7 +21,7 @@ _BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
 
 
 def check_suffix(path: Path) -> str:
-    """The ending of ``path`` in lower case; raises BidexError for another than these three."""
+    """Return the suffix of ``path`` in lower case; raises BidexError unless it is one of ``SUFFIXES``."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise BidexError(f"A picture ends in .png, a film in .mp4 or .webp, but {path.name!r} in none of them.")
@@ -36,18 +36,18 @@ def write_image(path: Path, frame: np.ndarray) -> None:
 
 
 def film_suffix() -> str:
-    """The ending of a film that nobody named: .mp4 where that can be written, else .webp."""
+    """Return the default suffix of a film: .mp4 if MP4 can be written, else .webp."""
     return ".mp4" if find_spec("imageio_ffmpeg") else ".webp"
 
 
 def check_films() -> None:
-    """Raises BidexError where MP4 cannot be written, since imageio-ffmpeg is missing."""
+    """Raise BidexError if MP4 cannot be written, because imageio-ffmpeg is missing."""
     if film_suffix() != ".mp4":
         raise BidexError("Films need imageio-ffmpeg: pip install 'bidex-meta[video]', or write .webp.")
 
 
 def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
-    """Frames ``(height, width, 3)``, uint8, in a format of Pillow's with its options; several as an animation."""
+    """Encode frames ``(height, width, 3)``, uint8, in a Pillow format with its options; several form an animation."""
     from PIL import Image
 
     out, pictures = io.BytesIO(), (Image.fromarray(frame) for frame in frames)
@@ -57,30 +57,30 @@ def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write frames as the film that the path's ending, one of ``FILMS``, asks for."""
+    """Write frames as a film in the format of the path's suffix, one of ``FILMS``."""
     write = write_video if path.suffix.lower() == ".mp4" else write_animation
     write(path, frames, fps)
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 60) -> None:
-    """Write frames ``(height, width, 3)``, uint8, as a WebP that plays for ever on web pages; ``quality`` 0 to 100."""
+    """Write frames ``(height, width, 3)``, uint8, as a WebP that loops forever on web pages; ``quality`` 0 to 100."""
     path.parent.mkdir(parents=True, exist_ok=True)
     film = encoded(frames, "WEBP", duration=round(1000 / fps), quality=quality, method=6)
     write_atomic(path, lambda file: file.write(film))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; returns their number.
+    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; returns the frame count.
 
-    Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError where imageio-ffmpeg is missing,
-    and OSError where the file cannot be written; what was there before stays.
+    Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError if imageio-ffmpeg is missing,
+    and OSError if the file cannot be written; an earlier file then stays.
     """
     check_films()
     import imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
     partial, count = path.with_name(f".{path.name}.part.mp4"), 0
-    # macro_block_size 2: the default of 16 would resize 1000x750 in silence.
+    # macro_block_size is 2, because the default of 16 would silently resize 1000x750.
     try:
         with imageio.get_writer(partial, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2) as writer:  # type: ignore[arg-type]
             for frame in frames:
@@ -95,7 +95,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
 
 def _whole(path: Path) -> bool:
-    """Whether an MP4 ends in the table of its frames, which is written last: imageio does not say how ffmpeg ended."""
+    """Return whether an MP4 ends in its frame table, which is written last: imageio does not report ffmpeg's exit."""
     with path.open("rb") as file:
         end, offset, kind = file.seek(0, 2), 0, b""
         while offset < end:
@@ -109,13 +109,13 @@ def _whole(path: Path) -> bool:
 
 
 def grid(count: int) -> tuple[int, int]:
-    """Columns and rows for so many tiles: as square as it goes, wider than high."""
+    """Return columns and rows for ``count`` tiles: as square as possible, wider than high."""
     columns = math.ceil(math.sqrt(count))
     return columns, math.ceil(count / columns)
 
 
 def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[bool]) -> np.ndarray:
-    """Pictures of one shape ``(height, width, 3)``, uint8, side by side with their names, in green where ``done``.
+    """Tile pictures of one shape ``(height, width, 3)``, uint8, with their names, which are green if ``done``.
 
     Returns ``(rows * (height + 20), columns * width, 3)``, uint8.
     """

@@ -1,4 +1,4 @@
-"""Where curves can be watched beside ``metrics.jsonl``: TensorBoard, Weights & Biases, or nowhere."""
+"""Loggers of curves in addition to ``metrics.jsonl``: TensorBoard, Weights & Biases, or none."""
 
 import json
 import os
@@ -17,38 +17,38 @@ from bidex_meta.runs.video import encoded
 
 
 class Writer:
-    """A logger; this one writes nothing, so that ``metrics.jsonl`` stands alone.
+    """The base class of loggers. It writes nothing, so that ``metrics.jsonl`` is the only record.
 
-    A resumed run starts from a checkpoint of ``resume_step``: what came after is written anew.
+    A resumed run starts from a checkpoint of ``resume_step`` and writes later points again.
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None: ...
 
     def config(self, values: Json) -> None:
-        """Takes the run's config, once at the beginning."""
+        """Log the run's config, once at the beginning."""
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
-        """Takes numbers by tag at an environment step."""
+        """Log numbers by tag at an environment step."""
 
     def film(self, tag: str, path: Path, frames: Sequence[np.ndarray], fps: float, step: int) -> None:
-        """Takes a film, as a file and as frames, each ``(height, width, 3)`` uint8."""
+        """Log a film, given as a file and as frames, each ``(height, width, 3)`` uint8."""
 
     def flush(self) -> None:
-        """Hands over what is buffered."""
+        """Write buffered points."""
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the logger."""
 
 
 def make_writer(logger: str, folder: Path, resume_step: int | None = None) -> Writer:
-    """The writer of a logger in ``LOGGERS``; raises BidexError where it is unknown or not installed."""
+    """Make the writer of a logger in ``LOGGERS``; raises BidexError if it is unknown or not installed."""
     if logger not in LOGGERS:
         raise unknown_name("logger", logger, LOGGERS)
     return LOGGERS[logger](folder, resume_step)
 
 
 def check_logger(logger: str) -> None:
-    """Raises BidexError for a logger that is not installed."""
+    """Raise BidexError for a logger that is not installed."""
     if logger == "wandb":
         _wandb()
 
@@ -94,8 +94,8 @@ class TensorBoardWriter(Writer):
 class WandbWriter(Writer):
     """A run of Weights & Biases; the project is ``WANDB_PROJECT``, or ``bidex-meta``.
 
-    Its id lies in the run folder, so that a resumed run goes on there. Environment steps are the metric ``env_steps``,
-    since its own steps may only rise, and a resumed run begins before the last one.
+    The run folder holds its id, so that a resumed run continues it. Environment steps are the metric ``env_steps``,
+    because W&B steps may only increase, and a resumed run begins before the last step.
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:

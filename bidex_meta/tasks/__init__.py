@@ -1,1 +1,1 @@
-"""The task classes, a module for each kind; ``registry`` says which module holds a class."""
+"""The task classes, a module for each kind; ``registry`` maps class names to modules."""

@@ -1,4 +1,4 @@
-"""The reward of version 2: one formula for all classes, from how far a state is from solved."""
+"""The reward of version 2: one formula for all classes, based on a state's errors."""
 
 from typing import Literal, NamedTuple
 
@@ -9,7 +9,7 @@ from bidex_meta.tasks.variation import VariationSpace
 
 
 class Hidden(NamedTuple):
-    """A part of a task that only goal entries show: success asks for each part on its own."""
+    """A part of a task that only goal entries show; success requires each part separately."""
 
     names: tuple[str, ...]
     """Components of the variation: coordinates of one point (metres, rad), or the draws of an orientation."""
@@ -18,14 +18,14 @@ class Hidden(NamedTuple):
     kind: Literal["point", "orientation", "sign"] = "point"
 
     def described(self, space: VariationSpace) -> str:
-        """Its components with their ranges, and its tolerance."""
+        """Return the components with their ranges, and the tolerance, as text."""
         ends = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
         ranges = ", ".join(f"{name} {ends[name][0]:.3g} … {ends[name][1]:.3g}" for name in self.names)
         return ranges if self.kind == "sign" else f"{ranges} (within {self.tolerance:.3g})"
 
 
 class Error(NamedTuple):
-    """How far a state is from solved in one respect."""
+    """The distance of a state from solved in one respect."""
 
     value: Tensor
     """Not negative, shape (n,), in the unit of its tolerance."""
@@ -34,27 +34,27 @@ class Error(NamedTuple):
 
 
 def at_least(value: Tensor, least: float, tolerance: float) -> Error:
-    """The error of a value that shall exceed ``least``, shaped over so much below it."""
+    """Return the error of a value that must exceed ``least``, zero from ``least`` + ``tolerance`` on."""
     return Error((least + tolerance - value).clamp(min=0.0), tolerance)
 
 
 def at_most(value: Tensor, most: float, tolerance: float) -> Error:
-    """The error of a value that shall stay below ``most``."""
+    """Return the error of a value that must stay below ``most``."""
     return Error((value - most + tolerance).clamp(min=0.0), tolerance)
 
 
 def within(errors: list[Error]) -> Tensor:
-    """Whether every error is below its tolerance. Shape (n,), bool."""
+    """Return whether every error is below its tolerance. Shape (n,), bool."""
     return torch.stack([error.value < error.tolerance for error in errors]).all(dim=0)
 
 
 def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> dict[str, Tensor]:
-    """The reward of version 2, in [0, 1], by terms (n,): 1 where ``solved``, at most 0.9 elsewhere.
+    """Return the terms (n,) of the reward of version 2, in [0, 1]: the sum is 1 if ``solved``, else at most 0.9.
 
-    ``solved``: 1 or 0. Elsewhere ``far`` and ``near``, means over the class's errors e in units of their tolerances, of
-    1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes with ``guides``,
-    distances d of hands to points, add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near 0.65; with reach
-    0.2, far 0.2 and near 0.5.
+    ``solved`` is 1 or 0. If it is 0, the terms are ``far`` and ``near``, means over the class's errors e in units of
+    their tolerances, of 1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes
+    with ``guides``, distances d of hands to points, add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near
+    0.65; with reach 0.2, far 0.2 and near 0.5.
     """
     off = torch.stack([error.value / error.tolerance for error in errors])
     far, near = (1.0 - torch.tanh(off / 16.0)).mean(dim=0), torch.exp(-0.3 * off).mean(dim=0)

@@ -1,4 +1,4 @@
-"""Jointed things on a table: appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes."""
+"""Articulated objects on a table: appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes."""
 
 import math
 from dataclasses import replace
@@ -38,10 +38,10 @@ _PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
 class OpenScissors(ReachTask):
     """Open shears that lie on a table by a task's angle, each hand at its loop.
 
-    Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open: a task freezes it (0 is
-    34 degrees open; shut, where episodes start, is -0.59). The object pose is that of the left hand's half. The goal
-    block is of the half that moves: its handle's point and its orientation at the target angle, with the other half
-    where it is now; the rotation difference is that half's too, so that it shows the missing angle.
+    Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open, so a task freezes it (0
+    is 34 degrees open; -0.59 is shut, the angle at the start). The object pose is the pose of the left hand's half. The
+    goal block describes the moving half: its handle's point and its orientation at the target angle, for the present
+    pose of the other half. The rotation difference is also the moving half's and shows the missing angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -69,7 +69,7 @@ class OpenScissors(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: quaternion (n, 4); ``ghost``: pose (n, 7)."""
+        """Return ``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: rotation (n, 4); ``ghost``: (n, 7)."""
         root = variation.new_tensor((*_SCISSORS.position, *_SCISSORS.quaternion)).repeat(len(variation), 1)
         place(root, variation[:, :3])
         turn = yaw_quaternion(variation[:, 3])
@@ -99,13 +99,13 @@ class OpenScissors(ReachTask):
         return within(self.errors(state))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return where the right handle shall be; in version 1 with the shears at the task's start."""
+        """Return the goal of the right handle; in version 1 with the shears at the task's start."""
         pose = self.observe(state)["goal_pose"] if self.rules.wide else state.frozen["ghost"]
         return [Ghost(pose, (0.02, 0.02, 0.01))]
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
-    """Pose (n, 7) of the right handle's point on the half that is opened by ``turn`` (n, 4) from the other half."""
+    """Return the right handle's pose (n, 7) on the half that is opened by ``turn`` (n, 4) from the other half."""
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
     return posed(pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened)
@@ -117,17 +117,17 @@ def _missing(state: TaskState) -> Tensor:
 
 _PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
 _OPEN = 0.3
-_GAP = 0.0125  # version 2's tolerance, metres: with 2.5 cm one witness settled in 12 % of its tasks
+_GAP = 0.0125  # version 2's tolerance, metres; with 2.5 cm one witness settled in 12 % of its tasks
 _BODY_POINT = 0.07
-"""Where the body point lies on the pen's axis, metres; the cap's point lies towards the other end."""
+"""Position of the body point on the pen's axis, metres; the cap's point lies towards the other end."""
 
 
 class OpenPenCap(ReachTask):
     """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
 
     Observation: Table 34 (428). Reward: equation 16. Success is a cap pulled 13 cm, its own length. Goal position is
-    the cap's point at 0.3 m with the body at the task's start, goal orientation the pen's there; reward and success do
-    not read them.
+    the cap's point at 0.3 m with the body at the task's start, and goal orientation is the pen's at the start; reward
+    and success do not read the goal.
     """
 
     needs = Capacity(56, 0, 121)
@@ -158,7 +158,7 @@ class OpenPenCap(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        """Return ``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
         pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
         place(pen, variation[:, :3])
         rotation = xyzw(pen[:, 3:])
@@ -170,7 +170,7 @@ class OpenPenCap(ReachTask):
         return 5.0 * apart(state, *self.points)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return where the cap shall be: with wide variation its gap from the pen's body, wherever that lies."""
+        """Return the goal of the cap, with wide variation relative to the present pose of the pen's body."""
         if not self.rules.wide:
             return super().ghosts(state)
         pen = state.quaternion("pen/quaternion")
@@ -204,11 +204,11 @@ _BAR = (0.005, 0.09, 0.005)
 class Switch(ReachTask):
     """Press the buttons of two rocker switches.
 
-    Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The half of each rocker that stands proud
-    is the button, its point 3.5 cm from the hinge on the surface, its target the same point at full travel. Switch 1 is
-    the one at -y, the left hand's. The entries of switch 1's pose and velocity are its rocker's, since the housing does
-    not move. The goal block holds switch 1's target and its rocker's orientation there. A task freezes where the
-    housings stand, 3 cm around the nominal place, unturned; an episode draws nothing.
+    Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The raised half of each rocker is
+    the button, its point 3.5 cm from the hinge on the surface, its target the same point at full travel. Switch 1 is
+    the one at -y, for the left hand. The entries of switch 1's pose and velocity are its rocker's, because the housing
+    does not move. The goal block holds switch 1's target and its rocker's orientation at full travel. A task freezes
+    the places of the housings, 3 cm around the nominal place, unturned; an episode draws nothing.
     """
 
     needs = Capacity(36, 0, 90)
@@ -247,7 +247,7 @@ class Switch(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Base positions, targets of the button points ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
+        """Return base positions, the button points' targets ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
         frozen = {}
         for i, switch in enumerate(self.objects, start=1):
             position = variation.new_tensor(switch.position).repeat(len(variation), 1)
@@ -278,7 +278,7 @@ class Switch(ReachTask):
         return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return where the buttons' points shall be, with wide variation."""
+        """Return the goals of the buttons' points, with wide variation."""
         if not self.rules.wide:
             return []
         found = []
@@ -301,5 +301,5 @@ class Switch(ReachTask):
 
 
 def _rockers(state: TaskState) -> Tensor:
-    """Angles of both rockers, rad, (n, 2)."""
+    """Return the angles of both rockers, rad, (n, 2)."""
     return torch.cat([state["switch1/angle"], state["switch2/angle"]], dim=1)

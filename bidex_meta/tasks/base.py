@@ -1,4 +1,4 @@
-"""What a task class is: one scene, one variation space, one reward formula, one success test."""
+"""The base of task classes: one scene, one variation space, one reward formula, one success test."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
@@ -32,13 +32,14 @@ CONTROL_RATE = 60
 @checked_arguments
 @dataclass(frozen=True)
 class Solver:
-    """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md).
+    """Settings of the contact solver per class, in addition to the common profile (bidex_meta/hands/README.md).
 
     Attributes:
         iterations: Newton iterations at most; ``line_search``: steps of a line search at most.
-        cone: Friction cones: an elliptic one is exact, a pyramid costs a quarter to a third less and slips a little.
-        impratio: How much stiffer friction is than the normal force: a held object creeps the less.
-        time_step: Seconds: a whole number to a control step. Contacts and limits are as stiff as it allows.
+        cone: Friction cones: an elliptic cone is exact; a pyramid costs 25 to 33 % less and slips a little.
+        impratio: Stiffness of friction relative to the normal force; a higher ratio makes held objects creep less.
+        time_step: Seconds; a control step has a whole number of time steps. Contacts and limits are as stiff as it
+            allows.
         most_condim: Dimensions of a contact at most: 4 with torsional friction (eggs and fingertips), 3 without.
     """
 
@@ -60,17 +61,17 @@ class Solver:
 
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
-"""For eggs, held for a second: what creeps by a millimetre a second does no harm."""
+"""For eggs, held for a second: creeping by a millimetre per second does no harm."""
 GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
 """For an egg that is thrown across a narrow gap, so that nothing is fast."""
 FIRM = Solver(100, 50)
-"""For light bodies between hands and table: with the common caps the solver stops early and kicks them."""
+"""For light bodies between hands and table, which the solver would kick by stopping early at the common limits."""
 FAST = Solver(100, 50, time_step=1.0 / 180.0)
-"""For fast bases among things that do not yield: in 1/120 s a hand at full speed sinks 24 mm into a table."""
+"""For fast bases near rigid objects: in 1/120 s a hand at full speed sinks 24 mm into a table."""
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
-"""For fast bases that press things as thin as a finger on a table."""
+"""For fast bases that press objects as thin as a finger on a table."""
 JITTER, JOINT_NOISE = 0.005, 0.1
-"""Of jittered starts: half width of a fixture's shift, metres, and joint noise as a share of each joint's range."""
+"""Half width of a fixture's shift in jittered starts, metres, and joint noise as a share of each joint's range."""
 
 
 class TaskClass(ABC):
@@ -82,7 +83,7 @@ class TaskClass(ABC):
         name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: what it asks for, one line.
         formula: The printed reward; ``solved``: when it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
-        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, where that takes longer.
+        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, if it takes longer.
         right: Start pose of the right hand; ``left`` of the left one.
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
@@ -90,20 +91,20 @@ class TaskClass(ABC):
         wide_space: The same with wide variation; None: a class without version 2.
         wide_solved: ``solved`` with wide variation.
         wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
-        jittered_hands: Hands that jittered starts give joint noise, where ``start`` gives none.
+        jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
-        rules: Those of the suite; ``adopt`` sets them.
+        rules: The suite's rules; ``adopt`` sets them.
         chosen: Options of the constructor by name, given or by default; ``registry.get`` sets them.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
-            class says (fixed for HandOver alone).
+            class says (fixed only for HandOver).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
             by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
             largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
-        camera_angle: Azimuth and elevation of that look, degrees, such that hands, objects and goal are seen.
-        depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
+        camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
+        depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
             at ``camera_target`` from the front.
     """
 
@@ -141,10 +142,10 @@ class TaskClass(ABC):
         self.moving_base = true_or_false("moving_base", default)
 
     def adopt(self, rules: Rules) -> None:
-        """Take a suite's rules, once.
+        """Adopt a suite's rules, once.
 
-        Raises BidexError for wide variation or the reward of version 2 of a class that has none, and for a class that
-        has other rules already.
+        Raises BidexError if the class lacks the wide variation or the reward of version 2 that the rules require, or
+        already has other rules.
         """
         if self.rules not in (V1, rules):
             raise BidexError(
@@ -159,43 +160,43 @@ class TaskClass(ABC):
             self.widen()
 
     def widen(self) -> None:
-        """Takes the wide variation: ``wide_space``."""
+        """Use the wide variation: ``wide_space``."""
         if self.wide_space is None:
             raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
         self.variation_space = self.wide_space
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """What its compiled scene depends on: classes with equal keys may share it."""
+        """Return the values that determine the compiled scene; classes with equal keys may share it."""
         return self.name, self.moving_base, self.rules
 
     @property
     def observation_size(self) -> int:
-        """Entries of the observation before padding."""
+        """Return the number of observation entries before padding."""
         return self.layout.size
 
     @property
     def action_size(self) -> int:
-        """Number of actions: 26 a hand with a moving base, 20 with a fixed one."""
+        """Return the number of actions: per hand 26 with a moving base, 20 with a fixed base."""
         return 52 if self.moving_base else 40
 
     @property
     def layout(self) -> Layout:
-        """The observation as named blocks: both hands', then ``blocks``."""
+        """Return the observation as named blocks: both hands' blocks, then ``blocks``."""
         more = self.wide_blocks if self.rules.wide else ()
         return Layout((*both_hands(self.moving_base), *self.blocks, *more))
 
     @abstractmethod
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Adds everything but floor and hands to the scene."""
+        """Add everything but floor and hands to the scene."""
 
     @abstractmethod
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """What reward and observation need of variations (n, variation_space.size), computed once; each (n, k)."""
+        """Compute frozen values, each (n, k), for reward and observation from variations (n, variation_space.size)."""
 
     @abstractmethod
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Writes the start of an episode, from uniform numbers in [-1, 1], (n, start_draws), and frozen ones.
+        """Write the start of an episode, from uniform numbers in [-1, 1], (n, start_draws), and frozen numbers.
 
         ``qpos`` maps a part (``right/joints``, an object, ...) to views (n, k) of its positions that hold the nominal
         start and are written in place; MuJoCo's quaternion order (w, x, y, z).
@@ -203,12 +204,12 @@ class TaskClass(ABC):
 
     @property
     def draws(self) -> int:
-        """How many uniform numbers ``begin`` takes."""
+        """Return the number of uniform numbers that ``begin`` takes."""
         more = 24 * len(self.jittered_hands) + 2 * len(self.jittered_fixtures)
         return self.start_draws + (more if self.rules.jittered else 0)
 
     def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """``start`` with what the suite's rules add; ``draws`` are (n, self.draws)."""
+        """Run ``start``, then apply the additions of the suite's rules; ``draws`` are (n, self.draws)."""
         self.start(draws[:, : self.start_draws], frozen, qpos)
         if not self.rules.jittered:
             return
@@ -227,54 +228,54 @@ class TaskClass(ABC):
             joints.copy_(torch.where(meets[:, None], steady[side], joints))
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, tuple[float, float, float]]]:
-        """Return boxes so near to a hand that joint noise might push its fingers into them; none by default.
+        """Return boxes so close to a hand that joint noise might push its fingers into them; none by default.
 
-        Each is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A hand
-        that noise would push into its box starts without noise.
+        Each entry is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A
+        hand that noise would push into its box starts without noise.
         """
         return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The blocks of the layout that no sensor gives, by name, each (n, size); none by default."""
+        """Return the layout's blocks that no sensor gives, by name, each (n, size); none by default."""
         return {}
 
     @abstractmethod
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Named terms, each (n,), that sum to the reward of the printed formula."""
+        """Return named terms, each (n,), that sum to the reward of the printed formula."""
 
     @abstractmethod
     def success(self, state: TaskState) -> Tensor:
-        """Whether the task is solved in this state. Shape (n,), bool."""
+        """Return whether the task is solved in this state. Shape (n,), bool."""
 
     def errors(self, state: TaskState) -> list[Error]:
-        """How far a state is from solved, for the reward of version 2: at least one error."""
+        """Return a state's errors for the reward of version 2, at least one."""
         raise NotImplementedError
 
     def hides(self) -> tuple[Hidden, ...]:
-        """What only goal entries show of a task, and how exactly success asks for it; nothing by default."""
+        """Return the parts of a task that only goal entries show, with success tolerances; none by default."""
         return ()
 
     def hidden_columns(self) -> list[int]:
-        """Columns of a variation that hold what it hides."""
+        """Return the columns of a variation that hold hidden components."""
         names = self.variation_space.names
         return [names.index(name) for part in self.hides() for name in part.names]
 
     def guides(self, state: TaskState) -> list[Tensor]:
-        """Distances (m), each (n,), that the reward of version 2 wants small beside the errors: hands to points."""
+        """Return distances (m), each (n,), from hands to points; the reward of version 2 rewards small distances."""
         return []
 
     def solved_in(self, state: TaskState) -> Tensor:
-        """``success``, computed once for reward and world. Shape (n,), bool."""
+        """Return ``success``, computed once for reward and world. Shape (n,), bool."""
         return state.once("solved", lambda: self.success(state))
 
     def rewards(self, state: TaskState) -> dict[str, Tensor]:
-        """Named terms, each (n,), that sum to the reward by the suite's rules."""
+        """Return named terms, each (n,), that sum to the reward by the suite's rules."""
         if self.rules.reward == "paper":
             return self.reward_terms(state)
         return aligned_terms(self.solved_in(state), self.errors(state), self.guides(state))
 
     def failed(self, state: TaskState) -> Tensor:
-        """Whether the episode ends here other than by time. Shape (n,), bool; never by default."""
+        """Return whether the episode ends here other than by time. Shape (n,), bool; never by default."""
         first = next(iter(state.frozen.values()))
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 

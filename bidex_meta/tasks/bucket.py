@@ -1,4 +1,4 @@
-"""GraspAndPlace and PourWater: appendix A.2.17 (which has a picture of the first and no section); docs/figures.md."""
+"""GraspAndPlace and PourWater: appendix A.2.17 (with a picture of GraspAndPlace but no section); docs/figures.md."""
 
 import math
 
@@ -28,7 +28,7 @@ _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
 
 
 def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
-    """Which points (n, k, 3) are in a bucket: between floor and rim, and within the wall's radius there. (n, k), bool.
+    """Return which points (n, k, 3) lie in a bucket, between floor and rim and within the wall. (n, k), bool.
 
     Points and buckets' origins (n, 3) in the world, metres; the buckets' orientations (x, y, z, w), (n, 4).
     """
@@ -39,7 +39,7 @@ def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def stands(quaternion: Tensor) -> Tensor:
-    """Whether buckets are within 45 degrees of upright, from orientations (x, y, z, w). Shape (n, 4) to (n,), bool."""
+    """Return whether buckets are within 45 degrees of upright, by orientations (x, y, z, w), (n, 4). (n,), bool."""
     return uprightness(quaternion) > math.cos(math.radians(45.0))
 
 
@@ -50,7 +50,7 @@ class GraspAndPlace(ReachTask):
     """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
 
     Table 1 x 1 m, 60 cm high. Observation: the original's (425; docs/figures.md, observation). Reward: its formula with
-    hand-point distances. The original's success, d < 20 cm, is met by a block beside the bucket. A task shifts and
+    hand-point distances. The original's success, d < 20 cm, is met by a block next to the bucket. A task shifts and
     turns bucket and block. Both start on the table; the original's start inside it. Bucket pose and bucket link have
     one orientation here, so entries 401-404 and 414-417 are equal.
     """
@@ -93,7 +93,7 @@ class GraspAndPlace(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``bucket``, ``block``: shifts and turns (n, 3); with wide variation ``goal``, of the bucket: pose (n, 7)."""
+        """Return ``bucket``, ``block``: shifts, turns (n, 3); with wide variation ``goal``: bucket's pose (n, 7)."""
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
 
     def hides(self) -> tuple[Hidden, ...]:
@@ -116,7 +116,7 @@ class GraspAndPlace(ReachTask):
 
 
 def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
-    """``goal``: the bucket's nominal place shifted (n, 2), metres, upright; nothing without a shift (n, 0)."""
+    """Return ``goal``: the bucket's nominal place shifted (n, 2), metres, upright; nothing without a shift (n, 0)."""
     if not shift.shape[1]:
         return {}
     position = pad(shift, (0, 1)) + shift.new_tensor(bucket.position)
@@ -124,13 +124,13 @@ def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
 
 
 def _bucket_error(state: TaskState) -> list[Error]:
-    """How far the bucket is from its goal, where it has one."""
+    """Return the bucket's distance from its goal, if it has one."""
     goal = state.frozen.get("goal")
     return [] if goal is None else [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
 
 
 def _bucket_ghosts(state: TaskState) -> list[Ghost]:
-    """Return where the bucket shall stand, where it has a goal."""
+    """Return the goal of the bucket, if it has one."""
     goal = state.frozen.get("goal")
     return [] if goal is None else [Ghost(goal, (0.065, 0.065, 0.06))]
 
@@ -138,11 +138,11 @@ def _bucket_ghosts(state: TaskState) -> list[Ghost]:
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _SINK, _DEEPEST = 5.0, 0.2
-"""How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
-most, metres."""
+"""Metres that the goal sinks for each metre that the bucket is lifted, and its largest depth below the mouth of a
+standing bucket, metres."""
 _TROUGH_TILT = 0.541
 _TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
-"""Of the box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
+"""The box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
 
@@ -154,11 +154,11 @@ class PourWater(ReachTask):
     bucket's its origin.
 
     The goal of a bucket that stands on the table is the point on its axis 1 cm below the rim. It moves with the bucket,
-    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most: with a
-    goal fixed to the bucket, spout and goal would meet as well where the bucket is lifted and tipped under an upright
-    kettle. So only a kettle tilted over the rim gets near: below 30 degrees, where no water leaves, the spout stays 3
-    cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The goal's orientation is the kettle's at the task's
-    start, tilted by 40 degrees towards the spout.
+    but sinks by 5 cm per cm that the bucket's floor is lifted, to at most 20 cm below its height on the table. With a
+    goal fixed to the bucket, spout and goal would also meet if the bucket were lifted and tipped under an upright
+    kettle. So the spout only gets near the goal if the kettle is tilted over the rim: below 30 degrees no water leaves
+    and the spout stays 3 cm away, at 40 degrees 2 cm, and from 60 degrees on it reaches the goal. The goal's
+    orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
 
     A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
     friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
@@ -201,10 +201,10 @@ class PourWater(ReachTask):
     )
 
     def __init__(self, moving_base: bool | None = None, water: int = 12) -> None:
-        """Chooses the base and the number of drops, 1 to 125."""
+        """Choose the base and the number of drops, 1 to 125."""
         super().__init__(moving_base)
         self.water = whole_number("water", water, 1, 125)  # five layers fit under the lid
-        # Measured for 12, 30 and 125 drops: a drop adds 1.8 contacts, 1 convex pair and 1.6 rows at most.
+        # We measured 12, 30 and 125 drops: a drop adds at most 1.8 contacts, 1 convex pair and 1.6 rows.
         more = max(0, water - 12)
         self.needs = Capacity(71 + 3 * more, 20 + more, 134 + 3 * more)
 
@@ -214,7 +214,7 @@ class PourWater(ReachTask):
             SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``kettle``, ``bucket``: shifts and turns (n, 3); ``goal_rotation``: (x, y, z, w), and its inverse (n, 4)."""
+        """Return ``kettle``, ``bucket``: shifts, turns (n, 3); ``goal_rotation``: (x, y, z, w), and inverse (n, 4)."""
         nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
         tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0))))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
@@ -238,11 +238,11 @@ class PourWater(ReachTask):
         return [("left", posed(centre, multiply(turn, tilt)), _TROUGH_HALF)]
 
     def _fill(self, like: Tensor) -> Tensor:
-        """Positions of the drops in the kettle's frame, metres, (water, 3)."""
+        """Return the positions of the drops in the kettle's frame, metres, (water, 3)."""
         i = torch.arange(self.water, device=like.device)
         middle = 0.5 * (_SIDE - 1)
         x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
-        z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest 0.5 mm above the floor
+        z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest drops start 0.5 mm above the floor
         return torch.stack((x, y, z), dim=1).to(like.dtype)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -272,7 +272,7 @@ class PourWater(ReachTask):
         return poured & within(_bucket_error(state)) if self.rules.wide else poured
 
     def _inside(self, state: TaskState) -> Tensor:
-        """Drops in the bucket, (n,)."""
+        """Return the number of drops in the bucket, (n,)."""
 
         def count() -> Tensor:
             drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
@@ -283,12 +283,12 @@ class PourWater(ReachTask):
 
 
 def _spout_off(state: TaskState) -> Tensor:
-    """Distance from the spout to its goal, metres, (n,)."""
+    """Return the distance from the spout to its goal, metres, (n,)."""
     return state.once("spout", lambda: norm(state["kettle/spout_position"] - _goal(state)))
 
 
 def _goal(state: TaskState) -> Tensor:
-    """Where the spout shall be, world, metres, (n, 3)."""
+    """Return the goal of the spout, world, metres, (n, 3)."""
 
     def sunk() -> Tensor:
         x, y, height = state["bucket/mouth_position"].unbind(1)

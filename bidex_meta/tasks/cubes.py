@@ -23,7 +23,7 @@ from bidex_meta.tasks.variation import component, join, orientation
 from bidex_meta.utils.maths import constant, multiply, norm, rotate, rotation_angle, wxyz, xyzw
 
 _RED, _BLUE = (0.85, 0.43, 0.30), (0.24, 0.52, 0.74)
-"""Colours of the first cube and of the second, which has that of its file."""
+"""Colours of the first cube and of the second cube, which keeps its file's colour."""
 _EDGE, _HALF = 0.05, (0.025, 0.025, 0.025)
 """Edge of a cube and its half sizes, metres."""
 _RODS = (
@@ -35,7 +35,7 @@ _RODS = (
 
 
 def _cubes(name: str, first: Point, second: Point) -> tuple[SceneObject, SceneObject]:
-    """Two cubes at positions in the world, metres; the first is red."""
+    """Return two cubes at positions in the world, metres; the first is red."""
     red = SceneObject(f"{name}1", "cube", first, colour=(*_RED, 1.0))
     return red, SceneObject(f"{name}2", "cube", second)
 
@@ -54,12 +54,12 @@ class _TwoBlocks(ReachTask):
     centres = tuple(point_block(f"block{i}_position", f"block{i}/position", f"centre of block {i}") for i in (1, 2))
 
     def distances(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        """Of the blocks to their goals, metres, each (n,)."""
+        """Return the distances of the blocks to their goals, metres, each (n,)."""
         first, second = (norm(state[f"block{i}/position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
         return first, second
 
     def off_by(self, state: TaskState, tolerance: float) -> list[Error]:
-        """``distances`` as errors."""
+        """Return ``distances`` as errors."""
         return [Error(distance, tolerance) for distance in self.distances(state)]
 
     def target(self, state: TaskState) -> Tensor:
@@ -73,7 +73,7 @@ class _TwoBlocks(ReachTask):
 
 
 def _unturned(position: Tensor) -> Tensor:
-    """Poses (n, 7) with the world's axes at positions (n, 3)."""
+    """Return poses (n, 7) with the world's axes at positions (n, 3)."""
     return posed(position, position.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(position), 4))
 
 
@@ -81,7 +81,7 @@ class PushBlock(_TwoBlocks):
     """Push two blocks on a table, one with each hand, 20 cm away to their goals.
 
     Table 1 x 1 m, 60 cm high, its friction the mean of the original's 0.5 and of 1 for hands and blocks. Observation:
-    Table 26 (417), without the goals; so these are fixed and the starts vary: a task shifts and turns each block.
+    Table 26 (417), without the goals; so goals are fixed and starts vary: a task shifts and turns each block.
     Reward: equation 12.
     """
 
@@ -108,7 +108,7 @@ class PushBlock(_TwoBlocks):
     blocks = (*object_blocks("block1"), *_TwoBlocks.centres)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
+        """Return ``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
         goals = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
         first, second = (variation.new_tensor(goal).expand(len(variation), 3) for goal in goals)
         if self.rules.wide:
@@ -116,7 +116,7 @@ class PushBlock(_TwoBlocks):
         return super().freeze(variation) | {"goal1": first, "goal2": second}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """With wide variation the goals of both blocks."""
+        """Return the goals of both blocks with wide variation, else nothing."""
         if not self.rules.wide:
             return {}
         goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
@@ -167,7 +167,7 @@ class StackBlock(_TwoBlocks):
         placed("block1"), placed("block2"), *(component(f"target_{axis}", -0.03, 0.03) for axis in "xy")
     )
     wide_space = join(
-        placed("block1"),  # farther they would meet
+        placed("block1"),  # with larger shifts the blocks would touch
         placed("block2"),
         *(component(f"target_{axis}", -0.09, 0.09) for axis in "xy"),
         component("order", -1.0, 1.0),
@@ -182,7 +182,7 @@ class StackBlock(_TwoBlocks):
             cube.friction[0], cube.priority = 0.375, 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``block1``, ``block2``: shifts, turns (n, 3); their targets (n, 3); ``goal``: the top block's pose (n, 7)."""
+        """Return ``block1``, ``block2``: shifts, turns (n, 3); targets (n, 3); ``goal``: top block's pose (n, 7)."""
         shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
         bottom = shift + shift.new_tensor((0.0, 0.0, 0.625))
         top = bottom + shift.new_tensor((0.0, 0.0, _EDGE))
@@ -194,7 +194,7 @@ class StackBlock(_TwoBlocks):
         return frozen | {"goal1": first, "goal2": second, "upper": upper}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Target 1 and block 1's turn; with wide variation the targets of both blocks."""
+        """Return target 1 and block 1's turn; with wide variation the targets of both blocks."""
         if self.rules.wide:
             goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
             return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
@@ -219,9 +219,9 @@ class StackBlock(_TwoBlocks):
 class ReOrientation(TaskClass):
     """Turn the two cubes that lie on the hands to one common orientation.
 
-    No table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing asks; the
-    original's lies on the right. Bases move as the appendix says (52 actions), with the scales of CatchUnderarm. No
-    episode ends early, since the reward is negative.
+    No table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing requires; in
+    the original it lies on the right. Bases move as the appendix says (52 actions), with the scales of CatchUnderarm.
+    No episode ends early, since the reward is negative.
 
     Both cubes start with the same random orientation 10 cm above the mounts and drop onto the palms; fingers that the
     start noise would push into a cube's bounding sphere are opened.
@@ -254,7 +254,7 @@ class ReOrientation(TaskClass):
             cube.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        """Return ``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
         frozen = {}
         for i, centre in enumerate(((0.0, -0.76, 0.56), (0.0, -0.39, 0.56)), start=1):
             position = variation.new_tensor(centre).expand(len(variation), 3)
@@ -288,11 +288,11 @@ class ReOrientation(TaskClass):
         return (first_angle < 0.2) & (second_angle < 0.2) & (first < 0.1) & (second < 0.1)
 
     def _distances(self, state: TaskState) -> list[tuple[Tensor, Tensor]]:
-        """Per cube its distance (m) and rotation (rad) to its goal, each (n,)."""
+        """Return per cube the distance (m) and rotation (rad) to its goal, each (n,)."""
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals, with wide variation their axes x, y and z in red, green and blue: a ball shows no turn."""
+        """Return the goals, with wide variation as red x, green y and blue z axes, because a ball shows no turn."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]
@@ -300,7 +300,7 @@ class ReOrientation(TaskClass):
 
 
 def _axes(goal: Tensor) -> list[Ghost]:
-    """Return three rods from a pose (n, 7) on along its axes."""
+    """Return three rods that start at a pose (n, 7) and follow its axes."""
     return [
         Ghost(posed(goal[:, :3] + rotate(goal[:, 3:], constant(middle, goal)), goal[:, 3:]), size, colour)
         for middle, size, colour in _RODS
@@ -308,7 +308,7 @@ def _axes(goal: Tensor) -> list[Ghost]:
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
-    """Turns cubes (n, 7) within 0.5 rad of their goal's orientation by half a turn about the world's x, in place."""
+    """Turn cubes (n, 7) within 0.5 rad of their goal's orientation by half a turn about the world's x, in place."""
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < 0.5
     turned = multiply(constant((1.0, 0.0, 0.0, 0.0), now).expand_as(now), now)

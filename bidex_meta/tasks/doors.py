@@ -24,16 +24,16 @@ from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rota
 
 _BASE = (0.0, 0.0, 0.7)
 _HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
-"""Where the leaves turn, right and left, in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
+"""Hinges of the right and the left leaf in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
 _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
 """Centres of the panels in the leaves' frames, and their half sizes, metres."""
 _HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
-"""The hands' points in the leaves' frames, metres; of an Inward door at -x."""
+"""The hands' points in the leaves' frames, metres; at -x for an Inward door."""
 _POLE = (0.025, 0.025, 0.65)
 """Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
 _LEAST_SHARE = 0.1
-"""Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
-pushed against its stop, which yields, more than 0.5 m."""
+"""Least distance of each handle from the door's middle along y, metres. One leaf of an Inward door gives 0.497 m, and
+more than 0.5 m if it is pushed against its stop, which yields."""
 _SHUT_ANGLE = 0.1 * (0.5 * math.pi)
 _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
 
@@ -41,11 +41,11 @@ _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door
 class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
-    With wide variation a task also freezes the angle at which each leaf shall stand, hinge 1 (right) and 2; the goal
-    block then holds both angles and both angles that are missing, instead of the base pose.
+    With wide variation a task also freezes each leaf's target angle, hinge 1 (right) and 2; the goal block then holds
+    both target angles and both remaining angles, instead of the base pose.
 
-    Leaf and handle of the right hand are those at +y. Success of the classes that open is measured along y, since a
-    leaf alone makes a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
+    Leaf and handle at +y are the right hand's. Success of the opening classes is measured along y, because a single
+    leaf gives a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
     for both leaves; an episode draws nothing. The goal block holds the base pose, also the object's. The Inward classes
     have the same door upside down, so that it swings towards the hands; their handle points lie behind the pulls that
     then face the hands.
@@ -86,7 +86,7 @@ class _Door(ReachTask):
         return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
+        """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: of leaves (n, 1)."""
         position = variation.new_tensor(_BASE).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
         turn = xyzw(variation.new_tensor(quaternion_from_rpy(self.objects[0].rpy))).expand(len(variation), 4)
@@ -113,7 +113,7 @@ class _Door(ReachTask):
         return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return where the handles shall be, with wide variation."""
+        """Return the goals of the handles, with wide variation."""
         if not self.rules.wide:
             return []
         base, angles = posed(state["object/position"], state.quaternion("object/quaternion")), state.frozen["leaves"]
@@ -122,7 +122,7 @@ class _Door(ReachTask):
 
     @abstractmethod
     def narrow_errors(self, state: TaskState) -> list[Error]:
-        """``errors`` without angles of a task."""
+        """Return the errors of a task without target angles."""
 
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state))
@@ -140,7 +140,7 @@ def _on_leaf(base: Tensor, leaf: int, angle: Tensor, point: Point) -> Tensor:
 
 
 def _hinges(state: TaskState) -> Tensor:
-    """Angles of both leaves, rad, (n, 2)."""
+    """Return the angles of both leaves, rad, (n, 2)."""
     return torch.cat([state[f"object/hinge{leaf}_angle"] for leaf in (1, 2)], dim=1)
 
 
@@ -153,7 +153,7 @@ class _Open(_Door):
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
     wide_space = join(
-        component("base_y", -0.08, 0.08),  # farther the handles would start in the hands
+        component("base_y", -0.08, 0.08),  # with larger shifts the handles would start in the hands
         component("start_angle", 0.0, 0.15),
         *(component(f"{side}_angle", 0.3, 1.4) for side in SIDES),
     )
@@ -162,7 +162,7 @@ class _Open(_Door):
         return 2.0 * apart(state, *self.points)
 
     def _opening(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        """Distances of the right and the left handle from the middle along y, metres, each (n,)."""
+        """Return the distances of the right and the left handle from the middle along y, metres, each (n,)."""
         middle = state["object/position"][:, 1]
         right = state["object/right_handle_position"][:, 1] - middle
         return right, middle - state["object/left_handle_position"][:, 1]
@@ -212,7 +212,7 @@ class DoorOpenOutward(_Open):
 class DoorCloseInward(_Close):
     """Push a double door shut that stands open towards the hands. Observation: Table 20 (428). Reward: equation 8.
 
-    The hands start farther out than in the other door classes, beside the open leaves.
+    The hands start farther out than in the other door classes, next to the open leaves.
     """
 
     needs = Capacity(38, 0, 77)
@@ -222,10 +222,10 @@ class DoorCloseInward(_Close):
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
     camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
-    wide_space = _closed_to(0.05)  # farther the leaves would start in the hands
+    wide_space = _closed_to(0.05)  # with larger angles the leaves would start in the hands
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
-        """Return the panel of each leaf; an open one ends beside the fingertips of its hand."""
+        """Return the panel of each leaf; an open leaf ends next to the fingertips of its hand."""
         door = qpos["object"]
         base = posed(door[:, :3], xyzw(door[:, 3:]))
         return [

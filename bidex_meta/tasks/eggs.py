@@ -1,4 +1,4 @@
-"""What the throwing and catching classes share: eggs, their goal poses, the exponential reward of equations 1 to 5."""
+"""Common parts of the throwing and catching classes: eggs, goal poses, the exponential reward of equations 1 to 5."""
 
 from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
@@ -28,32 +28,32 @@ JOINT_DRAWS = 24
 
 
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
-    """For ``""``, or ``"1"`` and ``"2"``, the blocks of ``object`` or ``object1``, ... and its goal."""
+    """Return, for ``""``, or ``"1"`` and ``"2"``, the blocks of ``object`` or ``object1``, ... and its goal."""
     return tuple(block for i in numbers for block in (*object_blocks(f"object{i}"), *goal_blocks(f"goal{i}")))
 
 
 def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]:
-    """The goal blocks of ``goal_object_blocks``."""
+    """Return the goal blocks of ``goal_object_blocks``."""
     goals = [observe_goal(state, f"object{i}/quaternion", f"goal{i}") for i in numbers]
     return {name: value for goal in goals for name, value in goal.items()}
 
 
 def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
-    """Pose (n, 7), position and quaternion (x, y, z, w), from positions (n, 3) and orientation draws (n, 2)."""
+    """Return poses (n, 7), position and quaternion (x, y, z, w), from positions (n, 3) and orientation draws (n, 2)."""
     return torch.cat((position, random_orientation(draws[:, 0], draws[:, 1])), dim=1)
 
 
 def start_hands(draws: Tensor, noise: float, qpos: dict[str, Tensor]) -> None:
-    """Gives both hands the same noisy joint angles (docs/figures.md, start noise). Draws in [-1, 1], shape (n, 24)."""
+    """Give both hands the same noisy joint angles (docs/figures.md, start noise). Draws in [-1, 1], shape (n, 24)."""
     joints = noisy_joints(draws, noise)
     qpos["right/joints"].copy_(joints)
     qpos["left/joints"].copy_(joints)
 
 
 def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
-    """Shifts an egg (n, 7), in place, by up to ``noise`` (m) from its nominal start and turns it at random.
+    """Shift an egg (n, 7), in place, by up to ``noise`` (m) from its nominal start and turn it at random.
 
-    Draws in [-1, 1], shape (n, 5): three of position, two of orientation.
+    The draws are in [-1, 1], shape (n, 5): three for position, two for orientation.
     """
     qpos[:, :3] += noise * draws[:, :3]
     qpos[:, 3:] = wxyz(random_orientation(draws[:, 3], draws[:, 4]))
@@ -62,9 +62,10 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
 def lay_egg_on_hand(
     egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
 ) -> None:
-    """Lifts an egg, or what a spheroid bounds, off the palm it lies on and opens the fingers that would stick in it.
+    """Lift an egg, or an object in a spheroid, off its palm and open the fingers that would penetrate it.
 
-    Written in place: the egg (n, 7) and joint angles (n, 24) of the hand that starts at ``pose``. Semi-axes in metres.
+    The egg (n, 7) and the joint angles (n, 24) of the hand that starts at ``pose`` are written in place. Semi-axes are
+    in metres.
     """
     quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
@@ -78,11 +79,11 @@ def lay_egg_on_hand(
 def put_down(
     place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
 ) -> None:
-    """The start of an egg, in any orientation, or of an object in its place, on a broad side; clear of the hand.
+    """Write the start of an egg, in any orientation, or of another object, on a broad side; clear of the hand.
 
-    Its positions (n, 7) and the joint angles (n, 24) of the hand that it lies on are written in place. Without joints
-    it lies on none: an object that reaches further down than an egg then starts so much higher. Draws and noise as of
-    ``start_egg``.
+    The positions (n, 7) and the joint angles (n, 24) of the hand below are written in place. Without joints no hand is
+    below: an object that reaches further down than an egg then starts higher by the difference. Draws and noise are
+    those of ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -98,7 +99,7 @@ def put_down(
 
 
 def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
-    """Distance (m) and rotation (rad in [0, pi]) between an egg and its goal, each (n,)."""
+    """Return the distance (m) and rotation (rad in [0, pi]) between an egg and its goal, each (n,)."""
     target = state.frozen[goal]
     translation = state.once(("distance", egg), lambda: norm(state[f"{egg}/position"] - target[:, :3]))
     difference = rotation_difference(state, f"{egg}/quaternion", goal)
@@ -109,7 +110,7 @@ class EggTask(TaskClass):
     """Throw each egg to a goal pose at the other hand; all goals share an orientation, all eggs a start noise.
 
     Attributes:
-        starts: Nominal start of each egg, world, metres: of one that lies on the right hand, and of one on the left.
+        starts: Nominal start of each egg, world, metres: first an egg on the right hand, then one on the left.
         goals: Centre of the box of each egg's goals, world, metres.
         position_noise: Half width of the eggs' noise at a start, m; ``joint_noise``: a share of each joint's range.
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
@@ -135,9 +136,9 @@ class EggTask(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Chooses the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
+        """Choose the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
 
-        Raises BidexError where there is no such object, or its file holds none for a hand.
+        Raises BidexError if there is no such object, or its file holds no object for a hand.
         """
         super().__init__(moving_base)
         self.held = held_object(object)
@@ -150,13 +151,13 @@ class EggTask(TaskClass):
 
     @property
     def variation_space(self) -> VariationSpace:
-        """Goal positions (world, metres) and the two draws of the goals' orientation."""
+        """Return the space of goal positions (world, metres) and the two draws of the goals' orientation."""
         half = 0.06 if self.rules.wide else 0.03
         boxes = (box(f"goal{i}", centre, half) for i, centre in zip(self.numbers, self.goals, strict=True))
         return join(*boxes, orientation("goal"))
 
     def widen(self) -> None:
-        """The goals' boxes follow the rules (``variation_space``)."""
+        """Accept wide variation; the goals' boxes follow the rules (``variation_space``)."""
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         green = (0.45, 0.62, 0.30, 1.0)
@@ -167,7 +168,7 @@ class EggTask(TaskClass):
                 self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        """Return ``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``..._inverse``: inverse rotations (n, 4)."""
         frozen = {}
         for k, i in enumerate(self.numbers):
             frozen |= frozen_goal(goal_pose(variation[:, 3 * k : 3 * k + 3], variation[:, -2:]), f"goal{i}")
@@ -185,7 +186,7 @@ class EggTask(TaskClass):
         return observe_goals(state, self.numbers)
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d_t + d_r))."""
+        """Return ``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d_t + d_r))."""
         terms = {}
         for i in self.numbers:
             translation, rotation = distances(state, f"object{i}", f"goal{i}")
@@ -202,7 +203,7 @@ class EggTask(TaskClass):
         return within(self.errors(state))
 
     def failed(self, state: TaskState) -> Tensor:
-        """An egg dropped or a hand left: the reward is positive throughout, so an early end is never worth seeking."""
+        """Return whether an egg dropped or a hand left; rewards are positive, so an early end never pays off."""
         ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
         for name, anchor in self.anchors.items():
             point = state[name]

@@ -1,4 +1,4 @@
-"""What classes with a goal pose share: the frozen goal, the goal blocks of the observation, and goals in pictures."""
+"""Common parts of classes with a goal pose: the frozen goal, goal blocks of the observation, goals in pictures."""
 
 from typing import NamedTuple
 
@@ -29,17 +29,17 @@ def posed(position: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
-    """A goal pose (n, 7), position and quaternion (x, y, z, w), and the inverse of its rotation, as frozen numbers."""
+    """Return a goal pose (n, 7), position and quaternion (x, y, z, w), and its inverse rotation, as frozen numbers."""
     return {goal: pose, f"{goal}_inverse": conjugate(pose[:, 3:])}
 
 
 def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Tensor:
-    """A body's quaternion, by its sensor, times the inverse of its frozen goal's, (x, y, z, w), shape (n, 4)."""
+    """Return a body's quaternion, by its sensor, times its frozen goal's inverse, (x, y, z, w), shape (n, 4)."""
     inverse = state.frozen[f"{goal}_inverse"]
     return state.once(("difference", sensor, goal), lambda: multiply(state.quaternion(sensor), inverse))
 
 
 def observe_goal(state: TaskState, sensor: str, goal: str = "goal") -> dict[str, Tensor]:
-    """The two goal blocks of a body whose orientation that sensor gives."""
+    """Return the two goal blocks of a body whose orientation the sensor gives."""
     difference = rotation_difference(state, sensor, goal)
     return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": difference}

@@ -1,4 +1,4 @@
-"""The observation of a task as named blocks: sizes, indices, goal mask and documentation derive from it."""
+"""The observation of a task as named blocks, from which sizes, indices, goal mask and documentation are derived."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ class Block:
     """Consecutive entries of an observation.
 
     Attributes:
-        sensors: Names of the sensors it is read from, in order; empty if the entries are computed.
+        sensors: Names of the sensors that the block is read from, in order; empty if the entries are computed.
         scale: Factor on the sensors' values.
-        goal: Whether it shows the goal, so that meta suites zero it.
+        goal: Whether the block shows the goal, so that meta suites zero it.
         description: One line for documentation, with unit and frame.
     """
 
@@ -54,11 +54,11 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Number of entries."""
+        """Return the number of entries."""
         return sum(block.size for block in self.blocks)
 
     def __iter__(self) -> Iterator[tuple[Block, slice]]:
-        """The blocks with their index ranges."""
+        """Yield the blocks with their index ranges."""
         start = 0
         for block in self.blocks:
             yield block, slice(start, start + block.size)
@@ -66,7 +66,7 @@ class Layout:
 
     @checked_arguments
     def range(self, name: str) -> slice:
-        """Index range of the named block; BidexError if there is none."""
+        """Return the index range of the named block; BidexError if there is none."""
         if name not in self._ranges:
             raise unknown_name("block", name, self._ranges)
         return self._ranges[name]
@@ -76,12 +76,12 @@ class Layout:
         return {block.name: where for block, where in self}
 
     def goal_indices(self) -> list[int]:
-        """Indices of all entries that show the goal."""
+        """Return the indices of all entries that show the goal."""
         return [i for block, where in self if block.goal for i in range(where.start, where.stop)]
 
 
 def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
-    """One hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
+    """Return one hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
 
     def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
         sensors = tuple(f"{side}/{part}_{kind}" for part in parts for kind in kinds.split())
@@ -108,7 +108,7 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
 
 @checked_arguments
 def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
-    """Pose and velocities of a free object (13 entries), ``<name>_...``, read from the sensors ``<sensors>/...``."""
+    """Return pose and velocities of a free object (13 entries), ``<name>_...``, read from ``<sensors>/...``."""
     name, spin = name or sensors, f"{sensors}/angular_velocity"
     return (
         Block(f"{name}_pose", 7, (f"{sensors}/position", f"{sensors}/quaternion"), description=_POSE),
@@ -119,7 +119,7 @@ def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
 
 @checked_arguments
 def goal_blocks(name: Text) -> tuple[Block, ...]:
-    """Goal pose and the rotation from goal to object (11 entries), zeroed in meta suites."""
+    """Return goal pose and rotation from goal to object (11 entries), zeroed in meta suites."""
     return (
         Block(f"{name}_pose", 7, goal=True, description=_POSE),
         Block(f"{name}_rotation_difference", 4, goal=True, description=_DIFFERENCE),
@@ -128,17 +128,17 @@ def goal_blocks(name: Text) -> tuple[Block, ...]:
 
 @checked_arguments
 def point_block(name: Text, sensor: Text, description: str) -> Block:
-    """A point that moves with an object: its position (3 entries), read from one sensor."""
+    """Return the block of a point that moves with an object: its position (3 entries), read from one sensor."""
     return Block(name, 3, (sensor,), description=f"{description}, world frame, m")
 
 
 def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
-    """The points ``<sensors>/<side>_handle_position`` with their descriptions (6 entries)."""
+    """Return the points ``<sensors>/<side>_handle_position`` with their descriptions (6 entries)."""
     first, second = (f"{side}_handle_position" for side in SIDES)
     return point_block(first, f"{sensors}/{first}", right), point_block(second, f"{sensors}/{second}", left)
 
 
 @cache
 def both_hands(moving: bool) -> tuple[Block, ...]:
-    """Table 7: 398 entries with moving bases, 374 with fixed ones."""
+    """Return Table 7: 398 entries with moving bases, 374 with fixed bases."""
     return tuple(block for side in SIDES for block in hand_blocks(side, moving))

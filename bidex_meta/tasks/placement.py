@@ -1,4 +1,4 @@
-"""Where objects stand at the start: a task freezes shifts from the nominal place, an episode adds a small jitter.
+"""Start places of objects: a task freezes shifts from the nominal place, an episode adds a small jitter.
 
 Turns are about the world's vertical through the object's own origin.
 """
@@ -18,30 +18,30 @@ SHIFT, TURN = 0.03, 0.2617993877991494
 JITTER, JITTER_TURN = 0.005, 0.05
 """Half widths of an episode's additional shift, metres, and turn, radians."""
 DRAWS = 3
-"""Uniform numbers that an episode draws for an object that it jitters: x, y, turn."""
+"""Uniform numbers that an episode draws for each jittered object: x, y, turn."""
 
 
 @checked_arguments
 def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> VariationSpace:
-    """An object's shift and turn as components ``<name>_x``, ``<name>_y`` (metres) and ``<name>_yaw`` (radians)."""
+    """Return the shift and turn as components ``<name>_x``, ``<name>_y`` (metres), ``<name>_yaw`` (radians)."""
     half = (shift, shift, turn)
     return VariationSpace((f"{name}_x", f"{name}_y", f"{name}_yaw"), tuple(-h for h in half), half)
 
 
 def yaw_quaternion(yaw: Tensor) -> Tensor:
-    """Turns about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
+    """Return turns about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
 
-    Sines of a vector unit and of its scalar tail may differ in the last bit of double precision, and a row's start must
-    not depend on its place in a batch.
+    Vectorised sines and the scalar sines at the end of an array may differ in the last bit of double precision, and a
+    row's start must not depend on its place in a batch.
     """
     half, zero = 0.5 * yaw, torch.zeros_like(yaw)
     return torch.stack((zero, zero, half.sin(), half.cos()), dim=-1).float().to(yaw.dtype)
 
 
 def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
-    """Shifts and turns nominal poses (n, 7), quaternion (w, x, y, z), in place, by x, y (metres) and yaw (n, 3).
+    """Shift and turn nominal poses (n, 7), quaternion (w, x, y, z), in place, by x, y (metres) and yaw (n, 3).
 
-    ``draws`` in [-1, 1], (n, 3), are of the episodes' jitter; None for a fixture, which has none.
+    ``draws`` in [-1, 1], (n, 3), give the episodes' jitter; None for a fixture, which has no jitter.
     """
     shift = frozen if draws is None else frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
     pose[:, :2] += shift[:, :2]
@@ -49,6 +49,6 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
 
 def place_all(names: Iterable[str], qpos: dict[str, Tensor], frozen: dict[str, Tensor], draws: Tensor) -> None:
-    """Places several objects, each by the frozen numbers of its name and its share of the draws, ``DRAWS`` each."""
+    """Place several objects, each by the frozen numbers of its name and its share of the draws, ``DRAWS`` each."""
     for name, jitter in zip(names, draws.split(DRAWS, dim=1), strict=True):
         place(qpos[name], frozen[name], jitter)

@@ -1,4 +1,4 @@
-"""What the classes with tables, doors and tools share: a point that each hand shall reach, and the linear reward."""
+"""Common parts of the classes with tables, doors and tools: a target point for each hand, and the linear reward."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -17,7 +17,7 @@ from bidex_meta.utils.maths import norm
 
 
 def reach(state: TaskState, side: str, point: str) -> Tensor:
-    """Distance (m) from the hand of a side to a point, given by the sensor of its position. Shape (n,).
+    """Return the distance (m) from the hand of a side to a point, given by its position sensor. Shape (n,).
 
     The hand's point is the palm's origin + 8 cm along the fingers + 2 cm out of the palm (docs/figures.md, hand point).
     """
@@ -25,7 +25,7 @@ def reach(state: TaskState, side: str, point: str) -> Tensor:
 
 
 def apart(state: TaskState, a: str, b: str) -> Tensor:
-    """Distance (m) between the positions that two sensors give, shape (n,)."""
+    """Return the distance (m) between the positions that two sensors give, shape (n,)."""
     return state.once(("apart", a, b), lambda: norm(state[a] - state[b]))
 
 
@@ -33,9 +33,9 @@ class ReachTask(TaskClass):
     """A class with the reward ``left`` -d_left + ``right`` -d_right + ``target`` + ``constant``.
 
     Attributes:
-        table: Its table.
+        table: The table of the class.
         objects: Objects that a task shifts and turns and an episode jitters, in the order of variation and draws.
-        points: Sensors of the points that the left and the right hand shall reach.
+        points: Sensors of the points that the left and the right hand must reach.
         constant: Constant of the reward.
         exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
         terms: Order in which the reward's terms are summed.
@@ -60,7 +60,7 @@ class ReachTask(TaskClass):
             each.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Each object's shift and turn by its name, (n, 3)."""
+        """Return each object's shift and turn by its name, (n, 3)."""
         return {each.name: variation[:, 3 * i : 3 * i + 3] for i, each in enumerate(self.objects)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
@@ -71,7 +71,7 @@ class ReachTask(TaskClass):
 
     @abstractmethod
     def target(self, state: TaskState) -> Tensor:
-        """The reward's target term, (n,)."""
+        """Return the reward's target term, (n,)."""
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         target = self.target(state)

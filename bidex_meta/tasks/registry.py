@@ -1,4 +1,4 @@
-"""The task classes by name; ``package.module:Class`` names one of the user's own."""
+"""The task classes by name; ``package.module:Class`` names a user's class."""
 
 import importlib
 import inspect
@@ -26,17 +26,17 @@ _MODULES = {
 
 
 def names() -> list[str]:
-    """Names of all task classes, in the order of the appendix."""
+    """Return the names of all task classes, in the order of the appendix."""
     return list(_MODULES)
 
 
 def module_of(name: str) -> str:
-    """Name of the module of a class in ``names``; it need not be imported yet."""
+    """Return the module name of a class in ``names``; the module need not be imported yet."""
     return f"bidex_meta.tasks.{_MODULES[name]}"
 
 
 def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
-    """A class's name among those of a suite: ``Switch-v2`` on its own is ``Switch`` in a suite of version 2."""
+    """Return a class's name in a suite: ``Switch-v2`` is ``Switch`` in a suite of version 2."""
     plain = plain_name(name)
     written = list(classes)
     return plain if name not in written and plain in written and classes[plain].rules == V2 else name
@@ -47,7 +47,7 @@ def resolve(name: str, kind: str = "task class") -> str:
 
     A name may end in ``-v2``.
 
-    Raises BidexError where there is no such class; the message calls it a ``kind``.
+    Raises BidexError if there is no such class; the message names it a ``kind``.
     """
     plain = plain_name(str(name))
     has_version = plain != str(name)
@@ -59,24 +59,24 @@ def resolve(name: str, kind: str = "task class") -> str:
 
 
 def with_object(name: str | None) -> dict[str, str]:
-    """The option of ``get`` that chooses an object; none for None."""
+    """Return the option of ``get`` that chooses an object; no option for None."""
     return {} if name is None else {"object": name}
 
 
 def check_object(name: object) -> None:
-    """Raise BidexError for an object called ``v2``: with it a class's name would be that of version 2."""
+    """Raise BidexError for an object named ``v2``, because class names with it would mean version 2."""
     if isinstance(name, str) and Path(name).stem.casefold() == "v2":
         raise BidexError(f"object: expected a name other than v2, which stands for a version, got {name!r}. Rename it.")
 
 
 def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
-    """A task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
+    """Return a task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
 
     ``CatchUnderarm-v2`` has the rules of version 2. ``moving_base`` drives the hands' bases (52 actions) or fixes them
     (40); None takes the class's own. Options are those of the class, e.g. ``water=30`` for PourWater,
     ``object="block"`` for CatchUnderarm.
 
-    Raises BidexError where there is no such class or option; the message gives the nearest name and the list.
+    Raises BidexError if there is no such class or option; the message gives the nearest name and the list.
     """
     plain = plain_name(name)
     if is_outside(name):
@@ -98,7 +98,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
 
 
 def _outside(name: str) -> "type[TaskClass]":
-    from bidex_meta.tasks.base import TaskClass  # torch and mujoco: not where names are listed
+    from bidex_meta.tasks.base import TaskClass  # listing names must not import torch and mujoco
 
     found, _ = outside_class(name, "task")
     if not issubclass(found, TaskClass):

@@ -1,4 +1,4 @@
-"""From a task class to a compiled model, and the addresses in it that the world reads and writes."""
+"""The compiled model of a task class, and the addresses that the world reads and writes."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,7 +22,7 @@ Colour = tuple[Fraction, Fraction, Fraction, Fraction]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
-"""Gravity compensation with which an object falls by 9.81 m/s² where gravity, a millionth of that, points up."""
+"""Gravity compensation that makes an object fall at 9.81 m/s² although gravity, a millionth of it, points up."""
 
 
 @checked_arguments
@@ -46,15 +46,15 @@ class SceneObject:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """Nominal orientation (w, x, y, z)."""
+        """Return the nominal orientation (w, x, y, z)."""
         return quaternion_from_rpy(self.rpy)
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
-        """Puts the object into a scene at its nominal start."""
+        """Add the object to a scene at its nominal start."""
         self.attach(scene, mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml")))
 
     def attach(self, scene: mujoco.MjSpec, part: mujoco.MjSpec) -> None:
-        """Puts a part with a body called ``object`` there in the place of the asset."""
+        """Add a part with a body called ``object`` to a scene, instead of the asset."""
         set_contact_bits(part.geoms, OBJECT)
         if self.colour is not None:
             for material in part.materials:
@@ -68,9 +68,9 @@ class Table(NamedTuple):
 
     Attributes:
         size: Full edge lengths, metres.
-        centre: Its centre in the world, metres.
+        centre: The table's centre in the world, metres.
         friction: Sliding friction.
-        priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
+        priority: Above 0 the table's friction applies to its contacts; else the larger friction of a pair applies.
     """
 
     size: Point
@@ -81,7 +81,7 @@ class Table(NamedTuple):
 
 @checked_arguments
 def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: NonNegative = 1.0, priority: int = 0) -> None:
-    """Adds a fixed box, the table of a task; see ``Table``."""
+    """Add a fixed box, the table of a task; see ``Table``."""
     floor = scene.geom("floor")
     scene.worldbody.add_geom(
         name="table",
@@ -101,7 +101,7 @@ class Scene:
     """A compiled scene with its addresses.
 
     Attributes:
-        task: The class whose scene it is.
+        task: The class of the scene.
         model: The compiled model.
         sensors: Sensor name to its slice of ``sensordata``.
         qpos: Name of a part to its slice of a start (``qpos``, then the poses of movable fixtures): ``right/base`` (7,
@@ -119,7 +119,7 @@ class Scene:
         return {m.sensor(i).name: slice(a := m.sensor_adr[i], a + m.sensor_dim[i]) for i in range(m.nsensor)}
 
     def sensor(self, name: str) -> slice:
-        """Its slice of ``sensordata``; raises BidexError where the scene has no such sensor."""
+        """Return the slice of a sensor in ``sensordata``; raises BidexError if the scene has no such sensor."""
         if name not in self.sensors:
             raise unknown_sensor(name, self.sensors)
         return self.sensors[name]
@@ -145,13 +145,13 @@ class Scene:
 
     @cached_property
     def _mocap_bodies(self) -> list[int]:
-        """Body ids of the movable fixtures, in the order of ``mocap_pos``."""
+        """Return the body ids of the movable fixtures, in the order of ``mocap_pos``."""
         place = self.model.body_mocapid
         return sorted((i for i in range(self.model.nbody) if place[i] >= 0), key=lambda i: place[i])
 
     @cached_property
     def dressed(self) -> mujoco.MjModel:
-        """For pictures: the same bodies and joints with hands as ``looks.dress`` shows them."""
+        """Return the model for pictures: the same bodies and joints with hands as ``looks.dress`` shows them."""
         spec = build_spec(self.task)
         dress(spec)
         return spec.compile()
@@ -163,13 +163,13 @@ class Scene:
 
     @cached_property
     def start_qpos(self) -> np.ndarray:
-        """The nominal start, all hand joints zero. Shape (nq + 7 nmocap,)."""
+        """Return the nominal start, all hand joints zero. Shape (nq + 7 nmocap,)."""
         fixtures = [np.concatenate((self.model.body_pos[i], self.model.body_quat[i])) for i in self._mocap_bodies]
         return np.concatenate((self.model.qpos0, *fixtures))
 
 
 def build_spec(task: "TaskClass") -> mujoco.MjSpec:
-    """The editable scene of a task class: floor, hands, objects. Objects alone have weight, as in the original."""
+    """Build the editable scene of a task class: floor, hands, objects. Only objects have weight, as in the original."""
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
     spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
@@ -189,10 +189,10 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
 
 
 def compile_scene(task: "TaskClass") -> Scene:
-    """The compiled scene of a task class."""
+    """Compile the scene of a task class."""
     model = build_spec(task).compile()
     damp_bases(model)
-    # The assets state the stiffest contacts and limits that 1/240 s allows; a longer step allows softer ones alone.
+    # The assets have the stiffest contacts and limits that 1/240 s allows; a longer step only allows softer ones.
     factor = model.opt.timestep / _STATED_TIME_STEP
     for solref in (model.geom_solref, model.pair_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
         solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor

@@ -9,7 +9,7 @@ from bidex_meta.utils.maths import xyzw
 
 
 def unknown_sensor(name: str, known: Iterable[str]) -> BidexError:
-    """An error for a sensor that does not exist, with those of the same object where there is one."""
+    """Return an error for a sensor that does not exist, listing the same object's sensors if it has any."""
     names = list(known)
     return unknown_name("sensor", name, [each for each in names if each.split("/")[0] == name.split("/")[0]] or names)
 
@@ -28,18 +28,18 @@ class TaskState:
         self.frozen = frozen
 
     def __getitem__(self, name: str) -> Tensor:
-        """Values of the named sensor, shape (n, k); BidexError for an unknown one."""
+        """Return the values of the named sensor, shape (n, k); BidexError for an unknown one."""
         try:
             return self._sensors[:, self._addresses[name]]
         except KeyError:
             raise unknown_sensor(name, self._addresses) from None
 
     def quaternion(self, name: str) -> Tensor:
-        """Orientation (x, y, z, w) read from the named framequat sensor, shape (n, 4)."""
+        """Return the orientation (x, y, z, w) read from the named framequat sensor, shape (n, 4)."""
         return self.once(("quaternion", name), lambda: xyzw(self[name]))
 
     def once(self, key: object, compute: Callable[[], Tensor]) -> Tensor:
-        """A value that reward, success and observation share, computed at its first use."""
+        """Return a value that reward, success and observation share, computed at its first use."""
         if key not in self._known:
             self._known[key] = compute()
         return self._known[key]

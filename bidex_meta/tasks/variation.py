@@ -1,4 +1,4 @@
-"""What a task freezes: a vector of named numbers."""
+"""The variation of a task: a vector of named numbers that the task freezes."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole
 class VariationSpace:
     """The box from which a class's variations are drawn uniformly.
 
-    Component names, e.g. ``goal_x``, with their lower and upper ends; in metres, radians, or a draw in [-1, 1].
+    It has component names, e.g. ``goal_x``, with lower and upper ends, in metres, radians, or a draw in [-1, 1].
     """
 
     names: tuple[Text, ...]
@@ -36,23 +36,23 @@ class VariationSpace:
 
     @property
     def size(self) -> int:
-        """Number of components."""
+        """Return the number of components."""
         return len(self.names)
 
     @checked_arguments
     def sample(self, rng: np.random.Generator, n: Whole) -> np.ndarray:
-        """N variations, uniform in the box. Shape (n, size), float64."""
+        """Draw ``n`` variations, uniform in the box. Shape (n, size), float64."""
         return rng.uniform(self.low, self.high, size=(n, self.size))
 
     def contains(self, vector: np.ndarray) -> bool:
-        """Whether a vector of shape (size,) lies in the box."""
+        """Return whether a vector of shape (size,) lies in the box."""
         vector = np.asarray(vector)
         return vector.shape == (self.size,) and bool(np.all((vector >= self.low) & (vector <= self.high)))
 
 
 @checked_arguments
 def join(*parts: VariationSpace) -> VariationSpace:
-    """One space of the components of several, in their order."""
+    """Return one space with the components of several spaces, in their order."""
     return VariationSpace(
         sum((p.names for p in parts), ()), sum((p.low for p in parts), ()), sum((p.high for p in parts), ())
     )
@@ -60,18 +60,18 @@ def join(*parts: VariationSpace) -> VariationSpace:
 
 @checked_arguments
 def component(name: Text, low: Finite, high: Finite) -> VariationSpace:
-    """A space of one number."""
+    """Return a space of one number."""
     return VariationSpace((name,), (low,), (high,))
 
 
 @checked_arguments
 def box(prefix: Text, centre: tuple[Finite, Finite, Finite], half: NonNegative) -> VariationSpace:
-    """A cube of positions around a centre: components ``<prefix>_x``, ``_y``, ``_z`` in metres."""
+    """Return a cube of positions around a centre: components ``<prefix>_x``, ``_y``, ``_z`` in metres."""
     names = tuple(f"{prefix}_{axis}" for axis in "xyz")
     return VariationSpace(names, tuple(c - half for c in centre), tuple(c + half for c in centre))
 
 
 @checked_arguments
 def orientation(prefix: Text) -> VariationSpace:
-    """The two draws of a random orientation (docs/figures.md, start noise): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
+    """Return two draws of a random orientation (docs/figures.md, start noise): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
     return VariationSpace((f"{prefix}_u0", f"{prefix}_u1"), (-1.0, -1.0), (1.0, 1.0))

@@ -28,7 +28,7 @@ class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
     Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's own start and up to 5 cm
-    beside it, and has the start's orientation, yaw included. The pot starts at rest on the table; at the original's
+    to its sides, and has the start's orientation, yaw included. The pot starts at rest on the table; at the original's
     height it would start 1.5 cm inside. Friction: 3 on the table, 2 between wall and hand.
     """
 
@@ -68,7 +68,7 @@ class LiftUnderarm(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``object``: the pot's placement (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return ``object``: pot's place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
         start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + placement.new_tensor(_START)
         goal = torch.cat((start + variation[:, 3:], yaw_quaternion(placement[:, 2])), dim=1)
@@ -93,16 +93,16 @@ class LiftUnderarm(OwnObjectClass):
 
 _TILT = 0.87
 _PALM_NORMAL = (math.sin(_TILT), 0.0, math.cos(_TILT))
-"""Out of the right palm at the start, world."""
+"""Normal of the right palm at the start, pointing out of the palm, world."""
 _LIFT, _AHEAD = 0.006, 0.015
-"""How far the bottle starts from the original's place, metres: along the palm's normal, since there it is in the hand,
-and along the fingers, so that it can be turned without meeting the thumb."""
+"""Shift of the bottle's start from the original's place, metres: along the palm's normal, because the original's place
+lies inside the hand, and along the fingers, so that the bottle can be turned without touching the thumb."""
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
 _DISC = (0.1, 0.1, 0.003)
 """Semi-axes of the goal in pictures, metres: a disc about the cap, wider than the hand."""
 _DROPPED = 0.25
-"""Height of the bottle below which it no longer lies in the hand, metres: half of where it starts."""
+"""Height below which the bottle no longer lies in the hand, metres: half of its start height."""
 
 
 class BottleCap(OwnObjectClass):
@@ -138,18 +138,18 @@ class BottleCap(OwnObjectClass):
     constant = 0.2
     camera_target = (0.0, -0.62, 0.52)
     variation_space = VariationSpace(("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -0.01, -TURN), (SHIFT, 0.0, TURN))
-    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # there is no room in the hand for more
+    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # the hand has no room for more
     wide_solved = "cap within 5 mm of where it shall stand out"
     wide_blocks = goal_blocks("goal")
     jittered_hands = ("left",)
     blocks = (*object_blocks("bottle"), point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"))
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``bottle``: shift and turn (n, 3); with wide variation ``slide``: how far the cap shall stand out (n, 1)."""
+        """Return ``bottle``: shift and turn (n, 3); with wide variation ``slide``: the cap's target travel (n, 1)."""
         return super().freeze(variation) | ({"slide": variation[:, 3:]} if self.rules.wide else {})
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """With wide variation how far the cap shall stand out, and how far it is from there."""
+        """Return, with wide variation, the cap's target travel and its distance from the target."""
         if not self.rules.wide:
             return {}
         slide = state.frozen["slide"]
@@ -168,7 +168,7 @@ class BottleCap(OwnObjectClass):
         return [at_least(slide, 0.03, 0.005)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return where the cap shall stand on the bottle, with wide variation."""
+        """Return the goal of the cap on the bottle, with wide variation."""
         if not self.rules.wide:
             return []
         turn = state.quaternion("bottle/quaternion")
@@ -191,7 +191,7 @@ class BottleCap(OwnObjectClass):
         return within(self.errors(state)) if self.rules.wide else state["bottle/slide"][:, 0] > 0.03
 
     def failed(self, state: TaskState) -> Tensor:
-        """With wide variation: the bottle was dropped. On the table it may spin so fast that it gains energy."""
+        """Return, with wide variation, whether the bottle fell; on the table a fast spin may add energy to it."""
         dropped = state["bottle/position"][:, 2] < _DROPPED
         return dropped & self.rules.wide
 
@@ -240,7 +240,7 @@ class SwingCup(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        """Return ``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
         position = variation.new_tensor(_CUP.position).repeat(len(variation), 1)
         position[:, :2] += variation[:, :2]
         rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))

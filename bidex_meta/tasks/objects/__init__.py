@@ -1,1 +1,1 @@
-"""Objects by config: files of the shelf and of the user's own, checked, and laid on a hand."""
+"""Objects chosen by config: shelf files and user files, checked, and laid on a hand."""

@@ -1,4 +1,4 @@
-"""Objects of the throwing classes in place of the egg: of the shelf, or from an MJCF file of the user's."""
+"""Objects that replace the egg in the throwing classes, from the shelf or a user's MJCF file."""
 
 import math
 import os
@@ -48,12 +48,12 @@ class HeldObject:
 
     @property
     def half_extents(self) -> Point:
-        """Extent from its origin along its axes, metres."""
+        """Return the extent from the origin along the object's axes, metres."""
         x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
     def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
-        """Puts it into a scene as a free body; arguments as of ``SceneObject``."""
+        """Add the object to a scene as a free body; arguments are those of ``SceneObject``."""
         part = read_own(self.file)
         body = part.worldbody.first_body()
         body.name = "object"
@@ -70,16 +70,16 @@ class HeldObject:
         SceneObject(name, self.name, position, colour=colour).attach(scene, part)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
-        """Room for contacts of a class with so many of it, from the class's need with eggs."""
+        """Return the contact room of a class with ``count`` such objects, from the class's need with eggs."""
         # A flat face meets its support in four points, and each geom may meet palm and fingers at once.
         more = count * (8 + 4 * self.geoms)
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
 
     def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
-        """Lays it on a broad side: its shortest extent along a palm's normal, turned about it at random.
+        """Lay the object on a broad side: its shortest extent along a palm's normal, turned about the normal at random.
 
-        Its positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2): the turn, and
-        which of the two sides lies below. Without a start pose of the hand as on a level palm.
+        Its positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2), give the turn and
+        the lower of the two sides. Without a start pose of the hand the palm is taken as level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
         half, zero = 0.5 * math.pi * draws[:, 0], torch.zeros_like(draws[:, 0])
@@ -91,7 +91,7 @@ class HeldObject:
 
     @property
     def _laid(self) -> tuple[float, float, float, float]:
-        """The turn (x, y, z, w) that takes its longest side to z and its shortest to y, the palm's normal."""
+        """Return the turn (x, y, z, w) that takes the longest side to z and the shortest to y, the palm's normal."""
         shortest, middle, longest = np.argsort(np.subtract(self.high, self.low), kind="stable")
         turn = np.zeros((3, 3))
         turn[0, middle] = turn[1, shortest] = turn[2, longest] = 1.0
@@ -102,7 +102,7 @@ class HeldObject:
         return x, y, z, w
 
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
-        """Lifts it off the palm it lies on, opens the fingers that would stick in it and lays the thumb flat.
+        """Lift the object off its palm, open the fingers that would penetrate it and lay the thumb flat.
 
         Its positions (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in place.
         """
@@ -116,18 +116,18 @@ class HeldObject:
         place[:, :3] += rotate(quaternion, shift).float()
 
     def depth_below(self, place: Tensor) -> Tensor:
-        """How far it reaches below its origin, metres, from its positions (n, 7). Shape (n,)."""
+        """Return the object's extent below its origin, metres, from its positions (n, 7). Shape (n,)."""
         points = rotate(xyzw(place[:, 3:])[:, None], torch.as_tensor(self.centres).to(place)[None])
         return (torch.as_tensor(self.radii).to(place) - points[..., 2]).amax(dim=1)
 
 
 def shelf() -> list[str]:
-    """Names of the shelf, sorted; the egg is not among them."""
+    """Return the names of the shelf, sorted, without the egg."""
     return sorted(path.stem for path in (paths.assets_dir() / "objects" / "shelf").glob("*.xml"))
 
 
 def held_object(name: object) -> HeldObject | None:
-    """The object of a name of the shelf, in any case, or of an MJCF file, which ends in ``.xml``; None for ``"egg"``.
+    """Return the object of a shelf name, in any case, or of an MJCF file, which ends in ``.xml``; None for ``"egg"``.
 
     Raises BidexError for an unknown name, or a file that holds no object for a hand.
     """
@@ -143,7 +143,7 @@ def held_object(name: object) -> HeldObject | None:
     try:
         state = os.stat(file)
     except (OSError, ValueError):
-        return _loaded(file, (0, 0))  # which says what is wrong
+        return _loaded(file, (0, 0))  # raises the error with the reason
     return _loaded(file.resolve(), (state.st_mtime_ns, state.st_size))
 
 

@@ -1,7 +1,7 @@
-"""An object's MJCF file from a user, checked before MuJoCo reads it, and the outline of what it collides with.
+"""An object's MJCF file from a user, checked before MuJoCo reads it, and the outline of its colliding geoms.
 
-MuJoCo opens whatever file a model names, so tags are allowed by a list: no entities, no includes, no file from another
-folder.
+MuJoCo opens any file that a model names, so only listed tags are allowed: no entities, no includes, no file from
+another folder.
 """
 
 import math
@@ -20,19 +20,19 @@ _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
 _MOST_TAGS, _DEEPEST = 2_000, 32
 _TAGS = {"mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"}
 _TAGS |= {"body", "inertial", "geom", "joint", "freejoint", "site"}
-"""What a file may hold; sensors may stand in a file that names points (``points=True``)."""
+"""Tags that a file may hold; a file that names points (``points=True``) may also hold sensors."""
 _SENSOR_TAGS = {"sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"}
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
-"""As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
+"""The values of the files under assets/objects, as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
-"""MuJoCo takes such numbers, and writes a log file into the working folder."""
+"""MuJoCo accepts numbers that are not finite, and writes a log file into the working folder."""
 _MOST_FRICTION = 5.0
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
-    """The specification in an MJCF file, with absolute paths of the files that it names; ``points`` allows sensors.
+    """Read the specification in an MJCF file, with absolute paths of the files it names; ``points`` allows sensors.
 
-    Raises BidexError where it cannot be read, is no MJCF, has a tag that no object needs, or names a file that is
+    Raises BidexError if the file cannot be read, is no MJCF, has a tag that no object needs, or names a file that is
     missing or outside its folder.
     """
     content = read_bytes(path, "an object's MJCF file", _MOST_BYTES)
@@ -50,7 +50,7 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
 
 
 def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a specification; BidexError where MuJoCo refuses it or its numbers are not finite."""
+    """Return the model of a specification; BidexError if MuJoCo refuses it or its numbers are not finite."""
     try:
         model = spec.copy().compile()
     except ValueError as error:
@@ -61,19 +61,19 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def set_contacts(spec: mujoco.MjSpec) -> None:
-    """Gives geoms the softness and the margin that the world's time steps need; friction stays the file's."""
+    """Give geoms the softness and the margin that the world's time steps need; friction stays the file's."""
     for geom in spec.geoms:
         geom.solref[:2], geom.solimp[:3] = _SOLREF, _SOLIMP
         geom.margin, geom.gap = _MARGIN, 0.0
 
 
 def colliding(model: mujoco.MjModel) -> int:
-    """The number of geoms that collide."""
+    """Return the number of geoms that collide."""
     return int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
 
 
 def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
-    """The number of geoms that collide; BidexError for none, more than ``most``, or one with too much friction."""
+    """Return the number of geoms that collide; BidexError for none, more than ``most``, or too much friction."""
     geoms = colliding(model)
     if not 0 < geoms <= most:
         raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Mend it.")
@@ -88,7 +88,7 @@ def _reason(error: Exception) -> str:
 
 
 def _beside(path: Path, name: Path) -> Path:
-    """The file of that name in the folder of an MJCF file, or below it."""
+    """Return the file of a name in the folder of an MJCF file, or below it."""
     folder = path.resolve().parent
     found = (folder / name).resolve()
     if not found.is_relative_to(folder):
@@ -101,7 +101,7 @@ def _beside(path: Path, name: Path) -> Path:
 
 
 def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
-    """Refuses entities, which may expand without end, and every tag that is not allowed."""
+    """Refuse entities, which may expand without end, and every tag that is not allowed."""
 
     def refuse(expected: str, received: str, mend: str) -> NoReturn:
         raise BidexError(f"{path}: expected {expected}, got {received}. {mend}")
@@ -143,13 +143,13 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
 
 
 _AROUND, _OVER = 12, 128
-"""Points around a cylinder's rim, which stand out by 3.5 % so that nothing of the rim does; directions in which an
-ellipsoid's and a mesh's outermost points are taken."""
+"""Number of points around a cylinder's rim, placed 3.5 % outside so that they enclose the rim; number of directions in
+which the outermost points of an ellipsoid or a mesh are taken."""
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]:
-    """A body's geoms that collide, each with its rotation (3, 3) in the body's frame."""
+    """Return a body's geoms that collide, each with its rotation (3, 3) in the body's frame."""
     found = []
     for geom in np.flatnonzero(model.geom_bodyid == body):
         if model.geom_contype[geom] or model.geom_conaffinity[geom]:
@@ -160,9 +160,9 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]
 
 
 def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (k, 3) and radii (k,) of balls whose convex hull holds a body's colliding geoms; body frame, metres.
+    """Return centres (k, 3) and radii (k,) of balls whose convex hull holds a body's colliding geoms; body frame, m.
 
-    Of ellipsoids and meshes a hundredth of their size may stand out. Without such geoms both are empty.
+    Ellipsoids and meshes may stand out by 1 % of their size. Without colliding geoms both arrays are empty.
     """
     centres, radii = [np.zeros((0, 3))], [np.zeros(0)]
     for geom, turn in _colliding(model, body):
@@ -173,9 +173,9 @@ def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of the box around a body's colliding geoms, body frame, metres, each (3,).
+    """Return the lower and upper corner of the box around a body's colliding geoms, body frame, metres, each (3,).
 
-    The outline's box and that of the geoms' own boxes both hold it; a cylinder stands out of neither in one of them.
+    The result is the intersection of the outline's box and the box of the geoms' own boxes, which both hold the geoms.
     """
     centres, radii = outline(model, body)
     low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
@@ -186,7 +186,7 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
-    """Ball centres (k, 3) in the geom's frame, and their radius."""
+    """Return ball centres (k, 3) in the geom's frame, and their radius."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return np.zeros((1, 3)), size[0]
@@ -207,7 +207,7 @@ def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 
 
 def _directions() -> np.ndarray:
-    """Unit vectors spread evenly over the ball (a Fibonacci lattice), shape (k, 3)."""
+    """Return unit vectors spread evenly over the ball (a Fibonacci lattice), shape (k, 3)."""
     i = np.arange(_OVER) + 0.5
     z, angle = 1 - 2 * i / _OVER, np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - z**2)

@@ -1,4 +1,4 @@
-"""User's objects for classes that reach for points such as handles: the file names them as the usual one does."""
+"""A user's objects for classes with points such as handles, named in the file as in the usual object's file."""
 
 import hashlib
 from collections.abc import Hashable
@@ -20,16 +20,16 @@ from bidex_meta.utils import paths
 from bidex_meta.utils.files import absolute
 
 _MOST_MASS, _LARGEST, _MOST_GEOMS = 10.0, 0.6, 64
-"""kg; metres of the box around it; geoms that collide."""
+"""Limits of an object: mass, kg; size of the box around it, metres; number of colliding geoms."""
 _LEVEL = 0.003
-"""How far its foot may lie from the usual one's, metres: it starts at rest on the table."""
+"""Largest distance of an object's foot from the usual object's foot, metres, so that it starts at rest on the table."""
 _DEEPEST = 0.005
-"""How deep it may stick in hands or table at the start, metres, as for every class (docs/figures.md)."""
+"""Deepest penetration of hands or table at the start, metres, as for every class (docs/figures.md)."""
 
 
 @dataclass(frozen=True)
 class PointedObject(SceneObject):
-    """An object of the user's; ``asset`` is the path of its file, ``digest`` changes with the file's model."""
+    """A user's object; ``asset`` is the path of its file, ``digest`` changes with the file's model."""
 
     digest: str = ""
 
@@ -40,7 +40,7 @@ class PointedObject(SceneObject):
 
 
 class OwnObjectClass(ReachTask):
-    """A class whose object may be the user's, with the sensors and joints of the class's own.
+    """A class whose object may be the user's, with the sensors and joints of the class's own object.
 
     ``usual_stands``: whether the class's own object stands on its foot at the start.
     """
@@ -48,9 +48,9 @@ class OwnObjectClass(ReachTask):
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
-        """Chooses the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
+        """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
 
-        Raises BidexError where the file holds no such object, or one that starts inside hands or table.
+        Raises BidexError if the file holds no such object, or one that starts inside hands or table.
         """
         super().__init__(moving_base)
         (usual,) = self.objects
@@ -112,7 +112,7 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
 
 
 def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
-    """Deepest penetration of the object at the nominal start, metres, and the name of the body that it is in."""
+    """Return the object's deepest penetration at the nominal start, metres, and the name of the penetrated body."""
     scene = compile_scene(task)
     start = torch.from_numpy(scene.start_qpos)[None].clone()
     space = task.variation_space
@@ -137,14 +137,14 @@ def _usual_model(usual: SceneObject) -> mujoco.MjModel:
 
 
 def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:
-    """Types of joints or sizes of sensors, by name."""
+    """Return types of joints or sizes of sensors, by name."""
     if kind == "joint":
         return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
     return {model.sensor(i).name: int(model.sensor_dim[i]) for i in range(model.nsensor)}
 
 
 def _box(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box around all that collides, from the origin of the body ``object``, metres."""
+    """Return the corners of the box around all colliding geoms, from the origin of the body ``object``, metres."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     lows, highs = [], []
