@@ -1,4 +1,4 @@
-"""What can be set about every gradient-based meta-learner; imports no torch, so that a command line can show it."""
+"""The options of every gradient-based meta-learner; imports no torch, so that a command line can show them quickly."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,7 +15,7 @@ USUAL_STEPS = 300
 
 @dataclass(frozen=True)
 class MetaConfig(LearnerConfig):
-    """Policy, sampling and inner steps; the defaults are the preset ``laptop``."""
+    """Options of the policy, sampling and inner steps; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
     activation: Activation = "tanh"  # Non-linearity of the hidden layers.
@@ -49,13 +49,13 @@ class MetaConfig(LearnerConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         steps = (self.slice_steps or self.max_adapt_steps or USUAL_STEPS) * (1 + self.inner_steps)
         return 4 * num_envs * width * steps + network_bytes(self.hidden, width, 2)
 
 
 class OuterConfig(MetaConfig):
-    """What the outer steps share. The learners' configs hold these as fields, each in its own place among the flags."""
+    """Options shared by the outer steps. Each learner's config repeats them as fields, to place them among its flags."""
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
     max_grad_norm: Positive  # Meta-gradients longer than this are shortened to it.

@@ -1,9 +1,10 @@
 """PEARL: SAC conditioned on a latent variable, whose posterior is inferred from a task's transitions.
 
-An environment keeps its task and plays trials: in the first episode it acts on a latent variable drawn from the prior,
-in each further one on one drawn from the posterior of the trial so far. In an update an encoder makes a posterior of
-what some environments did last, and actor and critics learn from all that the replay has of their tasks, on a sample of
-it. The encoder goes down the critics' loss and the divergence from the prior. See docs/learners/pearl.md.
+An environment keeps its task and plays trials. In the first episode it acts on a latent variable drawn from the prior,
+in each later episode on one drawn from the posterior of the trial so far. In an update an encoder computes a posterior
+from the latest trials of some environments. Actor and critics learn on a sample of it, from all replayed transitions
+of these environments' tasks. The encoder minimises the critics' loss and the divergence from the prior. See
+docs/learners/pearl.md.
 """
 
 import math
@@ -34,7 +35,7 @@ from bidex_meta.world.contract import Info, TaskWorld
 
 @dataclass(frozen=True)
 class PEARLConfig(MTSACConfig):
-    """Everything that can be set about PEARL; the defaults are the preset ``laptop``."""
+    """All options of PEARL; the defaults are the preset ``laptop``."""
 
     latent: Count = 8  # Entries of the latent variable that stands for the task.
     encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
