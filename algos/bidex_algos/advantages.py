@@ -28,14 +28,11 @@ def gae(
     rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float | Tensor,
     lam: float, valid: Tensor | None = None
 ) -> Tensor:  # fmt: skip
-    """Compute advantages A_t = sum_k (gamma lam)^k delta_{t+k} within an episode, delta_t = r_t + gamma V(s'_t) -
-    V(s_t).
+    """Compute advantages A_t = sum_k (gamma lam)^k delta_{t+k} in an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
 
     All tensors are (T, N). ``next_values`` are the values of the true successors (:func:`successor_values`) and count
-    as 0
-    if ``terminated``; a time limit is not a termination. ``gamma`` is a number, (N,) or (T, N). Nothing propagates
-    through
-    entries that are not ``valid``.
+    as 0 if ``terminated``; a time limit is not a termination. ``gamma`` is a number, (N,) or (T, N). Nothing propagates
+    through entries that are not ``valid``.
     """
     delta = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
     keep = gamma * lam * (~ended).to(delta.dtype)
@@ -50,9 +47,7 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean, biased variance and count (num_tasks,) of the valid x (T, N) over all processes; 0 for an empty
-    task.
-    """
+    """Return mean, biased variance and count (num_tasks,) of valid x (T, N) over all processes; 0 for an empty task."""
 
     def total(values: Tensor) -> Tensor:
         sums = torch.zeros(num_tasks, dtype=values.dtype, device=values.device)

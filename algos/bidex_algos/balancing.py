@@ -24,8 +24,8 @@ class Balance(ABC):
         """Write the gradient into the parameters, which have none yet, and keep the graph.
 
         ``losses`` (num_tasks,) and the ``least`` values that they can reach are this process's part. Returns a number
-        to be
-        logged, already divided by the number of processes, because the caller sums it over them like the gradients.
+        to be logged, already divided by the number of processes, because the caller sums it over them like the
+        gradients.
         """
 
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
@@ -93,8 +93,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     This is an interior-point method. Logarithms of the weights, scaled by a mu that is halved at each step, keep the
     weights positive; a cone of the same mu smooths the tip at w'G w = 0. Each step is a Newton step whose length is the
     best of several. No number is read on the host, so a GPU is never waited for. ``gram`` holds the inner products of
-    the
-    gradients (n, n), float64; ``even`` holds the weights e of the mean (n,), from which the method starts.
+    the gradients (n, n), float64; ``even`` holds the weights e of the mean (n,), from which the method starts.
     """
     weights, mean, square = even, gram @ even, reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
@@ -119,9 +118,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
 
 
 class GradientBalance(Balance):
-    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; each task needs a backward
-    pass.
-    """
+    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; one backward pass per task."""
 
     tag = "Policy/conflicts"
 
@@ -145,8 +142,7 @@ class Famo(Balance):
 
     theta descends sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), with z = softmax(xi); xi descends J'(log l - log l after
     the step), with J = dz / dxi. Losses have to be positive, so each loss counts by its distance above its least
-    possible
-    value. Adam with step size ``rate`` moves xi (``logits``, float64) with a ``decay`` towards even weights.
+    possible value. Adam with step size ``rate`` moves xi (``logits``, float64) with a ``decay`` towards even weights.
     """
 
     tag = "Policy/largest_weight"
@@ -157,9 +153,7 @@ class Famo(Balance):
         self.above = torch.zeros_like(self.logits)
 
     def weights(self, above: Tensor) -> Tensor:
-        """Return factors of losses that are ``above`` (num_tasks,) their least; mean 1, and 0 for a loss that cannot
-        fall.
-        """
+        """Return factors for losses (num_tasks,) ``above`` their least: 1 on average, 0 for a loss that cannot fall."""
         self.above = above.detach().double()
         shares = self.logits.detach().softmax(0) / self.above.clamp_min(_LEAST)
         shares = shares.masked_fill(self.above <= _LEAST, 0.0)

@@ -1,7 +1,7 @@
 """The data set of a student: the newest observations of each environment, with the teachers' actions as labels.
 
-The data set is a ring buffer of vector steps on the device, in half precision: 1.5 M observations of MT20-v2 with
-their labels take 1.6 GB.
+The data set is a ring buffer of vector steps on the device, in half precision: 1.5 M observations of MT20-v2 with their
+labels take 1.6 GB.
 """
 
 import torch
@@ -12,8 +12,7 @@ from bidex_meta.training.learner import State
 
 
 class Labelled:
-    """The last ``steps`` vector steps of the environments ``rows`` (L,), each of one task (``task_id``, (L,),
-    ascending).
+    """The last ``steps`` vector steps of environments ``rows`` (L,), each of one task (``task_id`` (L,), ascending).
 
     ``tasks`` (K,) are the tasks that have an environment in ``rows``.
     """

@@ -43,8 +43,8 @@ class Learner(Contract):
 
     With several processes each process has its own world, samples and ``generator``, and all have the same networks:
     statistics, gradients and ``env_steps`` cover all processes. Raises BidexError for a world in another autoreset
-    mode, for
-    a world with discounts per class if the learner has a single one, or without a one-hot that an option needs.
+    mode, for a world with discounts per class if the learner has a single one, or without a one-hot that an option
+    needs.
     """
 
     remedy: ClassVar[str]  # what helps, mostly, when a loss is no longer finite
@@ -136,9 +136,7 @@ class Learner(Contract):
         return obs
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Return actions (N, a) in [-1, 1] for raw observations (N, d), without exploration. N may differ from the
-        world's.
-        """
+        """Return actions (N, a) in [-1, 1] for raw observations (N, d), without exploration; N is arbitrary."""
         return self.agent.eval_action(obs)
 
     def reset(self, env_mask: Tensor) -> None:
@@ -169,9 +167,7 @@ class Learner(Contract):
         return policy
 
     def start_from(self, policy: State) -> None:
-        """Take and keep network and statistics of another learner's policy; a BidexError if the policy has another
-        form.
-        """
+        """Take and keep network and statistics of another learner's policy; a BidexError if its form differs."""
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
@@ -189,9 +185,7 @@ class Learner(Contract):
         self.policy.observations.keep()
 
     def state_dict(self) -> State:
-        """Return a copy of everything except the world, as tensors and plain values
-        (``torch.load(weights_only=True)``).
-        """
+        """Return a copy of all state but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:

@@ -20,9 +20,7 @@ StepSizeKind = Literal["fixed", "layer", "weight"]  # whether sizes of the inner
 
 
 class StepSizes(nn.Module):
-    """A factor of the inner step for each tensor that it moves (``layer``), or for each entry of the tensor
-    (``weight``).
-    """
+    """Factors of the inner step: one for each tensor that it moves (``layer``) or for each entry (``weight``)."""
 
     def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
         super().__init__()
@@ -75,7 +73,7 @@ class TaskBatch:
 
 
 class Adapter:
-    """Gradient steps on copies of an actor's parameters, which are the meta-parameters; options as in ``MetaConfig``."""
+    """Gradient steps on an actor's parameters, starting from its own as meta-parameters; options as in ``MetaConfig``."""
 
     def __init__(
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],

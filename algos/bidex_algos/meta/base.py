@@ -1,8 +1,8 @@
 """The base of the gradient-based meta-learners: meta-batches of tasks, stages of adaptation, checkpoints.
 
-The learners differ only in the outer step. In an iteration every task starts from the meta-parameters. In each stage
-k = 0 ... inner_steps every environment plays an episode with its task's parameters. After each stage except the last,
-the parameters take an inner step.
+The learners differ only in the outer step. In an iteration every task starts from the meta-parameters. In each stage k
+= 0 ... inner_steps every environment plays an episode with its task's parameters. After each stage except the last, the
+parameters take an inner step.
 """
 
 from abc import abstractmethod
@@ -31,8 +31,7 @@ class MetaPolicy(nn.Module):
     """A Gaussian actor with one adapted copy per task; follows the protocol of adapting agents (bidex_meta.agents).
 
     Its own parameters are the meta-parameters. Before the first ``adapt`` every task acts by the meta-parameters.
-    ``seed``
-    seeds the exploring actions.
+    ``seed`` seeds the exploring actions.
     """
 
     def __init__(
@@ -54,9 +53,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; environments of one task share adaptation. None: each has its own
-        task.
-        """
+        """Set the task (N,) of each environment; environments of one task adapt together. None: each has its own task."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
@@ -88,9 +85,7 @@ class MetaPolicy(nn.Module):
         self.elapsed = (elapsed + 1).masked_fill(ended, 0)
 
     def adapt(self) -> None:
-        """Take one inner step of each task on all transitions since the last inner step; without transitions, do
-        nothing.
-        """
+        """Take one inner step of each task on all transitions since the last inner step; do nothing if there are none."""
         if len(self.stage) == 0:
             return
         rows = self._rows(self.stage.obs[0])
@@ -126,9 +121,7 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """Make a policy with fresh weights drawn from ``init``, a CPU generator; no inner step moves the encoders of
-    ``inputs``.
-    """
+    """Make a policy with fresh weights from ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 
@@ -297,9 +290,7 @@ class MetaLearner(Learner):
         return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
     def policy_state_dict(self) -> State:
-        """Return the state that :meth:`load_policy` needs: network, statistics, sizes, config and the seed of
-        exploration.
-        """
+        """Return the state that :meth:`load_policy` needs: network, statistics, sizes, config and exploration seed."""
         return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod

@@ -55,7 +55,7 @@ class MetaConfig(LearnerConfig):
 
 
 class OuterConfig(MetaConfig):
-    """Options shared by the outer steps. Each learner's config repeats them as fields, to place them among its flags."""
+    """Options shared by the outer steps. Each learner's config repeats them as fields, in its own order of flags."""
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
     max_grad_norm: Positive  # Meta-gradients longer than this are shortened to it.

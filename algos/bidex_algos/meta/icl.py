@@ -73,9 +73,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning: a memory infers the task as in VariBAD (arXiv 1910.08348); teachers that know the task
-    label.
-    """
+    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); teachers know the task."""
 
     name, remedy = "icl", "lower learning_rate"
     config_type, presets = ICLConfig, PRESETS
@@ -225,7 +223,7 @@ class ICL(TrialLearner):
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
-        """Return squared action errors in units of the class's standard deviation (1: no better than a constant), (K,)."""
+        """Return squared action errors in units of the class's standard deviation (1: as good as a constant), (K,)."""
         policy = self.policy
         actions = policy.actor.act(policy.observations(steps.obs), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
@@ -235,8 +233,7 @@ class ICL(TrialLearner):
         """Return the negative log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
 
         The likelihood is weighted by the standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model
-        learns
-        nothing in the states where it is unsure.
+        learns nothing in the states where it is unsure.
         """
         policy, paid = self.policy, steps.paid[:, None].float()
         mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals), task)
@@ -294,8 +291,9 @@ class _Pupil:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def _draw_goals(self, privileged: PrivilegedWorld) -> None:
-        """Store the tasks' own goals (N, k) and draw other goals of their range, including entries that a class does
-        not use.
+        """Store the tasks' own goals (N, k) and draw other goals of their range.
+
+        Entries that a class does not use are drawn too.
         """
         goals, world = self._data.goals, self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
@@ -304,7 +302,7 @@ class _Pupil:
         goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:
-        """Return the squared distance of believed from hidden values, averaged over entries and rows; 1/3 for a guess."""
+        """Return the squared distance of believed from hidden values, mean of entries and rows; 1/3 for a guess."""
         return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:

@@ -11,8 +11,7 @@ class LatentAgent:
     """An adapting agent (``bidex_meta.agents``) of a latent-variable policy; ``seed`` seeds its exploration.
 
     Each environment sums the evidence of its own exploring episodes. The next exploring episode acts on a latent
-    variable
-    drawn from the posterior; an evaluation acts on the posterior's mean. No weight changes.
+    variable drawn from the posterior; an evaluation acts on the posterior's mean. No weight changes.
     """
 
     def __init__(self, policy: LatentPolicy, seed: int = 0):

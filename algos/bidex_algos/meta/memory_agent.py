@@ -13,8 +13,7 @@ class MemoryAgent:
     """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` seeds its exploration.
 
     Adaptation episodes write the memory of their environment. Evaluation episodes run on a copy, so each of them
-    follows
-    the same shots. No weight changes.
+    follows the same shots. No weight changes.
     """
 
     def __init__(self, policy: RecurrentPolicy, seed: int = 0):
@@ -34,7 +33,7 @@ class MemoryAgent:
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory, and discard the evaluation's copy."""
+        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory and discard the evaluation's copy."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
@@ -50,7 +49,7 @@ class MemoryAgent:
         return (mean + std * noise).clamp(-1.0, 1.0), {"mean": mean, "std": std}
 
     def step(self, timestep: Timestep) -> None:
-        """Store one transition of every environment, except environments whose episode is over and waits for ``reset``."""
+        """Store one transition of every environment, except environments that wait for ``reset`` after an episode."""
         if self._learned is None or self._next_state is None:
             return
         valid, ended = timestep.valid, timestep.terminated | timestep.truncated

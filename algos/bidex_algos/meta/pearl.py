@@ -2,8 +2,8 @@
 
 An environment keeps its task and plays trials. In the first episode it acts on a latent variable drawn from the prior,
 in each later episode on one drawn from the posterior of the trial so far. In an update an encoder computes a posterior
-from the latest trials of some environments. Actor and critics learn on a sample of it, from all replayed transitions
-of these environments' tasks. The encoder minimises the critics' loss and the divergence from the prior. See
+from the latest trials of some environments. Actor and critics learn on a sample of it, from all replayed transitions of
+these environments' tasks. The encoder minimises the critics' loss and the divergence from the prior. See
 docs/learners/pearl.md.
 """
 
@@ -94,7 +94,7 @@ class PEARL(MTSAC):
 
     @classmethod
     def _inputs(cls, config: PEARLConfig, shape: Shape) -> Inputs:
-        """With the latent variable behind the observation."""
+        """Append the latent variable to the observation."""
         return super()._inputs(config, shape).extended("latent", config.latent)
 
     @classmethod
@@ -137,14 +137,14 @@ class PEARL(MTSAC):
         return torch.randint(low, high, shape, generator=self.generator, device=self.device)
 
     def _below(self, counts: Tensor, *shape: int) -> Tensor:
-        """Uniform whole numbers (shape) below ``counts``, which broadcast; 0 below 0."""
+        """Draw uniform integers (shape) below ``counts``, which broadcast; 0 where a count is 0."""
         # The remainder of a number this large favours none by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
-        """Sum of the evidence of the first ``episodes`` (M,) of a trial (0: the last but one) of environments (M,).
+        """Sum the evidence of the first ``episodes`` (M,) of a trial (0: the previous one) of environments ``rows`` (M,).
 
-        By ``context`` of its transitions, whose mean stands for all: (M, 2 * latent).
+        The sum is estimated from ``context`` random transitions of these episodes: (M, 2 * latent).
         """
         begin, end = self.bounds[trial, rows, 0], self.bounds[trial, rows, episodes]
         ages = (self.replay.added - end)[:, None] + self._below((end - begin)[:, None], len(rows), self.config.context)
@@ -166,7 +166,7 @@ class PEARL(MTSAC):
         return [self._infer(chosen[i], stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
     def _infer(self, rows: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """An update by transitions (B) of the tasks of some environments (M,)."""
+        """Update all networks with transitions (B) of the tasks of some environments (M,)."""
         episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
         trial = (self.played[rows] >= episodes).long()
         mean, std = self.policy.posterior(self._shown(rows, trial, episodes))
@@ -191,12 +191,12 @@ class PEARL(MTSAC):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> LatentAgent:
-        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        """Return the agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return LatentAgent(super().load_policy(state, device))
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Numbers of the environments' tasks over all classes, (N,); a BidexError where some are played by none."""
+    """Return the environments' task numbers over all classes, (N,); a BidexError if no environment plays some task."""
     for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
         if rows.stop - rows.start < tasks:
             raise BidexError(

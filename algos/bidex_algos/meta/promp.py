@@ -1,8 +1,9 @@
 """ProMP: proximal meta-policy search (Rothfuss et al. 2019) on a batch of tasks at once.
 
-As ``maml.py``, but inner steps follow ratio * advantage, whose second derivative gives the policy before adaptation
-credit for the data that adaptation needs (their section 4), and the outer step, ``outer_epochs`` times on a meta-batch,
-raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k).
+ProMP differs from ``maml.py`` in two steps. Inner steps follow ratio * advantage, whose second derivative gives the
+policy before adaptation credit for collecting useful data (section 4 of the paper). The outer step, taken
+``outer_epochs`` times per meta-batch, raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of
+KL(policy that sampled D_k || theta_k).
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive, check_risi
 
 @dataclass(frozen=True)
 class ProMPConfig(OuterConfig):
-    """Everything that can be set about ProMP; the defaults are the preset ``laptop``."""
+    """All options of ProMP; the defaults are the preset ``laptop``."""
 
     outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts anew.
     outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the start.

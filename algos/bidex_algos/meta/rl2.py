@@ -1,7 +1,8 @@
-"""RL²: learning to learn by a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
+"""RL²: meta-learning with a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
 
-An iteration plays one trial, a few episodes of one task with one memory, in every environment, makes ``epochs`` passes
-over it in mini-batches of chunks, and starts the next without memory. The first only measures statistics.
+An iteration plays one trial in every environment: a few episodes of one task with one memory. The learner makes
+``epochs`` passes over the trial in mini-batches of chunks, and the next trial starts with an empty memory. The first
+trial only measures statistics.
 """
 
 import math
@@ -29,7 +30,7 @@ from bidex_meta.world.contract import PooledWorld
 
 @dataclass(frozen=True)
 class RL2Config(PPOConfig, TrialConfig):
-    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+    """All options of RL²; the defaults are the preset ``laptop``."""
 
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
@@ -43,7 +44,7 @@ class RL2Config(PPOConfig, TrialConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + self.hidden[-1])
         return 4 * num_envs * width * self.trial_steps + network_bytes(self.hidden, width, 2) + memory
 
@@ -66,7 +67,7 @@ PRESETS: dict[str, RL2Config] = {
 
 
 class RL2(TrialLearner):
-    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it."""
+    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it acts."""
 
     name, remedy = "rl2", "lower learning_rate"
     config_type, presets = RL2Config, PRESETS

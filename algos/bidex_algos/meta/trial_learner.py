@@ -1,4 +1,4 @@
-"""What the learners of a policy with a memory share: trials, tasks by turns, statistics of first and last episodes."""
+"""The base of learners with a memory: trials, tasks by turns, statistics of first and last episodes."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from bidex_meta.world.contract import PooledWorld
 
 
 def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str, float]:
-    """Metrics of the first and the last episodes of trials."""
+    """Return metrics of the first and the last episodes of trials."""
     metrics = {}
     for which, statistics in (("first", firsts), ("last", lasts)):
         found = statistics.metrics()
@@ -52,11 +52,11 @@ class TrialLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
-        """Episodes of a trial begin together."""
+        """Return DISABLED, because the episodes of a trial begin together."""
         return "DISABLED"
 
     def _play(self, trials: Trials, player: Player) -> None:
-        """Plays the next trial in all environments into ``trials``."""
+        """Play the next trial in all environments and record it in ``trials``."""
         counts = [[self.episodes] for _ in range(trials.episodes)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
@@ -81,5 +81,5 @@ class TrialLearner(Learner):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MemoryAgent:
-        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        """Return the agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return MemoryAgent(super().load_policy(state, device))

@@ -1,7 +1,8 @@
-"""VariBAD: RL² whose memory is a belief of the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
+"""VariBAD: RL² whose memory is a belief about the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
 
-An encoder turns what a trial has shown so far into a Gaussian over a latent. From a sample of it a decoder predicts the
-rewards of the whole trial: that trains both. The policy reads the belief; PPO trains the policy and not the encoder.
+An encoder turns the trial so far into a Gaussian over a latent variable. From a sample of the latent a decoder predicts
+the rewards of the whole trial; this prediction trains encoder and decoder. The policy reads the belief; PPO trains the
+policy but not the encoder.
 """
 
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ _TIMES, _STEPS = 16, 64
 
 @dataclass(frozen=True)
 class VariBADConfig(RL2Config):
-    """Everything that can be set about VariBAD; the defaults are the preset ``laptop``."""
+    """All options of VariBAD; the defaults are the preset ``laptop``."""
 
     latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
     kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
@@ -45,7 +46,7 @@ class VariBADConfig(RL2Config):
             )
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
@@ -54,9 +55,9 @@ PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig(), "v2": VariBADCon
 
 
 class BeliefActor(RecurrentNet):
-    """An actor that reads what is seen and the belief in the memory, and a decoder of rewards.
+    """An actor that reads the observation and the belief in the memory, and a decoder of rewards.
 
-    Of an input (..., inputs) the decoder sees the observation, its first ``seen`` entries.
+    The decoder sees the observation only: the first ``seen`` entries of an input (..., inputs).
     """
 
     def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
@@ -69,29 +70,29 @@ class BeliefActor(RecurrentNet):
         self.paid = MLP(hidden[-1], (hidden[-1],), 1, 0.01, generator, activation)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As in the base; the memory gets no gradient."""
+        """Compute outputs as in the base class; the memory gets no gradient."""
         with torch.no_grad():
             mean, log_std, state = self.believe(x, state)
         return self.actor(torch.cat([x, mean, log_std], dim=-1)), state
 
     def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Means and log-deviations (T, B, latent) of the beliefs at steps (T, B, inputs), and the memory after them."""
+        """Return means and log standard deviations (T, B, latent) of the beliefs at steps (T, B, inputs), and the memory."""
         belief, state = super().forward(x, state)
         mean, log_std = belief.chunk(2, dim=-1)
         return mean, log_std.clamp(-6.0, 2.0), state
 
     def pays(self, x: Tensor, latent: Tensor) -> Tensor:
-        """Normalised rewards (K, M, B) that led to inputs (M, B, inputs), by samples of the latent (K, B, latent)."""
+        """Decode normalised rewards (K, M, B) for reaching inputs (M, B, inputs) from latent samples (K, B, latent)."""
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
     def model(self) -> list[nn.Parameter]:
-        """Weights of encoder and decoder, which PPO leaves alone."""
+        """Return the weights of encoder and decoder, which PPO does not train."""
         return [weight for name, weight in self.named_parameters() if not name.startswith("actor.")]
 
 
 class VariBAD(RL2):
-    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief of what a task hides."""
+    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief about hidden parts of a task."""
 
     name = "varibad"
     config_type, presets = VariBADConfig, PRESETS
@@ -108,7 +109,7 @@ class VariBAD(RL2):
         return BeliefActor(inputs, inputs.width - actions - 3, config, actions, init)
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
-        """PPO's update, with the beliefs that the trial was played by, then theirs."""
+        """Run PPO's update with the beliefs of the played trial, then update encoder and decoder."""
         losses, cfg = super()._update(b), self.config
         ones = torch.ones_like(b.row, dtype=torch.float32)
         batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
@@ -116,7 +117,7 @@ class VariBAD(RL2):
         return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """One step of encoder and decoder; what :meth:`_bound` returns, of all processes (2,)."""
+        """Take one step of encoder and decoder; return the result of :meth:`_bound` over all processes (2,)."""
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
@@ -126,9 +127,11 @@ class VariBAD(RL2):
         return found
 
     def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean squared error of decoded rewards and mean KL of each belief from the one before: this process's share.
+        """Return this process's share of the reward error and the KL.
 
-        Of the trials ``chosen``, int64 (B,): beliefs at random times predict rewards of random steps, past and future.
+        The reward error is the mean squared error of decoded rewards. The KL is the mean KL of each belief from the
+        previous one. In the trials ``chosen``, int64 (B,), beliefs at random times predict rewards of random steps,
+        past and future.
         """
         policy, net = self.policy, self.net
         previous = [b.take(each, chosen) for each in b.previous]

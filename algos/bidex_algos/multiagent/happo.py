@@ -1,7 +1,7 @@
 """HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
 
-Each agent, in an order drawn anew in each iteration, climbs PPO's clipped surrogate with the advantage times the ratios
-of the agents before it, so that its step is to the gain of all; then the critic of all learns.
+The order of agents is random in each iteration. Each agent climbs PPO's clipped surrogate with the advantage times the
+ratios of the agents before it, so that its step improves the joint policy. Afterwards the common critic learns.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from bidex_meta.training.distributed import sum_gradients
 
 @dataclass(frozen=True)
 class HAPPOConfig(InTurnConfig, MultiAgentPPOConfig):
-    """Everything that can be set about HAPPO; the defaults are the preset ``laptop``."""
+    """All options of HAPPO; the defaults are the preset ``laptop``."""
 
 
 PRESETS: dict[str, HAPPOConfig] = {
@@ -40,7 +40,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(OwnAdams, Sequential):
-    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HAPPO: agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "happo", "lower learning_rate"
     config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS

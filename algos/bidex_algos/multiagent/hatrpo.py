@@ -1,6 +1,7 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-As HAPPO, with MT-TRPO's step on each agent's own parameters, within its share of the trust region.
+The learner works like HAPPO, but takes MT-TRPO's step on each agent's own parameters, within the agent's share of the
+trust region.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from bidex_meta.utils.validation import Positive
 
 @dataclass(frozen=True)
 class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
-    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
+    """All options of HATRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.05
     """Mean KL of the new joint policy from the sampling one that no update exceeds; each agent has an even share."""
@@ -38,7 +39,7 @@ TASK_PRESETS = {
 
 
 class HATRPO(Sequential):
-    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HATRPO: agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type, presets, task_presets = HATRPOConfig, PRESETS, TASK_PRESETS

@@ -1,7 +1,7 @@
 """MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
 
-As MT-PPO, and with one agent the same: in each mini-batch every agent climbs its own clipped surrogate. The advantage
-is of all agents together, normalised per task like the returns.
+MAPPO with one agent equals MT-PPO. In each mini-batch every agent climbs its own clipped surrogate. All agents share
+one advantage, normalised per task like the returns.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from bidex_meta.training.distributed import sum_gradients
 
 @dataclass(frozen=True)
 class MAPPOConfig(MultiAgentPPOConfig):
-    """Everything that can be set about MAPPO; the defaults are the preset ``laptop``."""
+    """All options of MAPPO; the defaults are the preset ``laptop``."""
 
     share_parameters: bool = False
     """Share one network between agents with equal observation groups and action sizes; it sees who acts."""

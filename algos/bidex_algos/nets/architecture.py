@@ -1,4 +1,4 @@
-"""Which network stands between observation and output, and the critics of actions that are made of it."""
+"""The choice of the network between observation and output, and the critics of actions that are built from it."""
 
 from dataclasses import dataclass
 from functools import partial
