@@ -53,7 +53,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; environments of one task adapt together. None: each has its own task."""
+        """Set the task (N,) of each environment; environments of one task adapt together. None: each is its own task."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
@@ -85,7 +85,7 @@ class MetaPolicy(nn.Module):
         self.elapsed = (elapsed + 1).masked_fill(ended, 0)
 
     def adapt(self) -> None:
-        """Take one inner step of each task on all transitions since the last inner step; do nothing if there are none."""
+        """Take one inner step of each task on all transitions since the last inner step, if there are any."""
         if len(self.stage) == 0:
             return
         rows = self._rows(self.stage.obs[0])
@@ -121,7 +121,7 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """Make a policy with fresh weights from ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
+    """Make a policy with fresh weights from ``init``, a CPU generator; inner steps leave encoders of ``inputs`` alone."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 

@@ -33,7 +33,7 @@ class MemoryAgent:
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory and discard the evaluation's copy."""
+        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory and discard the evaluation copy."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))

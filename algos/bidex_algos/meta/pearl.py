@@ -142,7 +142,7 @@ class PEARL(MTSAC):
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
-        """Sum the evidence of the first ``episodes`` (M,) of a trial (0: the previous one) of environments ``rows`` (M,).
+        """Sum the evidence of the first ``episodes`` (M,) of a trial (0: the previous one) of environments (M,).
 
         The sum is estimated from ``context`` random transitions of these episodes: (M, 2 * latent).
         """

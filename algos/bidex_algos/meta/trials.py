@@ -86,7 +86,7 @@ class Trials:
         return slot[:, None] < self.lengths
 
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the memory's inputs besides the observation: last action (slots, N, a), last reward, whether shown, end.
+        """Return the memory's inputs besides the observation: last action (slots, N, a), last reward, shown, end.
 
         The slot after the last step counts as part of the same episode, because its value replaces the rewards that the
         time limit cut off.
@@ -96,7 +96,7 @@ class Trials:
         return action, reward, known, done & self.filled(slots)
 
     def discounts(self, slots: int, gamma: float) -> Tensor:
-        """Return the discount of the state after each of the first ``slots`` transitions, (slots, N): gamma in an episode.
+        """Return the discount of the state after each of the first ``slots`` transitions, (slots, N): gamma per step.
 
         After a true end a row stands still without reward until its time limit. Otherwise ending an episode would be
         rewarded with the early start of a new one.

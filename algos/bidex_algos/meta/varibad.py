@@ -76,7 +76,10 @@ class BeliefActor(RecurrentNet):
         return self.actor(torch.cat([x, mean, log_std], dim=-1)), state
 
     def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means and log standard deviations (T, B, latent) of the beliefs at steps (T, B, inputs), and the memory."""
+        """Return means and log standard deviations (T, B, latent) of the beliefs at steps (T, B, inputs).
+
+        The third result is the memory after these steps.
+        """
         belief, state = super().forward(x, state)
         mean, log_std = belief.chunk(2, dim=-1)
         return mean, log_std.clamp(-6.0, 2.0), state
@@ -92,7 +95,7 @@ class BeliefActor(RecurrentNet):
 
 
 class VariBAD(RL2):
-    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief about hidden parts of a task."""
+    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief about a task's hidden part."""
 
     name = "varibad"
     config_type, presets = VariBADConfig, PRESETS

@@ -77,7 +77,7 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
 
 @dataclass(frozen=True)
 class InTurnConfig(LearnerConfig):
-    """Options shared by HAPPO and HATRPO. A config that also inherits others lists these fields after the others' fields."""
+    """Options shared by HAPPO and HATRPO. A config that inherits others too lists these fields after the others'."""
 
     max_factor: NonNegative = 4.0
     """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""

@@ -16,7 +16,7 @@ from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` per agent; with ``share`` one per form (columns of groups, actions), which sees the acting agent.
+    """One :class:`MLP` per agent; with ``share`` one per form (columns of groups, actions) that sees which agent acts.
 
     Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
     """
@@ -80,9 +80,10 @@ class Team(nn.Module):
 
 
 class TeamActor(Team):
-    """Diagonal Gaussians of all agents, which together form one Gaussian of the world's action, like a ``GaussianActor``.
+    """Diagonal Gaussians of all agents, which together form one Gaussian of the world's action.
 
-    Each network has ``log_stds`` of shape (a_i,), or (heads, a_i) from which the group ``task_id`` selects a row.
+    The class replaces a ``GaussianActor``. Each network has ``log_stds`` of shape (a_i,), or (heads, a_i) from which
+    the group ``task_id`` selects a row.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class TeamActor(Team):
         return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Return one agent's mean (B, a_i) and log standard deviation (a_i,) or (B, a_i) for its input and the one-hot."""
+        """Return one agent's mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i), for its input and one-hot."""
         return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:
