@@ -1,4 +1,4 @@
-"""A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
+"""A rollout of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,8 @@ from bidex_meta.world.contract import Info, VectorWorld
 class EpisodeStatistics:
     """Fading sums over about the last ``window`` finished episodes of each task, in each process.
 
-    Few episodes end in one rollout, and often none of a slow task. ``task_id``: of each environment, int64 (N,).
+    Few episodes end in one rollout, and often none of a slow task. ``task_id`` is the task of each environment, int64
+    (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
@@ -23,7 +24,7 @@ class EpisodeStatistics:
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
     def update(self, info: Info) -> None:
-        """Takes in the episodes that ``info["episode_mask"]`` says ended in this step."""
+        """Add the episodes that ended in this step according to ``info["episode_mask"]``."""
         episode, ended = info["running"], info["episode_mask"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
         new = torch.zeros_like(self.sums).index_add_(1, self.task_id, values.masked_fill(~ended, 0.0))
@@ -32,7 +33,8 @@ class EpisodeStatistics:
     def metrics(self) -> dict[str, float]:
         """Return the means of each task that has finished an episode, over all processes.
 
-        Means over tasks are added once every task has finished one: before, they would be means of the fast tasks.
+        Means over tasks are added once every task has finished an episode; earlier means would cover only the fast
+        tasks.
         """
         returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
@@ -47,11 +49,11 @@ class EpisodeStatistics:
         return out
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums."""
+        """Return the sums."""
         return {"sums": self.sums.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.sums.copy_(state["sums"])
 
 
@@ -89,7 +91,7 @@ def collect(
     world: VectorWorld, rollout: Rollout, obs: Tensor, sample: Sampler, final_value: FinalValue,
     episodes: EpisodeStatistics
 ) -> Tensor:  # fmt: skip
-    """Fills ``rollout`` from ``world``, starting at the observations ``obs``; returns those to continue from."""
+    """Fill ``rollout`` from ``world``, starting at observations ``obs``; return the observations to go on from."""
     for t in range(rollout.steps):
         action, mean = sample(obs)
         rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
@@ -111,7 +113,7 @@ def collect(
 
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
-    """Refuses, by a BidexError, another autoreset mode than the learner's, or another default precision than single."""
+    """Raise BidexError if the world's autoreset mode is not the learner's, or the default precision is not single."""
     maths.check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:

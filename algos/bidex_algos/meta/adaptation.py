@@ -73,7 +73,7 @@ class TaskBatch:
 
 
 class Adapter:
-    """Gradient steps on an actor's parameters; the actor's own are the meta-parameters. Options as in ``MetaConfig``."""
+    """Gradient steps on an actor's parameters, which are the meta-parameters; options as in ``MetaConfig``."""
 
     def __init__(
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],

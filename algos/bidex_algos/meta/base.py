@@ -53,7 +53,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; environments of one task adapt together. None: each is its own task."""
+        """Set the task (N,) of each environment; environments of one task adapt together. None: each adapts alone."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
@@ -121,7 +121,7 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """Make a policy with fresh weights from ``init``, a CPU generator; inner steps leave encoders of ``inputs`` alone."""
+    """Make a policy with fresh weights from ``init``, a CPU generator; encoders of ``inputs`` do not adapt."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 

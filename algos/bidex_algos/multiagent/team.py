@@ -123,7 +123,10 @@ class TeamActor(Team):
         return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Return one agent's mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i), for its input and one-hot."""
+        """Return one agent's mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i).
+
+        ``seen`` is the agent's input, ``task`` the one-hot.
+        """
         return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:

@@ -111,7 +111,7 @@ class Critics(nn.Module):
         self.nets = nn.ModuleList(network(*given) for _ in range(count))
 
     def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Return the values of each action: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
+        """Return values of actions: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
         x = torch.cat([obs, actions], dim=1)
         all_values = torch.stack([net(x) for net in self.nets])
         if self.heads == 1:

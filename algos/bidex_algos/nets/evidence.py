@@ -1,4 +1,4 @@
-"""Inference of a goal from rewards: a model of the reward under any goal, candidate goals, and a policy on their belief.
+"""Inference of a goal from rewards: a reward model for any goal, candidate goals, and a policy on their belief.
 
 The model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348) for a goal whose numbers are known in
 training. The belief follows from Bayes' rule: the memory holds the log-likelihood of each fixed candidate, and every

@@ -42,7 +42,10 @@ class LatentPolicy(SquashedPolicy):
         return torch.asinh(reward / self.reward_unit)[..., None]
 
     def evidence(self, obs: Tensor, actions: Tensor, reward: Tensor, next_obs: Tensor) -> Tensor:
-        """Return the addend of each transition to the sums (..., 2 * size), for raw observations (..., d) and rewards (...)."""
+        """Return each transition's addend to the sums (..., 2 * size).
+
+        Observations (..., d) and rewards (...) are raw.
+        """
         before, after = (self.observations.some(self.noted(x), self.noted) for x in (obs, next_obs))
         seen = [before, actions, self.rewards(self.compressed(reward)), after]
         mean, raw = self.encoder(torch.cat(seen, dim=-1)).chunk(2, dim=-1)
@@ -50,7 +53,7 @@ class LatentPolicy(SquashedPolicy):
         return torch.cat([precision, precision * mean], dim=-1)
 
     def posterior(self, sums: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation (..., size) of the latent variable for sums of evidence (..., 2 * size)."""
+        """Return mean and standard deviation (..., size) of the latent variable from evidence sums (..., 2 * size)."""
         precision, weighted = sums.chunk(2, dim=-1)
         return weighted / (1.0 + precision), (1.0 + precision).rsqrt()
 

@@ -42,7 +42,10 @@ class StackedLinear(nn.Module):
 
 
 class TaskWeights(nn.Module):
-    """``count`` (K) numbers for each task, selected by its one-hot; drawn with length 1, so that mixtures keep their size."""
+    """``count`` (K) numbers for each task, selected by its one-hot.
+
+    The numbers of a task are drawn with length 1, so that mixtures keep their size.
+    """
 
     def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
         super().__init__()
@@ -217,7 +220,7 @@ class SoftModules(Headed):
 
 
 class Towers(Headed):
-    """Common layers, ``shared`` in number, followed by separate layers of each task; with 0 each task has its own network.
+    """``shared`` common layers, followed by separate layers of each task; with 0 each task has its own network.
 
     The task's one-hot selects the layers and is not fed to them.
     """

@@ -70,7 +70,7 @@ class Headed(nn.Module):
 
 
 class MLP(Headed):
-    """Fully connected network with zero biases and orthogonal weights of gain sqrt 2, for the output ``output_gain``."""
+    """Fully connected network: zero biases, orthogonal weights of gain sqrt 2 and, in the output, ``output_gain``."""
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
@@ -141,10 +141,10 @@ def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
 
 
 class GaussianActor(nn.Module):
-    """Diagonal Gaussian: a network computes the mean; the standard deviation of each action does not depend on the state.
+    """Diagonal Gaussian: a network computes the mean; the standard deviations do not depend on the state.
 
-    With several heads the group ``task_id`` selects the head; ``log_std`` is (actions,), or (heads, actions) with
-    heads.
+    With several heads the group ``task_id`` selects the head. ``log_std`` is (actions,), or (heads, actions) with
+    several.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class GaussianActor(nn.Module):
         self.log_std = nn.Parameter(torch.full((heads, actions) if heads > 1 else (actions,), math.log(init_std)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return mean actions for normalised observations (batch, observations), float32 (batch, actions), not clamped."""
+        """Return unclamped mean actions for normalised observations (batch, observations), float32 (batch, actions)."""
         if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, Headed) and maths.may_look(x.device):
             return self.mean.of_head(x, self.one_hot(x).argmax(-1), self.heads)
         return head_of(self.one_hot(x), self.mean(x), self.heads)

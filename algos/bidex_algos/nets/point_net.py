@@ -67,7 +67,7 @@ class PointNet(nn.Module):
 
 
 def _largest_of(values: Tensor) -> Tensor:
-    """Return ``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, whose argmax and max are not vectorised."""
+    """Return ``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, where argmax is not vectorised."""
     points = values.shape[1]
     step = next(d for d in range(min(16, points), 0, -1) if points % d == 0)
     blocks = values.unflatten(1, (-1, step))

@@ -17,7 +17,7 @@ _LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call c
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Return ``x @ weight.T + bias``, differentiable: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
+    """Return differentiable ``x @ weight.T + bias``: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
     if not _pays(x, weight):
         if x.is_cuda and torch.is_autocast_enabled("cuda"):
             x, weight = _in_eights(x, weight)
@@ -76,7 +76,7 @@ class Linear(nn.Linear):
 
 
 class _Affine(torch.autograd.Function):
-    """oneDNN's product, which has no gradient; the gradients here are products too, so they have gradients themselves."""
+    """oneDNN's product, which has no gradient of its own; the gradients here are products, so they have one too."""
 
     generate_vmap_rule = True
 

@@ -114,7 +114,7 @@ class RecurrentPolicy(nn.Module):
         return mean[0], state
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor | None:
-        """Draw the trial of each of ``rows`` exploring environments for the next step, given the last; None: no trial."""
+        """Draw what each of ``rows`` exploring environments tries next, given the ``last`` draw; None: nothing."""
         return None
 
     def fresh_memory(self, rows: int) -> Memory:

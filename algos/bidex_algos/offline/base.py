@@ -78,7 +78,7 @@ class Batches:
         self.fingerprint = data.fingerprint()
 
     def draw(self, batches: int, generator: torch.Generator) -> Tensor:
-        """Draw indices of transitions, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
         shape = (batches, len(self._count), self._per_task)
         # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
         drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]

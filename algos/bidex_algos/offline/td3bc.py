@@ -1,6 +1,7 @@
 """TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
 
-TD3's targets and delay; mu down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)), lambda = alpha / mean |Q_1(s, mu(s))|.
+Targets and delay are TD3's. mu minimises (mu(s) - a)^2 - lambda Q_1(s, mu(s)), with lambda = alpha / mean |Q_1(s,
+mu(s))|.
 """
 
 import copy
@@ -21,7 +22,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class TD3BCConfig(CriticConfig):
-    """Everything that can be set about TD3+BC; the defaults are the preset ``laptop``."""
+    """All options of TD3+BC; the defaults are the preset ``laptop``."""
 
     alpha: NonNegative = 2.5
     """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""

@@ -1,8 +1,9 @@
-"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks by one large critic.
+"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks, one large critic.
 
-Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' the mean of both critics' distributions,
-which are wide residual networks; rewards are over their task's largest return (the paper's equation 2); the task enters
-by a learned vector of length 1. All else is as in ``mtsac.py`` and ``categorical.py``; see ``docs/learners/brc.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' the mean of both critics'
+distributions. The critics are wide residual networks. Rewards are divided by their task's largest return (equation 2 of
+the paper). The task enters as a learned vector of length 1. The rest is described in ``mtsac.py`` and
+``categorical.py``; see ``docs/learners/brc.md``.
 """
 
 import math
@@ -24,7 +25,7 @@ from bidex_meta.utils.validation import Count, Finite, NonNegative, Share, Whole
 
 
 class ResidualBlock(nn.Module):
-    """x plus two normalised layers of it, with the non-linearity between them; sizes stay as they are."""
+    """Adds to x two normalised layers of x, with the non-linearity between the layers; sizes do not change."""
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -33,15 +34,15 @@ class ResidualBlock(nn.Module):
         self.layers = nn.Sequential(first, norms[0], ACTIVATIONS[activation](), second, norms[1])
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, width) to (batch, width)."""
+        """Map (batch, width) to (batch, width)."""
         return x + self.layers(x)
 
 
 class ResidualMLP(MLP):
-    """One normalised layer, then residual blocks: stands in the place of :class:`MLP`, whose arguments it takes.
+    """One normalised layer followed by residual blocks; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` is the width as often as there are blocks, and once more for the first layer. The layer norm is part of
-    it: ``layer_norm`` changes nothing.
+    ``hidden`` repeats the width once per block, plus once for the first layer. The layer norm is always used;
+    ``layer_norm`` has no effect.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class ResidualMLP(MLP):
 
 @dataclass(frozen=True)
 class BRCConfig(CategoricalConfig, MTSACConfig):
-    """Everything that can be set about BRC; the defaults are the preset ``laptop``."""
+    """All options of BRC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (256, 256, 256)
     """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""

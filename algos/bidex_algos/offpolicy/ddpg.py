@@ -1,8 +1,9 @@
 """DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
-Q towards r + gamma (1 - terminated) Q'(s', mu'(s')), mu up on Q(s, mu(s)). A critic's slope drives actions into corners
-where tanh has no slope back (on two hands 86 % were beyond 0.99 after 0.4 M steps): ``squash_price`` keeps them out.
-The noise, normal, differs in size from environment to environment of a task (the spread of Horgan et al. 2018).
+Q regresses to r + gamma (1 - terminated) Q'(s', mu'(s')); mu maximises Q(s, mu(s)). The critic's slope drives actions
+to the bounds, where tanh has almost no slope (on two hands 86 % of the actions exceeded 0.99 after 0.4 M steps);
+``squash_price`` prevents this. The noise is normal; its size differs between the environments of a task (the spread of
+Horgan et al. 2018).
 """
 
 import copy
@@ -24,7 +25,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class DDPGConfig(OffPolicyConfig):
-    """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
+    """All options of DDPG; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
     """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
@@ -119,7 +120,10 @@ class DDPG(OffPolicy):
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
-    """Numbers (N,) that go evenly from ``low`` in each task's first environment to ``high`` in its last, or only."""
+    """Return numbers (N,) that rise evenly from ``low`` in each task's first environment to ``high`` in its last.
+
+    A single environment gets ``high``.
+    """
     numbers = torch.empty(len(task_id), device=task_id.device)
     for task in range(num_tasks):
         rows = (task_id == task).nonzero().squeeze(1)

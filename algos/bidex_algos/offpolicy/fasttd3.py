@@ -1,8 +1,9 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-Few updates of many transitions follow each vector step; targets take the present actor's actions and follow fast, mu
-climbs min_i E Z_i, returns may take several steps, weights decay; rewards are over max(deviation, largest / bound) of
-their task's returns. All else is as in ``td3.py`` and ``categorical.py``; see ``docs/learners/fasttd3.md``.
+Few updates of many transitions follow each vector step. Targets use the present actor's actions, and target networks
+follow fast. mu climbs min_i E Z_i, returns may span several steps, and weights decay. Rewards are divided by
+max(standard deviation, largest / bound) of their task's returns. The rest is described in ``td3.py`` and
+``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Share
 
 @dataclass(frozen=True)
 class FastTD3Config(CategoricalConfig, TD3Config):
-    """Everything that can be set about FastTD3; the defaults are the preset ``laptop``."""
+    """All options of FastTD3; the defaults are the preset ``laptop``."""
 
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.

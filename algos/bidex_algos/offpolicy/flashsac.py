@@ -1,9 +1,9 @@
 """FlashSAC: SAC with bounded networks and few updates of large batches (Kim et al. 2026, arXiv 2604.04539).
 
-Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' of the critic with the lower mean. Layers
-have rows of length 1, batch norms hold what they give in bounds; a critic sees (s, a) and (s', a') as one batch. Each
-environment repeats its noise for some steps. All else is as in ``mtsac.py`` and ``categorical.py``; differences from
-the paper: ``docs/learners/flashsac.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' of the critic with the lower mean.
+Layers have rows of length 1, and batch norms bound their outputs; a critic sees (s, a) and (s', a') as one batch. Each
+environment repeats its noise for some steps. The rest is described in ``mtsac.py`` and ``categorical.py``; for
+differences from the paper see ``docs/learners/flashsac.md``.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,7 +37,7 @@ def _directions(inputs: int, outputs: int, generator: torch.Generator) -> nn.Lin
 
 
 class InvertedBlock(nn.Module):
-    """x plus two layers of it without biases, each with batch norm and non-linearity, wide between them."""
+    """Adds to x two layers of x without biases, each with batch norm and non-linearity; the block is wider inside."""
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -48,7 +48,7 @@ class InvertedBlock(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, width) to (batch, width)."""
+        """Map (batch, width) to (batch, width)."""
         return x + self.layers(x)
 
 
@@ -56,15 +56,15 @@ class FloatRMSNorm(nn.RMSNorm):
     """Scales (..., n) to a root mean square of 1, in the precision of its weights."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (..., n) to (..., n)."""
+        """Map (..., n) to (..., n)."""
         return super().forward(x.to(self.weight.dtype))
 
 
 class UnitMLP(MLP):
-    """Batch norm, a layer, inverted blocks, RMS norm, output: stands in the place of :class:`MLP`, of its arguments.
+    """Batch norm, a layer, inverted blocks, RMS norm, output; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` is the width as often as there are blocks, and once more for the first layer; ``output_gain`` and
-    ``layer_norm`` change nothing. Batch norms go by running statistics except within :func:`by_batch`.
+    ``hidden`` repeats the width once per block, plus once for the first layer; ``output_gain`` and ``layer_norm`` have
+    no effect. Batch norms use running statistics except within :func:`by_batch`.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class UnitMLP(MLP):
 
     @torch.no_grad()
     def to_sphere(self) -> None:
-        """Scales rows of weights to length 1, scales and shifts of n-wide norms, as one vector, to sqrt(n)."""
+        """Scale rows of weights to length 1, and scales and shifts of n-wide norms, as one vector, to sqrt(n)."""
         for layer in (*self.body.modules(), self.head):
             if isinstance(layer, nn.Linear):
                 layer.weight.div_(layer.weight.norm(dim=1, keepdim=True).clamp_min(1e-8))
@@ -102,7 +102,7 @@ def _of(module: nn.Module) -> list[UnitMLP]:
 
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
-    """Within it batch norms go by the statistics of what they are given, and take them into the running ones."""
+    """Let batch norms within the context use their input's statistics and merge these into the running ones."""
     network.train()
     yield
     network.eval()
@@ -110,7 +110,7 @@ def by_batch(network: nn.Module) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class FlashSACConfig(CategoricalConfig, MTSACConfig):
-    """Everything that can be set about FlashSAC; the defaults are the preset ``laptop``."""
+    """All options of FlashSAC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (128, 128, 128)
     """Width of the critics as often as there are blocks, and once more for the first layer; within a block four times
@@ -215,7 +215,7 @@ class FlashSAC(Categorical, MTSAC):
 
     @torch.no_grad()
     def _share_statistics(self) -> None:
-        """Running statistics become the mean of all processes', of which each goes by its own batch."""
+        """Average the running statistics over processes, each of which uses its own batch."""
         if world_size() == 1:
             return
         buffers = [each for net in (self.policy.actor, self.critic, self.target_critic) for each in net.named_buffers()]

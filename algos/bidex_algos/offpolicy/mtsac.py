@@ -1,9 +1,10 @@
 """MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each.
 
-Q_i towards r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')); pi down on alpha_k log pi - min_i
-Q_i; log alpha_k down on -log alpha_k (log pi + H), the mean over task k alone: one temperature for all would be set by
-their mean entropy, though a task that is solved and one that still explores need different ones. The loss is linear in
-log alpha, so that its gradient is the gap in entropy whatever alpha is. Deviations: ``docs/learners/mtsac.md``.
+Q_i regresses to r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')). pi minimises alpha_k log pi -
+min_i Q_i. log alpha_k minimises -log alpha_k (log pi + H), averaged over task k only. A single temperature would be set
+by the mean entropy of all tasks, although a solved task and an exploring task need different temperatures. The loss is
+linear in log alpha, so its gradient is the entropy gap for any alpha. Deviations from the paper:
+``docs/learners/mtsac.md``.
 """
 
 import math
@@ -24,7 +25,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class MTSACConfig(OffPolicyConfig):
-    """Everything that can be set about MT-SAC; the defaults are the preset ``laptop``."""
+    """All options of MT-SAC; the defaults are the preset ``laptop``."""
 
     init_std: Positive = 0.5  # Standard deviation of the actions at the start, before the squashing.
     std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Its bounds.
@@ -139,7 +140,7 @@ class MTSAC(OffPolicy):
 class SAC(MTSAC):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
-    MT-SAC, whose presets are made of Table 43, SAC's own: it has the same numbers in all of its columns.
+    The class is MT-SAC with presets of Table 43, SAC's own, which has the same numbers in all columns.
     """
 
     task_presets = TASK_PRESETS

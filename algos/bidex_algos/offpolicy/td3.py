@@ -1,7 +1,7 @@
 """TD3: DDPG with three changes (Fujimoto et al. 2018; Bi-DexHands' appendix B.1.4), on all tasks of a world at once.
 
-Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and taken from the lower of two critics; the actor
-and all targets wait for the critics, and move at every second update.
+Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and use the lower of two critics. The actor and
+all target networks move only at every second update of the critics.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class TD3Config(DDPGConfig):
-    """Everything that can be set about TD3; the defaults are the preset ``laptop``."""
+    """All options of TD3; the defaults are the preset ``laptop``."""
 
     target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
     target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
