@@ -52,8 +52,8 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
     count = len(gradients)
     gram = gradients @ gradients.T
     square = gram.diagonal().clamp_min(1e-30)
-    # What is left of a gradient is a combination of all: row i holds the coefficients of the i-th, and all rows take a
-    # step at once.
+    # A projected gradient is a combination of all gradients: row i holds the coefficients of the i-th, and all rows
+    # take a step at once.
     combination = torch.eye(count, dtype=gradients.dtype, device=gradients.device)
     for shift in range(1, count):
         other = torch.arange(count, device=gradients.device).roll(-shift)
@@ -104,7 +104,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
         root = (mu.square() + square * (weights @ own).clamp_min(0.0)).sqrt()
         pull = square / (mu + root)
         curved = pull * (gram - pull / root * own.outer(own))
-        # In shares of the weights, so that small ones do not spoil the condition.
+        # The variables are relative changes of the weights, so that small weights do not spoil the condition number.
         matrix = weights.outer(weights) * curved + mu * diagonal
         sides = torch.stack([mu - weights * (mean + pull * own), weights], dim=1)
         newton, constant = torch.linalg.solve_ex(matrix, sides)[0].unbind(1)
@@ -129,7 +129,7 @@ class GradientBalance(Balance):
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
         gradient, apart = self.combine(all_sum(per_task_gradients(losses, parameters)))
         for parameter, part in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
-            # All processes have the whole of it, and sum it.
+            # Every process holds the whole gradient, and the processes sum it.
             parameter.grad = part.view_as(parameter) / world_size()
         return apart / world_size()
 

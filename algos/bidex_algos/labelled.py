@@ -22,7 +22,7 @@ class Labelled:
         self.tasks, self._count = torch.unique_consecutive(task_id, return_counts=True)
         self._first = self._count.cumsum(0) - self._count
         half = {"dtype": torch.float16, "device": rows.device}
-        # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+        # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
         self._obs = torch.empty(steps, len(rows), observations, **half)
         self._labels = torch.empty(steps, len(rows), actions, **half)
 
@@ -41,7 +41,7 @@ class Labelled:
         """Draw indices, uniform within each task: int64 (batches, K * per_task), task after task."""
         shape, device = (batches, len(self.tasks), per_task), self.rows.device
         step = torch.randint(self.filled, shape, generator=generator, device=device)
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=generator, device=device) % self._count[:, None]
         return (step * len(self.rows) + self._first[:, None] + row).flatten(1)
 

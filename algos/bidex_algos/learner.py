@@ -33,7 +33,7 @@ def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
     return dict(zip(tensors, values, strict=True))
 
 
-# What decides, beside the shapes of the weights, what they compute.
+# Besides the shapes of the weights, these values determine the function of a network.
 _WORLD = ("observations", "actions", "task_id")
 _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
 
@@ -66,7 +66,7 @@ class Learner(Contract):
         check_options(self.name, config, world, self.shape)
         check_discounts(self.name, world, self.discounts_by_class)
         self.inputs = self._inputs(config, self.shape)
-        # Weights come from a CPU generator, so that a seed means the same network on every device.
+        # Weights are drawn from a CPU generator, so that a seed gives the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)
         self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
         self.policy: Any = self._make_policy(config, self.shape, self.initial, self.device)
@@ -112,7 +112,7 @@ class Learner(Contract):
             steps = self.env_steps
             world: Any = getattr(self.world, "unwrapped", self.world)
             if hasattr(world, "check_formulas"):
-                world.check_formulas()  # of a class of the user's own, whose numbers may be the cause
+                world.check_formulas()  # a user's own class may have caused the non-finite numbers
             raise FloatingPointError(f"{self.name}: the loss is not finite after {steps} steps; {self.remedy}.")
         whole = time.perf_counter() - started
         metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected
@@ -128,7 +128,7 @@ class Learner(Contract):
 
     def _first_observations(self) -> Tensor:
         """Begin the training: return raw observations (N, d) of the world's first reset."""
-        # The same seed has given the same weights everywhere, unless a machine computes differently.
+        # The same seed gives the same weights in every process, unless a machine computes differently.
         modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
         broadcast([weight for module in modules for weight in module.parameters()])
         obs, _ = self.world.reset(seed=own_seed(self.seed))
@@ -179,7 +179,7 @@ class Learner(Contract):
                 "other weights. Name another run."
             )
         if isinstance(self.policy, SquashedPolicy):
-            # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
+            # Its network's output is a position between these bounds; a Gaussian policy has its std as a weight.
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
         self.policy.observations.keep()

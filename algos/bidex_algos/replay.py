@@ -43,10 +43,10 @@ class Replay:
     ):  # fmt: skip
         rows = len(task_id)
         self.steps, self.rows, self.num_tasks, self.device, self.added = steps, rows, num_tasks, device, 0
-        self.slots = steps + 1  # one more than transitions: the newest observation has none yet
+        self.slots = steps + 1  # one more than transitions, because the newest observation has none yet
         self.cuts_kept = _cuts_kept(steps, rows, cut_share)
 
-        # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+        # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
         def ring(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=device)
 
@@ -56,10 +56,10 @@ class Replay:
             "rewards": ring(self.slots, rows),
             "terminated": ring(self.slots, rows, dtype=torch.bool),
             "valid": ring(self.slots, rows, dtype=torch.bool),
-            # Running number, from 1, of the time limit that cut the episode here; 0 where none did.
+            # Running number, from 1, of the time limit that cut the episode here; 0 without a cut.
             "cut": ring(self.slots, rows, dtype=torch.int64),
         }
-        # The cell behind the last takes what nobody will read.
+        # The last cell is a dummy: it takes writes that are never read.
         self._final_obs = ring(self.cuts_kept + 1, observations)
         self._cuts = torch.zeros((), dtype=torch.int64, device=device)
         self._rows_of_task = torch.argsort(task_id, stable=True)
@@ -87,11 +87,11 @@ class Replay:
         valid = ~info["unstable"]
         cut = truncated & ~terminated & valid
         number = self._cuts + cut.cumsum(0)
-        # All rows write, those whose episode goes on into the last cell: to pick rows the host would have to wait.
+        # All rows write; rows whose episode goes on write into the dummy cell. Selecting rows would make the host wait.
         cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
         self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
-        # A weight of 0 does not undo a reward that is not a number.
+        # A weight of 0 does not remove a reward that is NaN.
         rewards, numbers = reward.masked_fill(~valid, 0.0), number.masked_fill(~cut, 0)
         step = {"actions": actions, "rewards": rewards, "terminated": terminated, "valid": valid, "cut": numbers}
         for name, value in step.items():
@@ -106,7 +106,7 @@ class Replay:
         def uniform(high: int) -> Tensor:
             return torch.randint(high, shape, generator=generator, device=self.device)
 
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = self._rows_of_task[self._first[:, None] + uniform(2**40) % self._count[:, None]]
         return self.places(row, uniform(self.filled)).flatten(1)
 
@@ -179,7 +179,7 @@ def steps_within(memory: float, steps: int, rows: int, observations: int, action
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
-    # A vector step's worth at least: all may end together, and no cell may be written twice in a step.
+    # At least one vector step's worth: all episodes may end together, and a step must not write a cell twice.
     return max(rows, math.ceil(cut_share * steps * rows))
 
 

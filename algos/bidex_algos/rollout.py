@@ -80,8 +80,8 @@ class Rollout:
         self.rewards = zeros(steps, num_envs)  # 0 where not valid
         self.terminated = zeros(steps, num_envs, dtype=torch.bool)  # the episode came to a true end
         self.ended = zeros(steps, num_envs, dtype=torch.bool)  # terminated, truncated or not valid
-        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False where physics broke: teaches nothing
-        # Values of the last observations of episodes cut by a time limit, 0 elsewhere; of several critics one each.
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False if physics broke: the transition teaches nothing
+        # Values of the last observations of episodes cut by a time limit, else 0; with several critics one value each.
         self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
         self.last_obs = zeros(num_envs, observations)  # raw, after the last step
 
@@ -102,7 +102,7 @@ def collect(
         cut = truncated & ~terminated & valid
         values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
         if not maths.may_look(cut.device):
-            # A forward of all environments is cheaper than the wait for which rows there are.
+            # A forward pass of all environments is cheaper than waiting for the indices of the cut rows.
             there = cut.view(-1, *[1] * (values.dim() - 1))
             values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
         elif len(rows := cut.nonzero().squeeze(-1)):

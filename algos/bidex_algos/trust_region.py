@@ -33,7 +33,7 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
     square = first = residual.dot(residual)
     for _ in range(iterations):
         along = product(direction)
-        # Masked instead of stopped: whether to stop would be a question to the device.
+        # The update is masked instead of stopped, because a stop would require a host sync.
         going = square > tolerance * first
         length = torch.where(going, square / direction.dot(along), 0.0)
         x = x + length * direction
@@ -73,7 +73,7 @@ def line_search(
     for _ in range(tries):
         write(parameters, start + share * step)
         objective, kl = measure()
-        # Comparisons with NaN are false, so that a broken point is never taken.
+        # Comparisons with NaN are false, so a broken point is never accepted.
         if objective - before > max(accept_ratio * share * expected, 0.0) and kl <= max_kl:
             return share
         share *= factor

@@ -150,5 +150,5 @@ class DAgger(Learner):
             return
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:
-            obs, _ = self.world.reset()  # no teacher knows the half of an episode that it has not seen
+            obs, _ = self.world.reset()  # teachers have not seen the first part of a running episode
             self._begin_all(obs, self._teachers_share())

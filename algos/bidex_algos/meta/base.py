@@ -44,7 +44,7 @@ class MetaPolicy(nn.Module):
             actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
             config.step_sizes
         )  # fmt: skip
-        self.step_sizes = self.adapter.step_sizes  # among the weights of a checkpoint, where there are such
+        self.step_sizes = self.adapter.step_sizes  # part of the weights of a checkpoint, unless None
         self.seed = seed
         self.generator: torch.Generator | None = None
         self.rows: TaskRows | None = None
@@ -90,7 +90,7 @@ class MetaPolicy(nn.Module):
             return
         rows = self._rows(self.stage.obs[0])
         params = self.adapter.meta(rows.count) if self.adapted is None else self.adapted
-        params = detached(params)  # nobody differentiates this step
+        params = detached(params)  # this step is not differentiated
         log_std = params["log_std"].clamp(*self.adapter.log_std_range)
         batch = task_batch(self.stage, rows, log_std, self.config)
         self.adapted = detached(self.adapter.adapt(params, batch))
@@ -146,7 +146,7 @@ class MetaLearner(Learner):
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
-        # What can be drawn from; the world's own pools will be those of a meta-batch.
+        # The tasks to draw from; the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
         counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         for name, count, pool in zip(world.task_names, counts, self.pools, strict=True):
@@ -234,7 +234,8 @@ class MetaLearner(Learner):
             obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned = torch.zeros(len(running), device=self.device)
-        # A slice counts an episode if the suite's rule does where slice or episode ends, and it meets the goal within.
+        # A slice is a success if the suite's rule holds at the end of the slice or an episode, and the goal was met in
+        # it.
         success = torch.zeros_like(running)
         ended_well = torch.zeros_like(running)
         met = torch.zeros_like(running)

@@ -32,7 +32,7 @@ from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
-# Added to the deviations of actions, in which errors count: 1.5 % of an action's range.
+# Added to the standard deviations of actions, which are the unit of errors: 1.5 % of an action's range.
 _FLOOR = 0.03
 
 
@@ -97,7 +97,10 @@ class ICL(TrialLearner):
     def _make_policy(
         cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device, belief: Belief | None = None
     ) -> BeliefPolicy:
-        seen, goals = cls._inputs(config, shape), max(1, shape.hidden)  # a 0 where nothing is hidden
+        seen, goals = (
+            cls._inputs(config, shape),
+            max(1, shape.hidden),
+        )  # at least one entry, which is 0 if no value is hidden
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
@@ -217,7 +220,7 @@ class ICL(TrialLearner):
         """Draw ``count`` trials evenly over the classes; return trial, environment and class of each, (B,)."""
         shape = len(self.tasks), math.ceil(count / len(self.tasks))
         trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=self.generator, device=self.device) % self.count[:, None]
         rows = self.rows[self.first[:, None] + row]
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])

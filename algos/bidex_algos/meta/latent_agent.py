@@ -50,7 +50,7 @@ class LatentAgent:
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
         """Add the evidence of one transition of every valid environment."""
-        # Meta-World's evaluation names neither next observations nor valid environments.
+        # Meta-World's evaluation passes neither next observations nor valid environments.
         following = timestep.observation if timestep.next_observation is None else timestep.next_observation
         valid = torch.ones_like(timestep.terminated) if timestep.valid is None else timestep.valid
         reward = timestep.reward.masked_fill(~valid, 0.0)

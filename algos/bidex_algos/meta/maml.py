@@ -33,7 +33,7 @@ class MAMLConfig(OuterConfig):
 
 
 PRESETS: dict[str, MAMLConfig] = {
-    # The Bi-DexHands appendix has no table for MAML: all but the trust region, MAML's own, is as in ProMP's.
+    # The Bi-DexHands appendix has no table for MAML. The trust region is MAML's own; the rest is ProMP's table.
     "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
     "tuned": MAMLConfig(**TUNED),
     "unseen": MAMLConfig(**UNSEEN),

@@ -53,7 +53,7 @@ class MemoryAgent:
         if self._learned is None or self._next_state is None:
             return
         valid, ended = timestep.valid, timestep.terminated | timestep.truncated
-        # Meta-World's evaluation names no valid rows: all are.
+        # Meta-World's evaluation does not pass valid rows: all are valid.
         known = torch.ones_like(ended) if valid is None else valid
         moved = torch.ones_like(ended) if valid is None else ~self._over
         after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)

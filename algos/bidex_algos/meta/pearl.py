@@ -54,7 +54,7 @@ class PEARLConfig(MTSACConfig):
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 
-# v2: as of MT-PPO.
+# v2: MT-PPO's discount.
 PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.96)}
 
 
@@ -75,19 +75,20 @@ class PEARL(MTSAC):
         trained = [*self.critic.parameters(), *self.policy.encoder.parameters()]
         self.adams["critic"] = self._adam(trained, config.critic_learning_rate)
         self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(2))
-        # Of each environment's trial: the latent variable it acts on, episodes that are over, and the vector steps
-        # after which it began and each of its episodes ended, of the trial before it too: (2, N, episodes + 1).
+        # For each environment's trial: the latent variable that it acts on, the number of finished episodes, and the
+        # vector steps at which the trial began and each episode ended. ``bounds`` also holds the previous trial: (2, N,
+        # episodes + 1).
         self.latent = torch.randn(rows, config.latent, generator=self.generator, device=device)
         self.played = torch.zeros(rows, dtype=torch.int64, device=device)
         self.bounds = torch.zeros(2, rows, config.episodes_per_trial + 1, dtype=torch.int64, device=device)
-        # Environments of each class: how many, and the first. In ``by_task`` those of one task stand side by side: of
-        # each environment's task how many, and where.
+        # Number and first index of each class's environments. ``by_task`` orders environments by task; ``count`` and
+        # ``first`` are number and first position of the environments of each environment's task.
         self.of_class = torch.bincount(world.task_id, minlength=world.num_tasks)
         self.start = self.of_class.cumsum(0) - self.of_class
         task = _tasks(world)
         self.by_task, self.count = torch.argsort(task, stable=True), torch.bincount(task)[task]
         self.first = torch.searchsorted(task[self.by_task], task)
-        # An update chooses so many environments of each class; ``which`` of all these each of its draws is for.
+        # An update chooses this many environments of each class; ``which`` maps each draw to a chosen environment.
         self.chosen = math.ceil(config.tasks_per_update / world.num_tasks)
         within = torch.arange(self.batch_per_task, device=device) % self.chosen
         self.which = (torch.arange(world.num_tasks, device=device)[:, None] * self.chosen + within).flatten()
@@ -138,7 +139,7 @@ class PEARL(MTSAC):
 
     def _below(self, counts: Tensor, *shape: int) -> Tensor:
         """Draw uniform integers (shape) below ``counts``, which broadcast; 0 where a count is 0."""
-        # The remainder of a number this large favours none by more than 1 in 2^40 / count.
+        # The remainder of so large a number favours no entry by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:

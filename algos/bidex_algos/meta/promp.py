@@ -39,14 +39,14 @@ class ProMPConfig(OuterConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. "Desired kl" is read by the original and used
-    # nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
+    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. The original reads "Desired kl" but never uses
+    # it; here the outer step size follows it, starting at 3e-4, as in PPO's tables.
     "paper": ProMPConfig(
         **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,
     ),
-    # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
-    # lost a third of the return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps.
+    # Outer steps for training from scratch are too large for a trained policy. Five steps of 1e-3 gave a KL of 1.1 and
+    # lost a third of the return. With a KL of 0.05 one seed lost 0.5 of a return of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
     "v2": ProMPConfig(**V2, outer_learning_rate=1e-4, desired_kl=0.0125),

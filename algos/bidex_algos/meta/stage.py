@@ -28,7 +28,7 @@ class TaskRows:
         column = torch.arange(width, device=task_of_row.device)
         self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
         self.weight = (column < counts[:, None]).float()
-        # Where each environment stands in the flattened rectangle.
+        # Position of each environment in the flattened rectangle.
         place = torch.empty_like(order)
         rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
         place[order] = task_of_row[order] * width + rank
@@ -72,13 +72,13 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
         1              0.78, 0.76, 0.77
     """
     predicted = []
-    # Task by task: the features of all tasks at once, and their Gram matrices, take more memory and more time.
+    # The loop runs task by task: features and Gram matrices of all tasks at once take more memory and more time.
     for o, t, r, w in zip(obs, elapsed, returns, weights, strict=True):
         x = features(o, t)
         weighted = x * w[:, None]
         gram = (weighted.T @ x).double()
         diagonal = gram.diagonal()
-        # What every entry gets, relative to their mean, so that features may depend on each other.
+        # A small penalty on every entry, relative to the mean, so that features may be linearly dependent.
         penalty = torch.full_like(diagonal, 1e-5)
         penalty[:-4] += ridge * x.shape[1] / w.sum().clamp_min(1.0)
         diagonal += penalty * diagonal.mean().clamp_min(1.0)

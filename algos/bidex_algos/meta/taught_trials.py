@@ -46,7 +46,7 @@ class TaughtTrials:
         self.taught = torch.zeros(rows, dtype=torch.bool, device=device)
 
         def empty(*shape: int, dtype: torch.dtype = torch.float16) -> Tensor:
-            # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+            # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
             return torch.empty(kept, slots, rows, *shape, dtype=dtype, device=device)
 
         self._ring = {
@@ -65,7 +65,7 @@ class TaughtTrials:
     def keep(self) -> None:
         """Store the trials that were played."""
         t = self.trials
-        # One slot later, so that a reward stands beside what it led to; an episode's last one led nowhere.
+        # Rewards move one slot later, to the state that they led to; an episode's last reward led to no recorded state.
         rewards, paid = (torch.cat([torch.zeros_like(x[:1]), x[:-1]]) for x in (self.rewards, t.valid & ~t.ended))
         new = {"obs": t.obs, "rewards": rewards, "paid": paid, "labels": self.labels, "goals": self.goals}
         for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():

@@ -37,7 +37,7 @@ class TrialLearner(Learner):
     going_on = ("trials_played", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: Any, seed: int):
-        if config.max_adapt_steps is None:  # memories are made to last for a trial
+        if config.max_adapt_steps is None:  # the memory is sized for a whole trial
             config = replace(config, max_adapt_steps=int(world.max_episode_steps.max()))
         super().__init__(world, config, seed)
         self.agent = MemoryAgent(self.policy, own_seed(seed))
@@ -45,7 +45,7 @@ class TrialLearner(Learner):
         self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
         """Most steps of an episode of each environment (N,)."""
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
-        # Classes with fewer rows than tasks: their pools and numbers of rows. Each trial takes as many tasks as that.
+        # Pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         each = zip(world.task_names, world.pools, rows, strict=True)
         self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}
@@ -67,7 +67,7 @@ class TrialLearner(Learner):
     def _begin(self) -> Tensor:
         if self.pools:
             trial = self.trials_played * world_size() + rank()
-            # By turns: all tasks of a class come equally often.
+            # The pool rotates, so all tasks of a class are played equally often.
             turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}
             self.world.set_tasks(turned)
         return self._first_observations() if self.trials_played == 0 else self.world.reset()[0]

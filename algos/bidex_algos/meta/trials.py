@@ -72,9 +72,10 @@ class Trials:
             return torch.zeros(slots, rows, *shape, dtype=dtype, device=limits.device)
 
         self.longest = longest
-        # Raw observations before each step, and in the slot after the last what that led to; sampled actions, not
-        # clamped; rewards, 0 where physics broke (not valid); whether the policy was shown them; true ends; steps that
-        # the time limit would still have allowed; slots that each environment has filled (N,).
+        # Per slot: the raw observation before the step (the slot after the last step holds the resulting one), the
+        # sampled and unclamped action, the reward (0 if not valid, when physics broke), whether the policy was shown
+        # it, true ends, and the steps left until the time limit. ``lengths`` (N,) counts the slots that each
+        # environment has filled.
         self.obs, self.actions, self.rewards = zeros(observations), zeros(actions), zeros()
         self.shown, self.valid, self.ended, self.terminated = (zeros(dtype=torch.bool) for _ in range(4))
         self.left = zeros(dtype=torch.int64)
@@ -171,7 +172,7 @@ def play(
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
-            # A waiting row writes into its next slot, and so leaves there the observation that its last step led to.
+            # A waiting row writes into its next slot, which therefore holds the observation after its last step.
             at = trials.lengths
             trials.obs[at, rows], trials.actions[at, rows], trials.rewards[at, rows] = obs, action, reward
             trials.shown[at, rows], trials.valid[at, rows], trials.ended[at, rows] = shown, valid, ended
@@ -196,7 +197,7 @@ class Batch:
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
-    # What the memory is fed beside the observation; see Trials.previous.
+    # Inputs of the memory besides the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
     old_means: Tensor  # means of the sampling policy (T, N, a)
     old_log_probs: Tensor  # log-density of the actions under it (T, N)
@@ -236,7 +237,7 @@ def make_batch(
     Also returns the explained variance per task (num_tasks,). ``return_stats`` is updated with the trial's returns.
     """
     num_tasks = len(return_stats.mean)
-    # The only wait for the device: how many steps the longest trial has.
+    # The only host sync: the number of steps of the longest trial.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
     means, values, actor_states, critic_states = [], [], [], []
@@ -255,9 +256,9 @@ def make_batch(
     filled = t.filled(slots)
     last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1
     valid = t.valid[:slots] & filled
-    # What follows the trial's last slot is never asked for.
+    # The value after the trial's last slot is never used.
     next_values = torch.cat([values[1:], values[-1:]])
-    # The end of an episode is none of the trial: the next one follows, and the memory with it.
+    # The end of an episode does not end the trial: the next episode follows with the same memory.
     advantages = gae(
         t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
         gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid

@@ -24,7 +24,7 @@ from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
-# Times of a trial whose beliefs a mini-batch decodes, and steps whose rewards are predicted from each.
+# Number of times of a trial whose beliefs a mini-batch decodes, and of steps whose rewards each belief predicts.
 _TIMES, _STEPS = 16, 64
 
 
@@ -50,7 +50,7 @@ class VariBADConfig(RL2Config):
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-# v2: as of RL².
+# v2: RL²'s discount.
 PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig(), "v2": VariBADConfig(gamma=0.96)}
 
 
@@ -142,7 +142,8 @@ class VariBAD(RL2):
         mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
         before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
         divergence = valid * gaussian_kl(mean, log_std, *before)
-        # A slot shows the reward of the step before it, but where that ended an episode not what it led to.
+        # A slot shows the reward of the previous step, but after the end of an episode not the state that the step led
+        # to.
         paid = torch.cat([torch.zeros_like(valid[:1]), valid[:-1]]).masked_fill(previous[3], 0.0)
         time, step = (torch.randperm(len(x), generator=self.generator, device=x.device)[:k] for k in (_TIMES, _STEPS))
         noise = torch.randn(mean[time].shape, generator=self.generator, device=x.device)

@@ -176,7 +176,7 @@ class MultiAgent(OnPolicy):
         super()._merge_returns(mean, var, count)
         if self.config.popart:
             after = stats.mean, stats.std()
-            # Before the first returns of a task its values are none.
+            # A task has no values before its first returns.
             old_mean, old_std = (torch.where(known, *pair) for pair in zip(before, after, strict=True))
             keep_values(self._critics(), (old_mean, old_std), after)
 

@@ -25,7 +25,7 @@ class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
 
 
 PRESETS: dict[str, HATRPOConfig] = {
-    # There is no table for HATRPO: HAPPO's (44), with the trust region of our TRPO's preset of this name.
+    # There is no table for HATRPO. The values are HAPPO's (44), with the trust region of TRPO's preset of this name.
     "paper": HATRPOConfig(
         **PAPER, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
         accept_ratio=0.1, critic_learning_rate=1e-4, critic_epochs=5, num_minibatches=1, max_grad_norm=1.0,

@@ -34,7 +34,7 @@ class MADDPGConfig(DDPGConfig):
         keep_partition(self)
 
 
-# There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
+# There is no table for MADDPG (B.2.5 describes it). The values are DDPG's preset of this name.
 PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop": MADDPGConfig()}
 
 
@@ -85,7 +85,7 @@ class MADDPG(DDPG):
             value = self._climbed(
                 self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
             )
-            # Of all actions, not of its own: the price of an action shall not depend on the partition.
+            # The price is relative to all actions, not the agent's own, so that it does not depend on the partition.
             price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())
         loss = torch.stack(losses).sum()

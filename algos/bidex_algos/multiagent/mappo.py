@@ -25,7 +25,7 @@ class MAPPOConfig(MultiAgentPPOConfig):
 
 
 PRESETS: dict[str, MAPPOConfig] = {
-    # Table 45. Its deviation is 0.5 sigmoid(s), s = 1 at first (std y and x coef); B.2.4 has one policy for all agents.
+    # Table 45. Its std is 0.5 sigmoid(s), initially s = 1 (std y and x coef); B.2.4 has one policy for all agents.
     "paper": MAPPOConfig(
         **PAPER_PPO, learning_rate=5e-4, critic_learning_rate=5e-4, max_grad_norm=10.0, adam_eps=5e-4,
         init_std=0.3655, std_range=(0.01, 0.5), share_parameters=True,
@@ -68,7 +68,7 @@ class MAPPO(OwnAdams):
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)
         value = self._value_loss(b, old_values, weights)
-        # Of agents that share a network the mean (B.2.4), else each its own loss.
+        # Agents that share a network get the mean of their losses (B.2.4), other agents their own loss.
         share = [1.0 / actor.net_of.count(net) for net in actor.net_of]
         surrogate = torch.stack([part * loss.surrogate for part, loss in zip(share, losses, strict=True)]).sum()
         entropy = torch.stack([part * loss.entropy for part, loss in zip(share, losses, strict=True)]).sum()

@@ -138,7 +138,7 @@ class TeamActor(Team):
         return joint.index_select(-1, self._taken).split(self._sizes, dim=-1)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return the joint log standard deviation for observations (B, d): (a,) with one head, else (B, a)."""
+        """Return the rows of ``log_std`` (default: own) for observations (B, d): (a,) with one head, else (B, a)."""
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:

@@ -19,8 +19,8 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_meta.utils import maths
 
-_WHICH = 64  # width of the hidden layer of the network that tells classes apart
-_TAIL = 4.0  # degrees of freedom of the Student distribution that errors of the model are taken to have
+_WHICH = 64  # width of the hidden layer of the network that classifies observations
+_TAIL = 4.0  # degrees of freedom of the Student distribution assumed for the model's errors
 
 
 def spread(count: int, size: int) -> Tensor:
@@ -46,7 +46,7 @@ class BeliefNet(nn.Module):
         super().__init__()
         width, self.classes = hidden[-1], classes
         self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
-        # One layer of all classes: of each, the columns have length 1.
+        # One layer holds all classes; the columns of each class have length 1.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)
         self.activation = ACTIVATIONS[activation]()
         self.paid = MLP(width, (max(1, width // 2),), 2, 0.01, generator, activation)
@@ -190,7 +190,7 @@ class BeliefPolicy(RecurrentPolicy):
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return mean actions and state as in the base class; a row with negative ``drawn`` tries no candidate."""
-        known = memory.known & ~memory.done  # what the last step of an episode led to was not seen
+        known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
         goal = self.belief.believed(state)
         if drawn is not None:

@@ -113,7 +113,7 @@ class Moore(Headed):
         for before, width in pairwise([self.encoder.size, *hidden]):
             layers += [StackedLinear(modules, before, width, math.sqrt(2.0), generator)]
             layers += [PlainNorm(layer_norm), ACTIVATIONS[activation]()]
-        self.body = nn.Sequential(*layers[:-2])  # what is made orthogonal has not been through a non-linearity
+        self.body = nn.Sequential(*layers[:-2])  # vectors are orthogonalised before the non-linearity
         self.activation, self.scale = ACTIVATIONS[activation](), math.sqrt(hidden[-1])
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 

@@ -27,7 +27,7 @@ def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
         return setting == "on"
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    # Functions of some of PyTorch's versions.
+    # These functions exist only in some versions of PyTorch.
     supported = [vars(torch.cpu).get(f"_is_{name}_supported") for name in ("amx_tile", "avx512_bf16")]
     return device.type == "cpu" and any(check is not None and check() for check in supported)
 
@@ -117,7 +117,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """Make a layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
-    # Made without memory first: the default initialisation would draw from (and so disturb) the global generator.
+    # The layer is made without memory first: the default initialisation would draw from the global generator.
     layer = Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
@@ -163,7 +163,7 @@ class GaussianActor(nn.Module):
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return ``log_std`` for observations (batch, d): (actions,) with one head, else (batch, actions)."""
+        """Return the rows of ``log_std`` (default: own) for observations (batch, d): (actions,) or (batch, actions)."""
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
 

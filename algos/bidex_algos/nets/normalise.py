@@ -9,8 +9,8 @@ from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.training.distributed import pool_moments
 from bidex_meta.training.learner import LearnerConfig
 
-_FLOOR = 3e-3  # of a deviation: keeps a column that has been constant so far from blowing up noise a thousandfold
-_FOREVER = 1e18  # observations beside which all that follow count nothing
+_FLOOR = 3e-3  # of a standard deviation: a column that was constant so far must not amplify noise a thousandfold
+_FOREVER = 1e18  # a count so large that further observations have no weight
 
 
 class RunningStats(nn.Module):
@@ -48,7 +48,7 @@ class RunningStats(nn.Module):
         return (x - self.mean.float()[element]) / self.std().float()[element]
 
     def restore(self, x: Tensor, element: Tensor) -> Tensor:
-        """Invert :meth:`normalise`, (..., n); the result is 0 if the element has no statistics yet.
+        """Invert :meth:`normalise` for ``x`` (..., n); the result is 0 if the element has no statistics yet.
 
         An untrained critic outputs numbers of about 1, which may be a hundred times a return. The first statistics
         would be of these outputs, and a hundred iterations would be needed to forget them.
@@ -69,7 +69,7 @@ class ObservationNormaliser(nn.Module):
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
-        # float32 copies of what forward needs, refreshed by update.
+        # float32 copies for forward, refreshed by update.
         self.shift: Tensor
         self.scale: Tensor
         self.register_buffer("shift", torch.zeros(inputs.width))

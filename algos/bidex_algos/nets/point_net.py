@@ -14,7 +14,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
-_SPREAD = 0.2  # what distances from a cloud's centre are divided by, metres: about a hand's length
+_SPREAD = 0.2  # metres; divides distances from a cloud's centre: about a hand's length
 _CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
 
 
@@ -53,7 +53,8 @@ class PointNet(nn.Module):
         last = cast(nn.Linear, self.shared[-1])
         if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
-        # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
+        # Only the point with the maximum of a feature has a gradient: find these points first, then differentiate only
+        # them.
         with torch.no_grad():
             found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
         chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))

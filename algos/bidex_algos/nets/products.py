@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-_LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call costs is more than what it saves
+_LEAST = 1 << 21  # multiplications from which oneDNN is faster; below, the call's overhead exceeds the gain
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -48,9 +48,9 @@ def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Ten
 
 
 def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]]) -> Tensor:
-    """Apply to each row (B, inputs) its layer ``index``, int64 (B,): (B, outputs); needs a host sync."""
+    """Apply to each row (B, inputs) the one of ``layers`` at ``index``, int64 (B,): (B, outputs); needs a host sync."""
     sizes = torch.bincount(index, minlength=len(layers)).tolist()
-    in_order = bool((index[1:] >= index[:-1]).all())  # batches that are drawn task by task: nothing to move
+    in_order = bool((index[1:] >= index[:-1]).all())  # batches drawn task by task need no reordering
     order = slice(None) if in_order else index.argsort(stable=True)
     parts = x[order].split(sizes)
     out = torch.cat([layer(part) for layer, part in zip(layers, parts, strict=True) if len(part)])
@@ -136,4 +136,4 @@ def _processor() -> str:
     try:
         return Path("/proc/cpuinfo").read_text(errors="ignore")
     except OSError:
-        return platform.processor()  # where it is no Linux
+        return platform.processor()  # not on Linux

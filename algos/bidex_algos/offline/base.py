@@ -110,7 +110,7 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
     while span < longest:
         inside = data.left[:-span] >= span
         behind = factor[:-span] ** span * returns[span:]
-        # One sum of both, not in place: what stands behind must still be of the shorter span.
+        # The sum is not in place, because the later entries must still have the shorter span.
         returns = torch.cat([returns[:-span] + torch.where(inside, behind, 0.0), returns[-span:]])
         span *= 2
     count = torch.bincount(data.task, minlength=num_tasks)

@@ -15,7 +15,7 @@ class BCConfig(OfflineConfig):
     """All options of BC; the defaults are the preset ``laptop``."""
 
 
-# Bi-DexHands compares with BC and has no table for it: layers, step size and batch are TD3+BC's of Table 46.
+# Bi-DexHands has results for BC but no table; layers, step size and batch are TD3+BC's in Table 46.
 PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 
 

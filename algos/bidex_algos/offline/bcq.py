@@ -25,7 +25,7 @@ from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-_FARTHEST = 0.5  # codes are cut to this when actions are proposed: near the middle the model has seen most
+_FARTHEST = 0.5  # bound of the codes of proposed actions: the model has seen most data near the middle
 _LOG_STD = (-4.0, 15.0)
 
 
@@ -46,8 +46,8 @@ class BCQConfig(CriticConfig):
         return super().bytes_held(num_envs, width) + network_bytes(self.vae_hidden, width, 2)
 
 
-# "paper": layers, step size, batch, Phi and the number of actions are Table 46's; the autoencoder's layers, its weight
-# and lower_weight, which it leaves out, those of Fujimoto et al. (2019, their code).
+# "paper": layers, step size, batch, Phi and the number of actions are from Table 46. The table omits the autoencoder's
+# layers, its weight and lower_weight; these values are from Fujimoto et al. (2019, their code).
 PRESETS: dict[str, BCQConfig] = {
     "paper": BCQConfig(
         hidden=(400, 300), vae_hidden=(750, 750), learning_rate=1e-3, critic_learning_rate=1e-3, batch_size=100,
@@ -100,7 +100,7 @@ class BCQPolicy(nn.Module):
             judged, config.hidden, shape.actions, heads if config.policy_heads else 1, generator, config.activation,
             network_of(config)
         )  # fmt: skip
-        # A policy knows its task by the one-hot alone: without it, one value serves all.
+        # A policy knows its task only by the one-hot; without a one-hot, one value serves all tasks.
         judges = heads if config.value_heads and heads else 1
         self.critic = Critics(judged, judges, config, config.critic_layer_norm, generator)
         self.model = ActionModel(inputs, config, shape.actions, generator)

@@ -38,7 +38,7 @@ class IQLConfig(CriticConfig):
         check_rising(self, self.algo, "std_range")
 
 
-# Table 46's numbers are the defaults. The bound of the weight is that of Kostrikov et al. (2022, their code).
+# The defaults are from Table 46. The bound of the weight is from Kostrikov et al. (2022, their code).
 PRESETS: dict[str, IQLConfig] = {"paper": IQLConfig(normalise_observations=False, **PAPER), "laptop": IQLConfig()}
 
 

@@ -31,8 +31,8 @@ class TD3BCConfig(CriticConfig):
     policy_delay: Count = 2  # Updates of the critics for each of the actor and the targets.
 
 
-# "paper": alpha is Table 46's, whose other numbers are the defaults; noise, its bound and the delay, which it leaves
-# out, and alpha of "laptop" are those of Fujimoto and Gu (2021, table 3), who also normalise observations.
+# "paper": alpha is from Table 46, whose other numbers are the defaults. The table omits noise, its bound and the delay;
+# these values, and alpha of "laptop", are from Fujimoto and Gu (2021, table 3), who also normalise observations.
 PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "laptop": TD3BCConfig()}
 
 

@@ -91,7 +91,7 @@ class ReturnScale:
 
     def deviation(self) -> Tensor:
         """Return the standard deviation of each task's returns (num_tasks,), at least a tenth of their mean."""
-        # Where all returns are about the same, their deviation alone would blow them up.
+        # If all returns are almost equal, dividing by their standard deviation would inflate them.
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 
     def parts(self) -> Parts:
@@ -130,7 +130,7 @@ class OffPolicy(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
         self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
-        # Rewards that have left the replay fade from the statistics too.
+        # Rewards that have left the replay also fade from the statistics.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
@@ -206,7 +206,7 @@ class OffPolicy(Learner):
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
         stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
         weights = self.replay.weights(stretches.last)
-        # Divided by the draws of all processes, losses and gradients become means by being summed over them.
+        # Losses and gradients are divided by the draws of all processes, so their sum over processes is a mean.
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
         return [self._update(stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 

@@ -78,10 +78,11 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
 
 PRESETS: dict[str, BRCConfig] = {
-    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py, jaxrl/agent/brc_learner.py and
-    # jaxrl/networks.py. There each task has one environment, 5,000 transitions of it come first and 1,000,000 are kept:
-    # here as many at 256 environments of each task. Log standard deviations go from -10 to 2 and begin in the middle.
-    # Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as they are.
+    # The values are from the authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py,
+    # jaxrl/agent/brc_learner.py and jaxrl/networks.py. There each task has one environment, a warm-up of 5,000
+    # transitions and a replay of 1,000,000; the same numbers result here with 256 environments per task. Log standard
+    # deviations range from -10 to 2 and start in the middle. The decay is AdamW's default there, 1e-4. The gradient has
+    # no limit (here a huge one), and observations are not normalised.
     "paper": BRCConfig(
         hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
         batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
@@ -113,7 +114,7 @@ class BRC(Categorical, MTSAC):
         tasks = torch.arange(self.world.num_tasks, device=self.device)
         gamma = discounts(self.world, self.config.gamma, tasks)
         bound, each = self.config.value_bound, abs(self.target_entropy) / (1.0 - gamma)
-        # Room for the entropy of all steps to come, but half of the atoms are the rewards' in any case.
+        # Room for the entropy of all future steps, but at least half of the range is left for rewards.
         room = bound - (self.log_alpha.detach().exp() * each).clamp_max(0.5 * bound)
         return (self.returns.bound / room).clamp_min(1e-8)
 

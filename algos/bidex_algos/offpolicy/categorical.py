@@ -45,10 +45,10 @@ class Atoms(nn.Module):
         the atom at that end. ``shift`` and ``factor`` are (B,).
         """
         moved = shift[:, None] + factor[:, None] * self.values
-        # In units of the distance of two atoms, from the lowest.
+        # Positions in units of the distance between two atoms, counted from the lowest.
         place = (moved.clamp(self.low, self.high) - self.low) * ((self.count - 1) / (self.high - self.low))
         share = place - place.floor()
-        # What is not a number shall stay so and not become a place in memory.
+        # NaN must stay NaN and must not become an index.
         index = place.long().clamp(0, self.count - 1)
         out = torch.zeros_like(probs).scatter_add_(1, index, probs * (1.0 - share))
         return out.scatter_add_(1, (index + 1).clamp_max(self.count - 1), probs * share)
@@ -90,8 +90,9 @@ class CategoricalCritics(nn.Module):
         outputs, norm = heads * config.atoms, config.critic_layer_norm
         given = inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm
         nets = [network(*given) for _ in range(count)]
-        # At first the mean is 0, the deviation a tenth of the bound: from an even distribution, which is much wider,
-        # means move slowly, since a cross-entropy pulls at them with its inverse variance.
+        # At first the mean is 0 and the standard deviation a tenth of the bound. From a uniform distribution, which is
+        # much wider, means would move slowly, because the gradient of a cross-entropy on them scales with the inverse
+        # variance.
         place = self.atoms.values / (0.1 * config.value_bound)
         with torch.no_grad():
             for net in nets:
@@ -115,7 +116,7 @@ class CategoricalCritics(nn.Module):
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
-RECENT = 0.9  # weight of a reward in the recent ones' mean over that of the next: about the last ten steps count
+RECENT = 0.9  # decay per step of the mean of recent rewards: about the last ten steps count
 
 
 class ReturnBound(ReturnScale):

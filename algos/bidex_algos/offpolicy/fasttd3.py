@@ -28,10 +28,10 @@ class FastTD3Config(CategoricalConfig, TD3Config):
 
 
 PRESETS: dict[str, FastTD3Config] = {
-    # The authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py, 2025), since the paper
-    # has no table of all: replay, discount, steps, bound and scaled rewards of its class for several tasks
-    # (MTBenchArgs, MetaWorldMT10Args), the rest its defaults (BaseArgs), whose 0 for the gradient's norm means no
-    # limit. replay_memory holds those steps of its 4,096 environments, of 441 columns.
+    # The values are from the authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py,
+    # 2025), because the paper has no complete table. Replay, discount, steps, bound and scaled rewards are from its
+    # class for several tasks (MTBenchArgs, MetaWorldMT10Args). The rest are its defaults (BaseArgs), whose gradient
+    # norm of 0 means no limit. replay_memory holds these steps of its 4,096 environments, with 441 columns.
     "paper": FastTD3Config(
         hidden=(512, 256, 128), critic_hidden=(1024, 512, 256), critic_layer_norm=False, task_embedding=32,
         replay_steps=2048, replay_memory=18.0, warmup_steps=10, updates_per_step=2, batch_size=32_768, gamma=0.97,
@@ -40,8 +40,9 @@ PRESETS: dict[str, FastTD3Config] = {
         squash_price=0.0,
     ),
     "laptop": FastTD3Config(),
-    # Meta-World's suites on one core: discount, steps and bound of the authors' class for them, narrower layers, one
-    # update of fewer transitions: a vector step is 4 rows of a class here instead of hundreds.
+    # For Meta-World's suites on one core: discount, steps and bound are from the authors' class for these suites.
+    # Layers are narrower and there is one update of fewer transitions, because a vector step has 4 rows per class here
+    # instead of hundreds.
     "metaworld": FastTD3Config(
         hidden=(256, 256, 128), critic_hidden=(256, 256, 128), replay_steps=100_000, warmup_steps=500,
         steps_per_iteration=500, updates_per_step=1, batch_per_task=256, gamma=0.97, n_steps=8, tau=0.05,

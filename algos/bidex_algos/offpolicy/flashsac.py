@@ -26,7 +26,7 @@ from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, Finite, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
-WIDER = 4  # width within a block over that of what it adds to
+WIDER = 4  # ratio of the width within a block to the width of its input
 MOMENTUM = 0.01  # share of a batch in the running statistics
 
 
@@ -135,11 +135,11 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
 
 PRESETS: dict[str, FlashSACConfig] = {
     "laptop": FlashSACConfig(),
-    # The authors' code (github.com/Holiday-Robot/FlashSAC, 2026): configs/agent/flashSAC.yaml, and scripts/
-    # run_isaaclab.sh, whose hands are nearest to ours, for batch, updates, discount and steps, for 10,000,000
-    # transitions that are kept and 100,000 that come first; here as many at 4,096 environments instead of its 1,024.
-    # Log standard deviations (flash_rl/agents/flashSAC/layer.py) go from -10 to 2 and begin in the middle. No limit of
-    # the gradient (here a huge one), observations as they are.
+    # The values are from the authors' code (github.com/Holiday-Robot/FlashSAC, 2026): configs/agent/flashSAC.yaml, and
+    # for batch, updates, discount and steps scripts/run_isaaclab.sh, whose hands are most similar to ours. The script
+    # keeps 10,000,000 transitions after a warm-up of 100,000; the same numbers result here with 4,096 environments
+    # instead of its 1,024. Log standard deviations (flash_rl/agents/flashSAC/layer.py) range from -10 to 2 and start in
+    # the middle. The gradient has no limit (here a huge one), and observations are not normalised.
     "gpu": FlashSACConfig(
         hidden=(128, 128, 128), critic_hidden=(256, 256, 256), replay_steps=2442, replay_memory=21.0, warmup_steps=25,
         updates_per_step=2, policy_delay=2, batch_size=2048, gamma=0.99, n_steps=3, tau=0.01, learning_rate=3e-4,
@@ -166,12 +166,14 @@ class FlashSAC(Categorical, MTSAC):
         self.updates = 0
         self.of_actor = {name: torch.zeros((), device=self.device) for name in ("Loss/actor", "Policy/entropy")}
         self.noise = torch.zeros(world.num_envs, self.shape.actions, device=self.device)
-        self.repeats = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)  # steps it is still kept for
+        self.repeats = torch.zeros(
+            world.num_envs, dtype=torch.int64, device=self.device
+        )  # remaining steps of the noise
         self.shares = torch.arange(1.0, config.noise_repeats + 1, device=self.device) ** -2
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         critics = super()._make_critics(inputs, heads)
-        # Weights of length 1 could not outweigh the biases of a narrow start, of up to 50.
+        # Weights of length 1 could not outweigh the biases of a narrow initial distribution, which reach 50.
         for net in _of(critics):
             nn.init.zeros_(net.head.bias)
         return critics

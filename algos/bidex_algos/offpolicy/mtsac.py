@@ -44,7 +44,7 @@ class MTSACConfig(OffPolicyConfig):
             )
 
 
-# What the published settings have in common, with log standard deviations from -20 to 2.
+# The published settings share these values; log standard deviations range from -20 to 2.
 _PLAIN = MTSACConfig(
     value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
     critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
@@ -52,10 +52,10 @@ _PLAIN = MTSACConfig(
 )  # fmt: skip
 
 PRESETS: dict[str, MTSACConfig] = {
-    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC), with its entropy coefficient
-    # 0.2 where each temperature starts and its 4 mini-batches of 32 after every vector step, of each task. From Table
-    # 49 (SAC on Humanoid) 32 steps, here between two reports. Both are silent on non-linearity, bounds of the standard
-    # deviation, target entropy and warm-up, and learn no temperature.
+    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"); there is no table for MT-SAC. Its entropy coefficient
+    # 0.2 is the initial value of each temperature; its 4 mini-batches of 32 follow every vector step, for each task.
+    # The 32 steps between two reports are from Table 49 (SAC on Humanoid). Both tables omit non-linearity, bounds of
+    # the standard deviation, target entropy and warm-up, and learn no temperature.
     "paper": replace(
         _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
@@ -68,7 +68,7 @@ PRESETS: dict[str, MTSACConfig] = {
     ),
 }  # fmt: skip
 
-# Table 49; its 2 epochs of one mini-batch are made after every vector step; its replay of 40,000 counts vector steps.
+# Table 49: its 2 epochs of one mini-batch follow every vector step; its replay of 40,000 counts vector steps.
 _TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,

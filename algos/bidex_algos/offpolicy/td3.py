@@ -23,11 +23,11 @@ class TD3Config(DDPGConfig):
     """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
 
 
-# Smoothing and delay of "paper" are those of Fujimoto et al. (2018, section 6.1), as are the defaults.
+# Smoothing and delay of "paper", like the defaults, are from Fujimoto et al. (2018, section 6.1).
 PRESETS: dict[str, TD3Config] = {
     "paper": TD3Config(**OF_PAPER),
     "laptop": TD3Config(),
-    # Meta-World's suites: discount, Polyak, layers, replay and batches are those of MT-SAC's preset of that name.
+    # For Meta-World's suites: discount, Polyak, layers, replay and batches are from MT-SAC's preset of this name.
     "metaworld": TD3Config(
         hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=500, steps_per_iteration=500, updates_per_step=1,
         batch_per_task=128, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,

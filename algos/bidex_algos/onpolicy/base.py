@@ -138,13 +138,13 @@ class OnPolicy(Learner):
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.policy.distribution(obs)
         noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
-        # Not clamped: the world does that, and the density must be that of what was drawn.
+        # The action is not clamped: the world clamps it, and the density must be of the sampled action.
         return mean + log_std.exp() * noise, mean
 
     def _final_value(self, obs: Tensor, task_id: Tensor) -> Tensor:
         return self._in_reward_units(self._critic(self.policy.observations(obs), task_id), task_id)
 
-    # Values. The critic speaks in units of its task's running mean and deviation of returns.
+    # Values. The critic's unit is given by its task's running mean and standard deviation of returns.
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
@@ -178,7 +178,7 @@ class OnPolicy(Learner):
         if self.low_precision:
             obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
 
-        # Several critics make several columns of a row, each like a row of its own.
+        # Several critics make several columns per row, each treated as a separate row.
         def each(x: Tensor) -> Tensor:
             return x if self.num_critics == 1 else x.repeat_interleave(self.num_critics, 1)
 

@@ -13,8 +13,8 @@ from bidex_meta.training.distributed import pool_moments, sum_gradients, world_s
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 
-# Added to the deviation of an action of a class's labels: entries that a teacher hardly moves must not outweigh all
-# others. It is 1.5 % of an action's range, and of a finger joint about 0.02 rad.
+# Added to the standard deviation of an action among a class's labels, so that an action that a teacher hardly moves
+# does not outweigh all others. It is 1.5 % of an action's range, or about 0.02 rad of a finger joint.
 _FLOOR = 0.03
 
 

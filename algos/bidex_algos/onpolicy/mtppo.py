@@ -71,18 +71,18 @@ PRESETS: dict[str, MTPPOConfig] = {
     "laptop": MTPPOConfig(),
     # Version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes.
     "v2": MTPPOConfig(gamma=0.96),
-    # Meta-World's multi-task suites: discount, trace and clip of its authors' MTPPO (metaworld-algorithms). Networks
-    # are small, rollouts 100 steps instead of 10,000: of 250 (ELU, 8 mini-batches) MT3 was at 24 % after 150 k steps,
-    # not 42.
+    # For Meta-World's multi-task suites: discount, trace and clip are from its authors' MTPPO (metaworld-algorithms).
+    # Networks are small, and rollouts have 100 steps instead of 10,000. With 250 steps (ELU, 8 mini-batches) success on
+    # MT3 was 24 % after 150 k steps instead of 42 %.
     "metaworld": MTPPOConfig(
         hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
         clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
     ),
 }  # fmt: skip
 
-# Table 42, column "Other Tasks". What it does not name is as in Table 47.
+# Table 42, column "Other Tasks". Other values are from Table 47.
 _SINGLE = replace(PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
-# Table 50. What it does not name is as in Table 47 (``paper``) or as for hands (``laptop``, of narrower layers).
+# Table 50. Other values are from Table 47 (``paper``) or those for hands (``laptop``, with narrower layers).
 _TABLE_50: Options = {
     "rollout_steps": 32, "epochs": 5, "num_minibatches": 4, "clip": 0.1, "learning_rate": 3e-4, "gamma": 0.99,
     "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01, "max_grad_norm": 1.0, "entropy_weight": 0.0,
@@ -99,7 +99,7 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 }
 
 
-# The first few episodes that end say little: until there are so many, the missing ones count as failures.
+# The first few episodes say little: up to this number, the missing episodes count as failures.
 _EPISODES = 20.0
 
 _DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
@@ -130,7 +130,7 @@ class Demonstrations:
         """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
         size, device = (self._config.demonstration_batch,), self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
-        # The remainder of a number this large favours none by more than 1 in 2^40 / transitions.
+        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
         place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
         chosen = self._of_task[self._first[task] + place]
         return self._obs[chosen], self._actions[chosen]
@@ -199,10 +199,10 @@ class MTPPO(OnPolicy):
             self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def start_from(self, policy: State) -> None:
-        """Start as in the base class; clamp standard deviations and set an adaptive step size to its minimum.
+        """Start as in the base class, with standard deviations clamped to ``std_range``.
 
-        A KL is known only after a step: the first update of a policy trained by DAgger had a KL of 187 with a step size
-        of 3e-4.
+        An adaptive step size starts at its minimum, because a KL is known only after a step: the first update of a
+        policy trained by DAgger had a KL of 187 with a step size of 3e-4.
         """
         super().start_from(policy)
         self._forget_graphs()

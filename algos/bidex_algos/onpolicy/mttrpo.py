@@ -70,7 +70,7 @@ def gaussian_step(
 
     @torch.no_grad()
     def measure() -> tuple[float, float]:
-        keep_bounds()  # part of the policy: what is measured is what will act
+        keep_bounds()  # the bounds are part of the policy that will act, so they hold when it is measured
         objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
         return objective, kl
 
@@ -86,7 +86,7 @@ def kl_from_itself(
     The value is 0; its curvature is the Fisher matrix.
     """
     sample = torch.arange(len(weights), device=weights.device)
-    # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
+    # The samples are steps by rows. Each later step starts at a later row; otherwise some rows would never be taken.
     taken = (sample + sample // rows) % stride == 0
     mean, log_std = distribution(taken)
     kl, weight = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std), weights[taken]
