@@ -47,13 +47,13 @@ class Learner(Contract):
     needs.
     """
 
-    remedy: ClassVar[str]  # what helps, mostly, when a loss is no longer finite
+    remedy: ClassVar[str]  # advice when a loss is no longer finite
     config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
     discounts_by_class: ClassVar[bool] = False
-    """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
+    """True if the learner supports discounts per class (``world.gammas``)."""
     unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
-    """Attributes (tensors, numbers, None) from which the next iteration goes on: in the checkpoint too."""
+    """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
     policy_of: ClassVar[Callable[..., nn.Module]]
     """Makes the policy of config, inputs, shape, a CPU generator for the weights, and device."""
 

@@ -58,10 +58,10 @@ class EpisodeStatistics:
 
 
 Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
+"""Maps raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
 
 FinalValue = Callable[[Tensor, Tensor], Tensor]
-"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward; of several critics (n, critics)."""
+"""Maps raw observations (n, d) and task ids (n,) to values (n,) in units of reward; several critics: (n, critics)."""
 
 
 class Rollout:

@@ -15,8 +15,8 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]  # which parameters an inner step moves: all, or those of the mean's output layer
-StepSizeKind = Literal["fixed", "layer", "weight"]  # whether sizes of the inner step are learned, and of what
+Adapted = Literal["all", "head"]  # parameters that an inner step moves: all, or only the mean's output layer
+StepSizeKind = Literal["fixed", "layer", "weight"]  # granularity of learned inner step sizes; fixed: not learned
 
 
 class StepSizes(nn.Module):
@@ -51,9 +51,9 @@ def _key(name: str) -> str:
 Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have a first axis of tasks
 
 Objective = Literal["likelihood", "ratio"]
-"""What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
+"""Objective of the inner step: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192  # what a CPU's caches hold of layers 64-64; all tasks at once take half as long again
+_TRANSITIONS_AT_ONCE = 8_192  # for layers 64-64 they fit a CPU's caches; all tasks at once take 1.5 times as long
 
 
 @dataclass

@@ -10,7 +10,7 @@ from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
 USUAL_STEPS = 300
-"""Steps of an episode for estimates of memory, where no world says how long its episodes are."""
+"""Steps of an episode for estimates of memory when no world gives the length of its episodes."""
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); teachers know the task."""
+    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348), taught by those who know it."""
 
     name, remedy = "icl", "lower learning_rate"
     config_type, presets = ICLConfig, PRESETS

@@ -58,8 +58,8 @@ PRESETS: dict[str, RL2Config] = {
         lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
         critic_learning_rate=None, entropy_weight=0.0, max_grad_norm=1.0, normalise_observations=False,
     ),
-    # Discount and KL are MT-PPO's. We also tried a discount of 0.97, so that an episode is rewarded for what the next
-    # one earns, with a KL of 0.02: after 5 M steps the policy carried the egg of ML1-wide and did not throw it
+    # Discount and KL are MT-PPO's. We also tried a discount of 0.97, which rewards exploration through the next
+    # episode, with a KL of 0.02: after 5 M steps the policy carried the egg of ML1-wide and did not throw it
     # (docs/results/ml1.md).
     "laptop": RL2Config(),
     # For version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes, and
@@ -69,7 +69,7 @@ PRESETS: dict[str, RL2Config] = {
 
 
 class RL2(TrialLearner):
-    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it acts."""
+    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it."""
 
     name, remedy = "rl2", "lower learning_rate"
     config_type, presets = RL2Config, PRESETS
@@ -100,8 +100,8 @@ class RL2(TrialLearner):
         valid = self.trials.valid & filled
         seen = self.trials.obs[filled], self.trials.rewards[valid]
         if self.trials_played == 0:
-            # The first trial only measures. Statistics of the initial states, in which nothing moves, would be much too
-            # small: the policy would see large noise, learn from it, and have to unlearn most of that.
+            # The first trial only measures. Statistics of the initial states only, in which nothing moves, made the
+            # policy see so much noise that it would have to unlearn most of what it learned from this trial.
             self.policy.update_statistics(*seen)
             losses, explained = {}, self._prepare()[1]
         else:

@@ -20,13 +20,13 @@ class Steps(NamedTuple):
     obs: Tensor
     """Raw observations (B, d)."""
     labels: Tensor
-    """What teachers would have done there (B, a)."""
+    """The teachers' actions in these states (B, a)."""
     goals: Tensor
-    """What the tasks hide, and other goals (B, g, k)."""
+    """The tasks' hidden values, and other goals (B, g, k)."""
     rewards: Tensor
     """For each goal (B, g)."""
     paid: Tensor
-    """Whether there was a reward: not where an episode begins, bool (B,)."""
+    """True if the step had a reward, False at the beginning of an episode, bool (B,)."""
 
 
 class TaughtTrials:

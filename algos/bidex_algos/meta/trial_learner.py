@@ -43,7 +43,7 @@ class TrialLearner(Learner):
         self.agent = MemoryAgent(self.policy, own_seed(seed))
         self.trials_played = 0
         self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
-        """Most steps of an episode of each environment (N,)."""
+        """Maximum steps of an episode of each environment (N,)."""
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
         # Pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()

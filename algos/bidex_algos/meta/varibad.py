@@ -95,7 +95,7 @@ class BeliefActor(RecurrentNet):
 
 
 class VariBAD(RL2):
-    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief about a task's hidden part."""
+    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief of what a task hides."""
 
     name = "varibad"
     config_type, presets = VariBADConfig, PRESETS

@@ -29,7 +29,7 @@ from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
 
 Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
-"""A partition of the hands' units, on the command line by a short name too."""
+"""A partition of the hands' units, with a short alias on the command line."""
 
 
 def keep_partition(config: ArchitectureConfig) -> None:
@@ -94,15 +94,15 @@ PAPER: Options = {
     "hidden": (1024, 1024, 512), "popart": True, "rollout_steps": 8, "gamma": 0.96, "lam": 0.95,
     "normalise_observations": False, "huber_delta": 10.0, "value_clip": 0.2,
 }  # fmt: skip
-"""What Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix agree on, in their columns for other tasks than
-LiftUnderarm; B.2.1 and B.2.4 have the clipped value."""
+"""Values shared by Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix, in their columns for tasks other than
+LiftUnderarm; B.2.1 and B.2.4 describe the clipped value."""
 
 PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
-"""The same with the two tables' passes and clip."""
+"""PAPER with the passes and the clip of both tables."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # both tables' column for LiftUnderarm, where it differs
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # the values of both tables' column for LiftUnderarm that differ
 
 
 @torch.no_grad()

@@ -40,7 +40,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(OwnAdams, Sequential):
-    """HAPPO: agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "happo", "lower learning_rate"
     config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS

@@ -39,7 +39,7 @@ TASK_PRESETS = {
 
 
 class HATRPO(Sequential):
-    """HATRPO: agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type, presets, task_presets = HATRPOConfig, PRESETS, TASK_PRESETS

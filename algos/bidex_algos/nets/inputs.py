@@ -35,7 +35,7 @@ class Columns(nn.Module):
 
 
 MakeEncoder = Callable[[int, torch.Generator], nn.Module]
-"""Makes an encoder for a group of so many entries, its weights drawn from a CPU generator: a module that maps
+"""Makes an encoder for a group, given its number of entries and a CPU generator for the weights: a module that maps
 (..., entries) to (..., ``size``) and has the attribute ``size``."""
 
 

@@ -12,7 +12,7 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 
 _NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
-"""Groups that the encoder is not shown: by the hands it learns fifty tasks by heart, and not the rewards."""
+"""Groups hidden from the encoder: given the hands, it memorises fifty tasks instead of reading the rewards."""
 
 
 class LatentPolicy(SquashedPolicy):

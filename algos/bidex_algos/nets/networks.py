@@ -18,7 +18,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh
 Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
 Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; none makes a linear map
 MakeNetwork = Callable[..., Any]
-"""Takes the arguments of :class:`MLP`; what it makes has ``output_bias``, the biases of the output (outputs,)."""
+"""Takes the arguments of :class:`MLP`; the result has ``output_bias``, the biases of the output (outputs,)."""
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:

@@ -42,10 +42,10 @@ OF_PAPER: Options = {
     "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
     "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
 }  # fmt: skip
-"""What DDPG and TD3 share of the preset ``paper``. The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no
-table for either. Table 43 (SAC, "other tasks") has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps
-of replay and 1 epoch of 4 mini-batches of 32 (here of each task); Table 49 32 steps between two reports. The noise of
-0.1 is Fujimoto et al.'s (2018, section 6.1)."""
+"""Values of the preset ``paper`` shared by DDPG and TD3. The Bi-DexHands appendix describes both (B.1.3, B.1.4) but has no
+table for either. Layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4
+mini-batches of 32 (here of each task) are from Table 43 (SAC, "other tasks"). The 32 steps between two reports are from
+Table 49. The noise of 0.1 is from Fujimoto et al. (2018, section 6.1)."""
 PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDPGConfig()}
 
 
@@ -59,8 +59,8 @@ class DDPG(OffPolicy):
     policy_of = staticmethod(deterministic_policy)
     num_critics = 1
     delayed_targets: ClassVar[bool] = True
-    """Whether targets take the actions of an actor that follows the actor, and all that follow move only when the actor
-    learns. Off: they take the present actor's, and the target critics move in each update."""
+    """True: targets use the actions of a target actor, and all target networks move only when the actor learns. False:
+    targets use the present actor's actions, and the target critics move in each update."""
 
     def __init__(self, world: VectorWorld, config: DDPGConfig, seed: int):
         super().__init__(world, config, seed)
