@@ -43,8 +43,8 @@ class Learner(Contract):
 
     With several processes each process has its own world, samples and ``generator``, and all have the same networks:
     statistics, gradients and ``env_steps`` cover all processes. Raises BidexError for a world in another autoreset
-    mode, for a world with discounts per class if the learner has a single one, or without a one-hot that an option
-    needs.
+    mode, for a world with discounts per class if the learner has a single one, or for a world without the one-hot that
+    an option needs.
     """
 
     remedy: ClassVar[str]  # advice when a loss is no longer finite

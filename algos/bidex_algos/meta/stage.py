@@ -67,9 +67,9 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
     parts of the returns. A fit with almost no penalty (1e-5) memorises the returns. On ML1-wide we measured the
     correlation of advantages with the advantages of a baseline fitted to other rollouts, for 7, 20 and 50 rollouts::
 
-        1e-5           0.19, 0.18, 0.47
+        ridge 1e-5     0.19, 0.18, 0.47
         no baseline    0.71, 0.63, 0.62
-        1              0.78, 0.76, 0.77
+        ridge 1        0.78, 0.76, 0.77
     """
     predicted = []
     # The loop runs task by task: features and Gram matrices of all tasks at once take more memory and more time.

@@ -61,7 +61,7 @@ class CriticConfig(OfflineConfig):
 
 
 PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
-"""Options that the preset ``paper`` turns off in all learners with critics: neither Table 46 nor the papers have them."""
+"""Options that the preset ``paper`` turns off in all learners with critics: Table 46 and the papers lack them."""
 
 
 class Batches:

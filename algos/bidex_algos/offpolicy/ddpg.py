@@ -42,8 +42,8 @@ OF_PAPER: Options = {
     "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
     "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
 }  # fmt: skip
-"""Values of the preset ``paper`` shared by DDPG and TD3. The Bi-DexHands appendix describes both (B.1.3, B.1.4) but has no
-table for either. Layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4
+"""Values of the preset ``paper`` shared by DDPG and TD3. The Bi-DexHands appendix describes both (B.1.3, B.1.4) but has
+no table for either. Layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4
 mini-batches of 32 (here of each task) are from Table 43 (SAC, "other tasks"). The 32 steps between two reports are from
 Table 49. The noise of 0.1 is from Fujimoto et al. (2018, section 6.1)."""
 PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDPGConfig()}
