@@ -1,4 +1,5 @@
-"""The learners of bidex-meta, one file each, and the small pieces they share.
+"""The learners of bidex-meta, one file each, and the small modules that they share.
 
-Imports nothing, nor do the rooms: a learner is loaded by its name, so that listing them costs no import of torch.
+This package and its subpackages import nothing: a learner is loaded by its name, so listing the learners does not
+import torch.
 """

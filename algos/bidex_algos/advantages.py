@@ -8,16 +8,17 @@ from bidex_meta.world.contract import VectorWorld
 
 
 def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tensor:
-    """A learner's ``gamma``; where classes of the world have their own, that of each entry of ``task_id`` (n,)."""
+    """Return ``gamma``, or the discount of each entry of ``task_id`` (n,) if classes of the world have their own."""
     if all(own is None for own in world.gammas):
         return gamma
     return torch.tensor([gamma if own is None else own for own in world.gammas], device=task_id.device)[task_id]
 
 
 def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
-    """V (T, N) of the state each transition led to, in a world that resets within the step.
+    """Return V (T, N) of the state that each transition led to, in a world that resets within the step.
 
-    ``last_values`` (N,) are of the state after the last one; ``final_values`` (T, N) of where episodes ``ended``.
+    ``last_values`` (N,) are the values of the states after the last step; ``final_values`` (T, N) are the values of the
+    states in which episodes ``ended``.
     """
     following = torch.cat([values[1:], last_values[None]])
     return torch.where(ended, final_values, following)
@@ -27,10 +28,11 @@ def gae(
     rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float | Tensor,
     lam: float, valid: Tensor | None = None
 ) -> Tensor:  # fmt: skip
-    """Advantages A_t = sum_k (gamma lam)^k delta_{t+k} within an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
+    """Compute advantages A_t = sum_k (gamma lam)^k delta_{t+k} in an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
 
-    All are (T, N); ``next_values`` of the true successors (:func:`successor_values`), 0 where terminated, which a time
-    limit is not; ``gamma`` one for all, (N,) or (T, N). Nothing flows through what is not ``valid``.
+    All tensors are (T, N). ``next_values`` are the values of the true successors (:func:`successor_values`) and count
+    as 0 if ``terminated``; a time limit is not a termination. ``gamma`` is a number, (N,) or (T, N). Nothing propagates
+    through entries that are not ``valid``.
     """
     delta = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
     keep = gamma * lam * (~ended).to(delta.dtype)
@@ -45,7 +47,7 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance and count (num_tasks,) of x (T, N), where valid, in all processes; 0 for an empty task."""
+    """Return mean, biased variance and count (num_tasks,) of valid x (T, N) over all processes; 0 for an empty task."""
 
     def total(values: Tensor) -> Tensor:
         sums = torch.zeros(num_tasks, dtype=values.dtype, device=values.device)
@@ -58,13 +60,13 @@ def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> t
 
 
 def normalise_per_task(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:
-    """``x`` (T, N) to zero mean and unit variance within each task; invalid entries become 0."""
+    """Scale ``x`` (T, N) to zero mean and unit variance within each task; invalid entries become 0."""
     mean, var, _ = task_moments(x, task_id, num_tasks, valid)
     return ((x - mean[task_id]) / (var.sqrt()[task_id] + 1e-8)).masked_fill(~valid, 0.0)
 
 
 def explained_variance(values: Tensor, returns: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:
-    """1 - Var(return - value) / Var(return) per task, shape (num_tasks,): 1 is perfect, 0 no better than a constant."""
+    """Return 1 - Var(return - value) / Var(return) per task (num_tasks,): 1 is perfect, 0 no better than a constant."""
     _, rest, _ = task_moments(returns - values, task_id, num_tasks, valid)
     _, whole, _ = task_moments(returns, task_id, num_tasks, valid)
     return 1.0 - rest / whole.clamp_min(1e-12)

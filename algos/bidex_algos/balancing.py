@@ -1,4 +1,4 @@
-"""How the losses of several tasks become one gradient of the weights that they share: one interface, a few ways."""
+"""Methods that combine the losses of several tasks into one gradient of their shared weights, behind one interface."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,44 +15,45 @@ Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 
 
 class Balance(ABC):
-    """Puts one gradient in the place of the sum of all tasks' losses."""
+    """Replaces the gradient of the sum of all tasks' losses by a balanced one."""
 
     tag: ClassVar[str]  # of the number that it reports
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Puts the gradient into the parameters, which have none yet, and keeps the graph.
+        """Write the gradient into the parameters, which have none yet, and keep the graph.
 
-        ``losses`` of each task, and the ``least`` they can become, are this process's part (num_tasks,). Returns a
-        number to be logged, divided by the processes that will sum it, as they will the gradients.
+        ``losses`` (num_tasks,) and the ``least`` values that they can reach are this process's part. Returns a number
+        to be logged, already divided by the number of processes, because the caller sums it over them like the
+        gradients.
         """
 
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
-        """What follows a step; ``above`` tells how far each loss is above its least now, this process's part."""
+        """Update the balance after a step; ``above`` returns this process's part of each loss minus its least value."""
 
     def parts(self) -> Parts:
-        """What a checkpoint holds of it, by name."""
+        """Return the parts of the balance that a checkpoint holds, by name."""
         return {}
 
 
 def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-    """Gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the graph is kept."""
+    """Return gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the graph is kept."""
     one_each = torch.eye(len(losses), dtype=losses.dtype, device=losses.device)
     gradients = torch.autograd.grad(losses, parameters, one_each, retain_graph=True, is_grads_batched=True)
     return torch.cat([g.flatten(1) for g in gradients], dim=1)
 
 
 def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """PCGrad (Yu et al. 2020, algorithm 1): each gradient loses what points against another task's.
+    """Remove from each gradient the component that points against another task's (PCGrad, Yu et al. 2020, algorithm 1).
 
-    The others are met in cyclic order instead of a random one, so that all processes of a run do the same.
-    Returns the sum (P,) of what is left of ``gradients`` (num_tasks, P), and the share of pairs in conflict, a scalar.
+    The other tasks are visited in cyclic instead of random order, so that all processes of a run compute the same.
+    Returns the sum (P,) of the projected ``gradients`` (num_tasks, P) and the share of conflicting pairs, a scalar.
     """
     count = len(gradients)
     gram = gradients @ gradients.T
     square = gram.diagonal().clamp_min(1e-30)
-    # What is left of a gradient is a combination of all: row i holds the coefficients of the i-th, and all rows take a
-    # step at once.
+    # A projected gradient is a combination of all gradients: row i holds the coefficients of the i-th, and all rows
+    # take a step at once.
     combination = torch.eye(count, dtype=gradients.dtype, device=gradients.device)
     for shift in range(1, count):
         other = torch.arange(count, device=gradients.device).roll(-shift)
@@ -63,15 +64,17 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """CAGrad (Liu et al. 2021): the sum of all gradients, turned towards those that it serves worst.
+    """Turn the sum of all gradients towards the tasks that it serves worst (CAGrad, Liu et al. 2021).
 
-    With g_0 the mean of the gradients, it is the number of tasks times the d that maximises min_i <g_i, d> among those
-    within ``radius`` |g_0| of g_0. Its dual (their equation 4) is over weights w on the simplex, g_w = sum_i w_i g_i::
+    Let g_0 be the mean of the gradients. The result is the number of tasks times the d that maximises min_i <g_i, d>
+    within a distance of ``radius`` |g_0| from g_0. The dual problem (equation 4 of the paper) is over weights w on the
+    simplex, with g_w = sum_i w_i g_i::
 
         min_w  <g_w, g_0> + radius |g_0| |g_w|        d = g_0 + radius |g_0| g_w / |g_w|
 
-    ``gradients``: one a task, (num_tasks, P); ``radius``: their c, from 0 (the mean) on; below 1, so that the mean loss
-    still falls. Returns the direction, (P,); the share of pairs of tasks whose gradients point apart, a scalar.
+    ``gradients`` (num_tasks, P) has one row per task. ``radius`` is the paper's c: 0 gives the mean; a value below 1
+    ensures that the mean loss still falls. Returns the direction (P,) and the share of pairs of tasks whose gradients
+    point apart, a scalar.
     """
     count = len(gradients)
     gram = (gradients @ gradients.T).double()
@@ -85,12 +88,12 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
-    """The weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
+    """Return the weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
 
-    An interior-point method: logarithms of the weights, times a mu that is halved at each step, keep them positive, and
-    a cone of the same mu rounds off the tip where w'G w is 0. Each step is Newton's, as long as is best of some
-    lengths. It looks at no number, so that a GPU need not be waited for. ``gram``: products of the gradients (n, n),
-    float64; ``even``: the weights e of the mean (n,), where it starts.
+    This is an interior-point method. Logarithms of the weights, scaled by a mu that is halved at each step, keep the
+    weights positive; a cone of the same mu smooths the tip at w'G w = 0. Each step is a Newton step whose length is the
+    best of several. No number is read on the host, so a GPU is never waited for. ``gram`` holds the inner products of
+    the gradients (n, n), float64; ``even`` holds the weights e of the mean (n,), from which the method starts.
     """
     weights, mean, square = even, gram @ even, reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
@@ -101,7 +104,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
         root = (mu.square() + square * (weights @ own).clamp_min(0.0)).sqrt()
         pull = square / (mu + root)
         curved = pull * (gram - pull / root * own.outer(own))
-        # In shares of the weights, so that small ones do not spoil the condition.
+        # The variables are relative changes of the weights, so that small weights do not spoil the condition number.
         matrix = weights.outer(weights) * curved + mu * diagonal
         sides = torch.stack([mu - weights * (mean + pull * own), weights], dim=1)
         newton, constant = torch.linalg.solve_ex(matrix, sides)[0].unbind(1)
@@ -115,7 +118,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
 
 
 class GradientBalance(Balance):
-    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; a backward pass for each."""
+    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; one backward pass per task."""
 
     tag = "Policy/conflicts"
 
@@ -126,7 +129,7 @@ class GradientBalance(Balance):
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
         gradient, apart = self.combine(all_sum(per_task_gradients(losses, parameters)))
         for parameter, part in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
-            # All processes have the whole of it, and sum it.
+            # Every process holds the whole gradient, and the processes sum it.
             parameter.grad = part.view_as(parameter) / world_size()
         return apart / world_size()
 
@@ -135,11 +138,11 @@ _LEAST = 1e-8
 
 
 class Famo(Balance):
-    """FAMO (Liu et al. 2023): weights of tasks under which all losses fall at the same rate, without a gradient each.
+    """FAMO (Liu et al. 2023): task weights under which all losses fall at the same rate, without a gradient per task.
 
-    theta goes down on sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), z = softmax(xi); xi down on J'(log l - log l after
-    the step), J = dz / dxi. Losses have to be positive: what counts is how far each is above the least that it can
-    become. Adam, of step size ``rate``, moves xi (``logits``, float64) with a ``decay`` towards even weights.
+    theta descends sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), with z = softmax(xi); xi descends J'(log l - log l after
+    the step), with J = dz / dxi. Losses have to be positive, so each loss counts by its distance above its least
+    possible value. Adam with step size ``rate`` moves xi (``logits``, float64) with a ``decay`` towards even weights.
     """
 
     tag = "Policy/largest_weight"
@@ -150,21 +153,21 @@ class Famo(Balance):
         self.above = torch.zeros_like(self.logits)
 
     def weights(self, above: Tensor) -> Tensor:
-        """Factors of losses (num_tasks,) so far above their least, 1 in the mean; 0 for one that cannot fall."""
+        """Return factors for losses (num_tasks,) ``above`` their least: 1 on average, 0 for a loss that cannot fall."""
         self.above = above.detach().double()
         shares = self.logits.detach().softmax(0) / self.above.clamp_min(_LEAST)
         shares = shares.masked_fill(self.above <= _LEAST, 0.0)
         return (len(shares) * shares / shares.sum().clamp_min(1e-30)).to(above.dtype)
 
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """As in the base; the number is the largest weight."""
+        """Write the gradient as in the base class; the returned number is the largest weight."""
         weights = self.weights(all_sum((losses - least).detach()))
         (weights * losses).sum().backward(retain_graph=True)
         return weights.max() / len(weights) / world_size()
 
     @torch.no_grad()
     def learn(self, above: Callable[[], Tensor]) -> None:
-        """As in the base: costs another forward pass."""
+        """Update the weights as in the base class, at the cost of another forward pass."""
         fallen = self.above.clamp_min(_LEAST).log() - all_sum(above()).double().clamp_min(_LEAST).log()
         fallen = fallen.masked_fill(self.above <= _LEAST, 0.0)
         z = self.logits.softmax(0)
@@ -172,5 +175,5 @@ class Famo(Balance):
         self.adam.step()
 
     def parts(self) -> Parts:
-        """What a checkpoint holds of it."""
+        """Return the parts of the balance that a checkpoint holds."""
         return {"famo_logits": self.logits, "famo_adam": self.adam}

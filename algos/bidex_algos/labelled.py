@@ -1,6 +1,7 @@
-"""The data set of a student: observations and what its teachers would have done there, the newest of each environment.
+"""The data set of a student: the newest observations of each environment, with the teachers' actions as labels.
 
-A ring of vector steps on the device, in half precision: 1.5 M observations of MT20-v2 with their labels take 1.6 GB.
+The data set is a ring buffer of vector steps on the device, in half precision: 1.5 M observations of MT20-v2 with their
+labels take 1.6 GB.
 """
 
 import torch
@@ -11,9 +12,9 @@ from bidex_meta.training.learner import State
 
 
 class Labelled:
-    """The last ``steps`` vector steps of ``rows``, environments (L,) of one task each (``task_id``, (L,)), ascending.
+    """The last ``steps`` vector steps of environments ``rows`` (L,), each of one task (``task_id`` (L,), ascending).
 
-    ``tasks`` are those that have an environment here, (K,).
+    ``tasks`` (K,) are the tasks that have an environment in ``rows``.
     """
 
     def __init__(self, steps: int, rows: Tensor, task_id: Tensor, observations: int, actions: int):
@@ -21,45 +22,45 @@ class Labelled:
         self.tasks, self._count = torch.unique_consecutive(task_id, return_counts=True)
         self._first = self._count.cumsum(0) - self._count
         half = {"dtype": torch.float16, "device": rows.device}
-        # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+        # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
         self._obs = torch.empty(steps, len(rows), observations, **half)
         self._labels = torch.empty(steps, len(rows), actions, **half)
 
     @property
     def filled(self) -> int:
-        """Vector steps that can be drawn from."""
+        """Return the number of vector steps that can be drawn from."""
         return min(self.added, self.steps)
 
     def add(self, obs: Tensor, labels: Tensor) -> None:
-        """Takes raw observations (N, d) and labels (N, a) of all environments of the world, and keeps its own."""
+        """Store raw observations (N, d) and labels (N, a); of all environments of the world, only ``rows`` are kept."""
         self._obs[self.added % self.steps] = obs[self.rows]
         self._labels[self.added % self.steps] = labels[self.rows]
         self.added += 1
 
     def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
-        """Places, uniform within each task: int64 (batches, K * per_task), task after task."""
+        """Draw indices, uniform within each task: int64 (batches, K * per_task), task after task."""
         shape, device = (batches, len(self.tasks), per_task), self.rows.device
         step = torch.randint(self.filled, shape, generator=generator, device=device)
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=generator, device=device) % self._count[:, None]
         return (step * len(self.rows) + self._first[:, None] + row).flatten(1)
 
     def take(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Observations (B, d) and labels (B, a) at ``places`` (B,), float32."""
+        """Return observations (B, d) and labels (B, a) at the indices ``places`` (B,), float32."""
         return tuple(ring.flatten(0, 1).index_select(0, places).float() for ring in (self._obs, self._labels))  # type: ignore[return-value]
 
     def of_last(self, steps: int) -> list[Tensor]:
-        """The labels of the last vector steps, no more than are kept, of each task: (n, a) each, float32."""
+        """Return the labels of the last stored vector steps, at most ``steps``, for each task: (n, a), float32."""
         last = (self.added - 1 - torch.arange(steps, device=self.rows.device)) % self.steps
         return [part.flatten(0, 1).float() for part in self._labels[last].split(self._count.tolist(), dim=1)]
 
     def state_dict(self) -> State:
-        """A copy of all that is kept."""
+        """Return a copy of the stored data."""
         kept = {"obs": self._obs[: self.filled].clone(), "labels": self._labels[: self.filled].clone()}
         return {"added": self.added, "steps": self.steps, "rows": self.rows.clone(), **kept}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave. Raises BidexError where it has other environments or another size."""
+        """Restore the result of :meth:`state_dict`; raises BidexError if it has other environments or another size."""
         here, there = (self.steps, self.rows.tolist()), (state["steps"], state["rows"].tolist())
         if here != there:
             raise BidexError(

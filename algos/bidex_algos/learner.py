@@ -1,4 +1,4 @@
-"""All learners: seeds, shapes read from the world, timers, the finite check, checkpoints, several processes."""
+"""The base of all learners: seeds, shapes read from the world, timers, the finite check, checkpoints, processes."""
 
 import copy
 import math
@@ -26,33 +26,34 @@ from bidex_meta.world.contract import VectorWorld
 
 
 def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
-    """Scalars as numbers, in one transfer from the device."""
+    """Convert scalars to numbers in one transfer from the device."""
     if not tensors:
         return {}
     values = torch.stack([value.double() for value in tensors.values()]).tolist()
     return dict(zip(tensors, values, strict=True))
 
 
-# What decides, beside the shapes of the weights, what they compute.
+# Besides the shapes of the weights, these values determine the function of a network.
 _WORLD = ("observations", "actions", "task_id")
 _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
 
 
 class Learner(Contract):
-    """Base of all learners of this package; ``policy`` acts, ``agent`` is what evaluation plays of it.
+    """Base of all learners of this package; ``policy`` acts, and ``agent`` is the part of it that an evaluation runs.
 
-    Of several processes each has a world, samples and ``generator`` of its own, and all the same networks: statistics,
-    gradients and ``env_steps`` are of all. Raises BidexError for a world in another mode, with discounts of its classes
-    where the learner has one for all, or without a one-hot that an option needs.
+    With several processes each process has its own world, samples and ``generator``, and all have the same networks:
+    statistics, gradients and ``env_steps`` cover all processes. Raises BidexError for a world in another autoreset
+    mode, for a world with discounts per class if the learner has a single one, or for a world without the one-hot that
+    an option needs.
     """
 
-    remedy: ClassVar[str]  # what helps, mostly, when a loss is no longer finite
+    remedy: ClassVar[str]  # advice when a loss is no longer finite
     config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
     discounts_by_class: ClassVar[bool] = False
-    """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
+    """True if the learner supports discounts per class (``world.gammas``)."""
     unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
-    """Attributes (tensors, numbers, None) from which the next iteration goes on: in the checkpoint too."""
+    """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
     policy_of: ClassVar[Callable[..., nn.Module]]
     """Makes the policy of config, inputs, shape, a CPU generator for the weights, and device."""
 
@@ -65,7 +66,7 @@ class Learner(Contract):
         check_options(self.name, config, world, self.shape)
         check_discounts(self.name, world, self.discounts_by_class)
         self.inputs = self._inputs(config, self.shape)
-        # Weights come from a CPU generator, so that a seed means the same network on every device.
+        # Weights are drawn from a CPU generator, so that a seed gives the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)
         self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
         self.policy: Any = self._make_policy(config, self.shape, self.initial, self.device)
@@ -74,25 +75,25 @@ class Learner(Contract):
 
     @classmethod
     def _make_policy(cls, config: Any, shape: Shape, init: torch.Generator, device: torch.device) -> nn.Module:
-        """A policy with fresh weights, drawn from ``init`` (a CPU generator), on ``device``."""
+        """Make a policy on ``device`` with fresh weights drawn from ``init`` (a CPU generator)."""
         return cls.policy_of(config, cls._inputs(config, shape), shape, init, device).to(device)
 
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
-        """How its networks read an observation: the place for encoders of its groups."""
+        """Describe the networks' reading of an observation; encoders of observation groups are added here."""
         size = vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
         return with_task_embedding(with_point_net(Inputs(shape.groups), config), size, cls.unit_embeddings)
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
-        """Collects, learns, adds to ``env_steps``; returns all metrics but those of time."""
+        """Collect, learn and add to ``env_steps``; return all metrics except times."""
 
     @abstractmethod
     def _parts(self) -> Parts:
-        """What a checkpoint holds beside the policy, by name."""
+        """Return everything that a checkpoint holds besides the policy, by name."""
 
     def _place(self) -> State:
-        """What ``going_on`` names, and other plain values, for the checkpoint."""
+        """Return the attributes named in ``going_on``, and other plain values, for the checkpoint."""
         return {name: vars(self)[name] for name in self.going_on}
 
     def _go_on_from(self, state: State) -> None:
@@ -104,14 +105,14 @@ class Learner(Contract):
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
     def iterate(self) -> dict[str, float]:
-        """Collects experience, learns from it; metrics, or a FloatingPointError where a loss is not finite."""
+        """Collect experience, learn from it and return metrics; a FloatingPointError if a loss is not finite."""
         started, steps, self._collected = time.perf_counter(), self.env_steps, 0.0
         metrics = self._iterate()
         if not math.isfinite(sum(value for name, value in metrics.items() if name.startswith(("Loss/", "Policy/")))):
             steps = self.env_steps
             world: Any = getattr(self.world, "unwrapped", self.world)
             if hasattr(world, "check_formulas"):
-                world.check_formulas()  # of a class of the user's own, whose numbers may be the cause
+                world.check_formulas()  # a user's own class may have caused the non-finite numbers
             raise FloatingPointError(f"{self.name}: the loss is not finite after {steps} steps; {self.remedy}.")
         whole = time.perf_counter() - started
         metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected
@@ -120,14 +121,14 @@ class Learner(Contract):
 
     @contextmanager
     def _collecting(self) -> Iterator[None]:
-        """What happens within is collection; the rest of an iteration is learning."""
+        """Count the time within the context as collection; the rest of an iteration is learning."""
         began = time.perf_counter()
         yield
         self._collected += time.perf_counter() - began
 
     def _first_observations(self) -> Tensor:
-        """Begins the training: raw observations (N, d) of the world's first reset."""
-        # The same seed has given the same weights everywhere, unless a machine computes differently.
+        """Begin the training: return raw observations (N, d) of the world's first reset."""
+        # The same seed gives the same weights in every process, unless a machine computes differently.
         modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
         broadcast([weight for module in modules for weight in module.parameters()])
         obs, _ = self.world.reset(seed=own_seed(self.seed))
@@ -135,22 +136,22 @@ class Learner(Contract):
         return obs
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Actions (N, a) in [-1, 1] for raw observations (N, d), no exploration. N need not be the world's."""
+        """Return actions (N, a) in [-1, 1] for raw observations (N, d), without exploration; N is arbitrary."""
         return self.agent.eval_action(obs)
 
     def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
+        """Begin a new episode in the rows of ``env_mask``, bool (N,)."""
         self.agent.reset(env_mask)
 
     def policy_state_dict(self) -> State:
-        """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
+        """Return the state that :meth:`load_policy` needs: network, observation statistics, sizes and config."""
         return {"config": asdict(self.config), "shape": self.shape.state_dict(), "weights": self.policy.state_dict()}
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
-        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments.
+        """Return the agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments.
 
-        Raises ValueError where the config asks for other layers than the weights, before these take memory.
+        Raises ValueError if the config describes other layers than the weights have, before the layers take memory.
         """
         init, weights, sizes = torch.Generator().manual_seed(0), state["weights"], state["shape"]
         total = sum(weight.numel() for weight in weights.values())
@@ -166,7 +167,7 @@ class Learner(Contract):
         return policy
 
     def start_from(self, policy: State) -> None:
-        """Takes network and statistics of another learner's policy, and keeps these; refuses what has another form."""
+        """Take and keep network and statistics of another learner's policy; a BidexError if its form differs."""
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
@@ -178,17 +179,17 @@ class Learner(Contract):
                 "other weights. Name another run."
             )
         if isinstance(self.policy, SquashedPolicy):
-            # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
+            # Its network's output is a position between these bounds; a Gaussian policy has its std as a weight.
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
         self.policy.observations.keep()
 
     def state_dict(self) -> State:
-        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
+        """Return a copy of all state but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave; a BidexError where it comes from a world of another size."""
+        """Restore the result of :meth:`state_dict`; a BidexError if it comes from a world of another size."""
         self._check_size(state)
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)
@@ -229,7 +230,7 @@ def _restore(part: Any, state: Any) -> None:
 
 
 def _network(weights: State) -> State:
-    """Without learned sizes of inner steps, which are no part of what plays."""
+    """Drop the learned sizes of inner steps, because the acting network does not use them."""
     return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
 
 

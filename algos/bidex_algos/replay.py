@@ -1,7 +1,7 @@
-"""A replay with a part of its own for each task: the last vector steps of all environments, in a ring on the device.
+"""A replay with a separate part for each task: the last vector steps of all environments, in a ring on the device.
 
-An observation is kept once, as where one transition leads and the next begins; last ones before time limits lie in a
-ring of their own. No shape depends on data, and nothing makes the host wait for the device.
+An observation is stored once, as the end of one transition and the start of the next; last observations before time
+limits are stored in a separate ring. No shape depends on data, and the host never waits for the device.
 """
 
 import math
@@ -31,10 +31,10 @@ class Transitions:
 
 
 class Replay:
-    """The last ``steps`` vector steps of all environments, in parts no other task (``task_id``, (N,)) can crowd out.
+    """The last ``steps`` vector steps of all environments, with a separate part per task (``task_id``, (N,)).
 
-    ``cut_share`` is the room for last observations of episodes cut by a time limit, as a share of all transitions;
-    where they do not fit, the oldest lose their weight. ``added`` counts the vector steps taken in.
+    ``cut_share`` is the room for last observations of episodes cut by a time limit, as a share of all transitions. If
+    the room is too small, the oldest lose their weight. ``added`` counts the vector steps added.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class Replay:
     ):  # fmt: skip
         rows = len(task_id)
         self.steps, self.rows, self.num_tasks, self.device, self.added = steps, rows, num_tasks, device, 0
-        self.slots = steps + 1  # one more than transitions: the newest observation has none yet
+        self.slots = steps + 1  # one more than transitions, because the newest observation has none yet
         self.cuts_kept = _cuts_kept(steps, rows, cut_share)
 
-        # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+        # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
         def ring(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.empty(shape, dtype=dtype, device=device)
 
@@ -56,10 +56,10 @@ class Replay:
             "rewards": ring(self.slots, rows),
             "terminated": ring(self.slots, rows, dtype=torch.bool),
             "valid": ring(self.slots, rows, dtype=torch.bool),
-            # Running number, from 1, of the time limit that cut the episode here; 0 where none did.
+            # Running number, from 1, of the time limit that cut the episode here; 0 without a cut.
             "cut": ring(self.slots, rows, dtype=torch.int64),
         }
-        # The cell behind the last takes what nobody will read.
+        # The last cell is a dummy: it takes writes that are never read.
         self._final_obs = ring(self.cuts_kept + 1, observations)
         self._cuts = torch.zeros((), dtype=torch.int64, device=device)
         self._rows_of_task = torch.argsort(task_id, stable=True)
@@ -68,30 +68,30 @@ class Replay:
 
     @property
     def filled(self) -> int:
-        """Vector steps that can be drawn from."""
+        """Return the number of vector steps that can be drawn from."""
         return min(self.added, self.steps)
 
     @property
     def obs(self) -> Tensor:
-        """Newest observations, raw (N, d)."""
+        """Return the newest observations, raw (N, d)."""
         return self._obs[self.added % self.slots]
 
     def begin(self, obs: Tensor) -> None:
-        """Takes the observations (N, d) that the first step starts from."""
+        """Store the observations (N, d) from which the first step starts."""
         self.obs.copy_(obs)
 
     def add(
         self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: Info
     ) -> None:
-        """Takes one vector step from ``self.obs``: ``actions`` (N, a) and what a world's ``step`` returned for them."""
+        """Add one vector step from ``self.obs``: ``actions`` (N, a) and the results of the world's ``step``."""
         valid = ~info["unstable"]
         cut = truncated & ~terminated & valid
         number = self._cuts + cut.cumsum(0)
-        # All rows write, those whose episode goes on into the last cell: to pick rows the host would have to wait.
+        # All rows write; rows whose episode goes on write into the dummy cell. Selecting rows would make the host wait.
         cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
         self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
-        # A weight of 0 does not undo a reward that is not a number.
+        # A weight of 0 does not remove a reward that is NaN.
         rewards, numbers = reward.masked_fill(~valid, 0.0), number.masked_fill(~cut, 0)
         step = {"actions": actions, "rewards": rewards, "terminated": terminated, "valid": valid, "cut": numbers}
         for name, value in step.items():
@@ -100,32 +100,32 @@ class Replay:
         self.obs.copy_(obs)
 
     def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
-        """Places of transitions, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
         shape = (batches, self.num_tasks, per_task)
 
         def uniform(high: int) -> Tensor:
             return torch.randint(high, shape, generator=generator, device=self.device)
 
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = self._rows_of_task[self._first[:, None] + uniform(2**40) % self._count[:, None]]
         return self.places(row, uniform(self.filled)).flatten(1)
 
     def places(self, rows: Tensor, ages: Tensor) -> Tensor:
-        """Places of what environments did so many vector steps ago, 0: the last; int64, shapes that broadcast."""
+        """Return indices of transitions of environments ``ages`` vector steps ago, 0: the last; int64, broadcast."""
         return (self.added - 1 - ages) % self.slots * self.rows + rows
 
     def weights(self, places: Tensor) -> Tensor:
-        """1, or 0 where physics broke or the last observation is no longer kept. Shape of ``places``, float32."""
+        """Return 1, or 0 if physics broke or the last observation is no longer kept. Shape of ``places``, float32."""
         cut = self.at("cut", places)
         kept = (cut == 0) | (cut > self._cuts - self.cuts_kept)
         return (self.at("valid", places) & kept).float()
 
     def after(self, places: Tensor) -> Tensor:
-        """Where the environment's next transition lies, in the shape of ``places``."""
+        """Return indices of the environments' next transitions, in the shape of ``places``."""
         return (places + self.rows) % (self.slots * self.rows)
 
     def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
-        """The transitions at ``places`` (B,); with ``last`` they begin there and end as the ones at ``last``."""
+        """Return the transitions at ``places`` (B,); with ``last`` they end like the transitions at ``last``."""
         last = places if last is None else last
         everything = self._obs.flatten(0, 1)
         following = everything.index_select(0, self.after(last))
@@ -138,11 +138,11 @@ class Replay:
         )  # fmt: skip
 
     def at(self, name: str, places: Tensor) -> Tensor:
-        """What was stored under a name at ``places``, in their shape: rewards, terminated, valid, cut."""
+        """Return a stored field at ``places``, in their shape: rewards, terminated, valid, cut."""
         return self._steps[name].flatten(0, 1)[places]
 
     def state_dict(self) -> State:
-        """A copy of all that was taken in."""
+        """Return a copy of the stored data."""
         cuts = min(int(self._cuts), self.cuts_kept)
         return {
             "added": self.added, "steps": self.steps, "obs": self._obs[: self.added + 1].clone(),
@@ -151,7 +151,7 @@ class Replay:
         }  # fmt: skip
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave. Raises BidexError: it comes from a replay of another size."""
+        """Restore the result of :meth:`state_dict`; raises BidexError if it comes from a replay of another size."""
         here, there = (self.steps, *self._obs.shape[1:]), (state["steps"], *state["obs"].shape[1:])
         if here != there:
             raise BidexError(
@@ -167,24 +167,24 @@ class Replay:
 
 
 def replay_bytes(steps: int, rows: int, observations: int, actions: int, cut_share: float = 1 / 16) -> int:
-    """Bytes that a :class:`Replay` of this size takes."""
+    """Return the bytes that a :class:`Replay` of this size takes."""
     transition = 4 * (observations + actions + 1) + 2 + 8
     return (steps + 1) * rows * transition + (_cuts_kept(steps, rows, cut_share) + 1) * 4 * observations
 
 
 def steps_within(memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float) -> int:
-    """The most vector steps, up to ``steps``, that take no more than ``memory`` bytes; 0 if not even one does."""
+    """Return the most vector steps, up to ``steps``, that fit into ``memory`` bytes; 0 if not even one fits."""
     sizes = rows, observations, actions, cut_share
     return bisect_right(range(1, steps + 1), memory, key=lambda n: replay_bytes(n, *sizes))
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
-    # A vector step's worth at least: all may end together, and no cell may be written twice in a step.
+    # At least one vector step's worth: all episodes may end together, and a step must not write a cell twice.
     return max(rows, math.ceil(cut_share * steps * rows))
 
 
 class Stretches:
-    """Up to ``n`` steps in a row from each of ``places``, int64 (batches, B); ``last``: places of their last steps."""
+    """Up to ``n`` consecutive steps from each of ``places``, int64 (batches, B); ``last`` are the final indices."""
 
     def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
         self.replay, self.first, self.last = replay, places, places
@@ -207,7 +207,7 @@ class Stretches:
         return self.replay.at("terminated", places) | (self.replay.at("cut", places) > 0)
 
     def take(self, batch: int) -> Transitions:
-        """One batch of them, as transitions (B,)."""
+        """Return one batch of the stretches as transitions (B,)."""
         taken = self.replay.take(self.first[batch], self.last[batch])
         if self.rewards is None:
             return taken
@@ -217,7 +217,7 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """The replay of ``asked`` vector steps, or as many as ``memory`` (10^9 bytes) holds; a BidexError if that is 0."""
+    """Make a replay of ``asked`` vector steps, or the most that ``memory`` (10^9 bytes) holds; a BidexError if 0."""
     rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
     if 0 in present:

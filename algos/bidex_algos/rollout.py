@@ -1,4 +1,4 @@
-"""A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
+"""A rollout of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,8 @@ from bidex_meta.world.contract import Info, VectorWorld
 class EpisodeStatistics:
     """Fading sums over about the last ``window`` finished episodes of each task, in each process.
 
-    Few episodes end in one rollout, and often none of a slow task. ``task_id``: of each environment, int64 (N,).
+    Few episodes end in one rollout, and often none of a slow task. ``task_id`` is the task of each environment, int64
+    (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
@@ -23,7 +24,7 @@ class EpisodeStatistics:
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
     def update(self, info: Info) -> None:
-        """Takes in the episodes that ``info["episode_mask"]`` says ended in this step."""
+        """Add the episodes that ended in this step according to ``info["episode_mask"]``."""
         episode, ended = info["running"], info["episode_mask"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
         new = torch.zeros_like(self.sums).index_add_(1, self.task_id, values.masked_fill(~ended, 0.0))
@@ -32,7 +33,8 @@ class EpisodeStatistics:
     def metrics(self) -> dict[str, float]:
         """Return the means of each task that has finished an episode, over all processes.
 
-        Means over tasks are added once every task has finished one: before, they would be means of the fast tasks.
+        Means over tasks are added once every task has finished an episode; earlier means would cover only the fast
+        tasks.
         """
         returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
@@ -47,19 +49,19 @@ class EpisodeStatistics:
         return out
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums."""
+        """Return the sums."""
         return {"sums": self.sums.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.sums.copy_(state["sums"])
 
 
 Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
+"""Maps raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
 
 FinalValue = Callable[[Tensor, Tensor], Tensor]
-"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward; of several critics (n, critics)."""
+"""Maps raw observations (n, d) and task ids (n,) to values (n,) in units of reward; several critics: (n, critics)."""
 
 
 class Rollout:
@@ -78,8 +80,8 @@ class Rollout:
         self.rewards = zeros(steps, num_envs)  # 0 where not valid
         self.terminated = zeros(steps, num_envs, dtype=torch.bool)  # the episode came to a true end
         self.ended = zeros(steps, num_envs, dtype=torch.bool)  # terminated, truncated or not valid
-        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False where physics broke: teaches nothing
-        # Values of the last observations of episodes cut by a time limit, 0 elsewhere; of several critics one each.
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False if physics broke: the transition teaches nothing
+        # Values of the last observations of episodes cut by a time limit, else 0; with several critics one value each.
         self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
         self.last_obs = zeros(num_envs, observations)  # raw, after the last step
 
@@ -89,7 +91,7 @@ def collect(
     world: VectorWorld, rollout: Rollout, obs: Tensor, sample: Sampler, final_value: FinalValue,
     episodes: EpisodeStatistics
 ) -> Tensor:  # fmt: skip
-    """Fills ``rollout`` from ``world``, starting at the observations ``obs``; returns those to continue from."""
+    """Fill ``rollout`` from ``world``, starting at observations ``obs``; return the observations to go on from."""
     for t in range(rollout.steps):
         action, mean = sample(obs)
         rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
@@ -100,7 +102,7 @@ def collect(
         cut = truncated & ~terminated & valid
         values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
         if not maths.may_look(cut.device):
-            # A forward of all environments is cheaper than the wait for which rows there are.
+            # A forward pass of all environments is cheaper than waiting for the indices of the cut rows.
             there = cut.view(-1, *[1] * (values.dim() - 1))
             values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
         elif len(rows := cut.nonzero().squeeze(-1)):
@@ -111,7 +113,7 @@ def collect(
 
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
-    """Refuses, by a BidexError, another autoreset mode than the learner's, or another default precision than single."""
+    """Raise BidexError if the world's autoreset mode is not the learner's, or the default precision is not single."""
     maths.check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:

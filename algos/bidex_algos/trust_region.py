@@ -1,4 +1,4 @@
-"""A step as far as the KL allows: conjugate gradients, Fisher-vector products and line search, on flat vectors."""
+"""A step within a KL bound: conjugate gradients, Fisher-vector products and line search, on flat vectors."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,28 +12,28 @@ Product = Callable[[Tensor], Tensor]  # A symmetric positive matrix as a functio
 
 
 def flatten(tensors: Sequence[Tensor]) -> Tensor:
-    """All entries in one vector (P,)."""
+    """Concatenate all entries into one vector (P,)."""
     return torch.cat([t.reshape(-1) for t in tensors])
 
 
 @torch.no_grad()
 def write(parameters: Sequence[nn.Parameter], vector: Tensor) -> None:
-    """Overwrites parameters with the entries of a vector (P,)."""
+    """Overwrite parameters with the entries of a vector (P,)."""
     for parameter, part in zip(parameters, vector.split([p.numel() for p in parameters]), strict=True):
         parameter.copy_(part.view_as(parameter))
 
 
 def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: float = 1e-10) -> Tensor:
-    """Solves ``product(x) = b`` for x (P,) from 0 (Hestenes and Stiefel 1952).
+    """Solve ``product(x) = b`` for x (P,), starting at 0 (Hestenes and Stiefel 1952).
 
-    With as many iterations as P the solution is exact but for rounding. Once the squared residual is below
-    ``tolerance`` of the first one, x no longer changes.
+    After P iterations the solution is exact except for rounding. Once the squared residual is below ``tolerance`` of
+    the first one, x no longer changes.
     """
     x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
     square = first = residual.dot(residual)
     for _ in range(iterations):
         along = product(direction)
-        # Masked instead of stopped: whether to stop would be a question to the device.
+        # The update is masked instead of stopped, because a stop would require a host sync.
         going = square > tolerance * first
         length = torch.where(going, square / direction.dot(along), 0.0)
         x = x + length * direction
@@ -45,7 +45,7 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
 
 
 def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: float) -> Product:
-    """Fisher-vector products F v + damping v by differentiating the KL twice.
+    """Return Fisher-vector products F v + damping v, computed by differentiating the KL twice.
 
     ``kl`` is this process's part of the policy's mean KL from itself, with its graph; its Hessian is the Fisher matrix.
     """
@@ -62,10 +62,10 @@ def line_search(
     parameters: Sequence[nn.Parameter], step: Tensor, measure: Callable[[], tuple[float, float]], *, expected: float,
     max_kl: float, accept_ratio: float, factor: float, tries: int
 ) -> float:  # fmt: skip
-    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes: 0.
+    """Shorten ``step`` (P,) until the objective has risen and the KL is within its bound; otherwise change nothing.
 
-    ``measure`` gives both; of the rise ``expected`` of the whole step ``accept_ratio`` must come true. Returns the
-    share.
+    ``measure`` returns objective and KL. The objective must rise by at least ``accept_ratio`` of the rise ``expected``
+    of the step. Returns the share of the step that was taken, or 0.
     """
     start = flatten(parameters).detach().clone()
     before, _ = measure()
@@ -73,7 +73,7 @@ def line_search(
     for _ in range(tries):
         write(parameters, start + share * step)
         objective, kl = measure()
-        # Comparisons with NaN are false, so that a broken point is never taken.
+        # Comparisons with NaN are false, so a broken point is never accepted.
         if objective - before > max(accept_ratio * share * expected, 0.0) and kl <= max_kl:
             return share
         share *= factor
@@ -85,10 +85,11 @@ def trust_region_step(
     parameters: Sequence[nn.Parameter], objective: Tensor, kl: Tensor, measure: Callable[[], tuple[float, float]],
     config: Any, max_kl: float, kl_tag: str, accept_ratio: float = 0.0
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Goes along F^-1 g as far as has the KL ``max_kl`` to second order, and back by :func:`line_search`.
+    """Move along F^-1 g to the KL ``max_kl``, to second order, and shorten the step by :func:`line_search`.
 
-    Returns scalars to be logged. ``objective`` is this process's part of what shall rise, with its graph, ``kl`` as for
-    :func:`fisher_product`. The config has ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
+    Returns scalars to be logged. ``objective`` is this process's part of the value to raise, with its graph; ``kl`` is
+    described in :func:`fisher_product`. The config has ``damping``, ``cg_iterations``, ``backtracks`` and
+    ``backtrack_factor``.
     """
     gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
     product = fisher_product(kl, parameters, config.damping)

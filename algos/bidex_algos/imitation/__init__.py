@@ -1,1 +1,1 @@
-"""Learners that imitate a teacher in the states that they come to themselves."""
+"""Learners that imitate a teacher in the states that the learner itself visits."""

@@ -1,4 +1,4 @@
-"""DAgger: the student plays, its teachers say what they would do in the states that it comes to, and it learns that."""
+"""DAgger: the student acts, its teachers label the states that it visits, and it learns to imitate these labels."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class DAggerConfig(NetworkConfig):
-    """Everything that can be set about DAgger; the defaults are the preset ``laptop``."""
+    """All options of DAgger; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (512, 512)  # Widths of the hidden layers.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
@@ -42,11 +42,11 @@ class DAggerConfig(NetworkConfig):
     autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 1)
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """As in the base: the labelled observations."""
+        """Estimate the bytes of the labelled observations, as in the base class."""
         return self.samples * width
 
 
@@ -56,8 +56,8 @@ PRESETS: dict[str, DAggerConfig] = {"laptop": DAggerConfig()}
 class DAgger(Learner):
     """Data set aggregation (Ross et al. 2011, arXiv 1011.0686) from policies and scripts, on a batched world.
 
-    With teachers that follow an episode from its start (scripts) a resumed run begins new episodes: it is no longer
-    equal to an unbroken one bit for bit.
+    If teachers follow an episode from its start (scripts), a resumed run begins new episodes and is no longer bitwise
+    equal to an uninterrupted run.
     """
 
     name, remedy = "dagger", "lower learning_rate"
@@ -93,7 +93,7 @@ class DAgger(Learner):
         return self.episodes.metrics() | as_numbers({"Train/unstable": all_sum(unstable), **losses}) | self._played()
 
     def _teachers_share(self) -> float:
-        """Of the episodes that begin now: those that the teacher plays."""
+        """Return the share of the episodes beginning now that the teacher plays."""
         steps = self.config.teacher_steps
         return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
 
@@ -107,7 +107,7 @@ class DAgger(Learner):
         self._begin(everyone, share)
 
     def _begin(self, ended: Tensor, share: float) -> None:
-        """New episodes in the rows of a mask (N,): who plays them, and the teachers begin anew."""
+        """Begin new episodes in the rows of a mask (N,): draw who acts in them and reset the teachers."""
         drawn = torch.rand(ended.shape, generator=self.generator, device=self.device) < share
         self.teacher_plays = torch.where(ended, drawn & self.lessons.teachers.known, self.teacher_plays)
         self.lessons.teachers.reset(ended)
@@ -140,15 +140,15 @@ class DAgger(Learner):
             self._expect("(num_envs, observations) = ", *shapes)
 
     def state_dict(self) -> State:
-        """As in the base; the data set makes its own copy, since two of it at once may not fit."""
+        """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
         return super().state_dict() | {"data": self.lessons.data and self.lessons.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or data set had another size."""
+        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the data set had another size."""
         super().load_state_dict(state)
         if self.lessons.data is None:
             return
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:
-            obs, _ = self.world.reset()  # no teacher knows the half of an episode that it has not seen
+            obs, _ = self.world.reset()  # teachers have not seen the first part of a running episode
             self._begin_all(obs, self._teachers_share())

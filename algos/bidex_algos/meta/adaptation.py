@@ -1,7 +1,7 @@
 """The inner loop of MAML and ProMP: one gradient step on a task's own data, for all tasks at once.
 
-Every task has parameters of its own, stacked along a first axis; adapted ones keep their graph back to the
-meta-parameters, which is what the outer loops differentiate.
+Every task has its own parameters, stacked along a first axis. Adapted parameters keep their graph back to the
+meta-parameters, because the outer loops differentiate through it.
 """
 
 import math
@@ -15,12 +15,12 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]  # which parameters an inner step moves: all, or those of the mean's output layer
-StepSizeKind = Literal["fixed", "layer", "weight"]  # whether sizes of the inner step are learned, and of what
+Adapted = Literal["all", "head"]  # parameters that an inner step moves: all, or only the mean's output layer
+StepSizeKind = Literal["fixed", "layer", "weight"]  # granularity of learned inner step sizes; fixed: not learned
 
 
 class StepSizes(nn.Module):
-    """A factor of the inner step for each tensor (``layer``), or each entry of it (``weight``), that it moves."""
+    """Factors of the inner step: one for each tensor that it moves (``layer``) or for each entry (``weight``)."""
 
     def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
         super().__init__()
@@ -28,37 +28,37 @@ class StepSizes(nn.Module):
         self.factors = nn.ParameterDict({_key(name): torch.ones(size) for name, size in sizes.items()})
 
     def __getitem__(self, name: str) -> Tensor:
-        """Factor of a parameter: a scalar, or of the parameter's shape."""
+        """Return the factor of a parameter: a scalar, or a tensor of the parameter's shape."""
         return self.factors[_key(name)]
 
     @torch.no_grad()
     def project(self) -> None:
-        """Moves factors below 0 back to it: a step uphill would unlearn."""
+        """Raise negative factors to 0, because a step uphill would unlearn."""
         for factor in self.parameters():
             factor.clamp_(min=0.0)
 
     @torch.no_grad()
     def mean(self) -> Tensor:
-        """Mean factor over tensors and their entries, a scalar."""
+        """Return the mean factor over tensors and their entries, a scalar."""
         return torch.cat([factor.flatten() for factor in self.parameters()]).mean()
 
 
 def _key(name: str) -> str:
-    """Names of parameters must not hold dots."""
+    """Replace the dots of a parameter's name, because a ParameterDict does not accept dots."""
     return name.replace(".", "/")
 
 
 Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have a first axis of tasks
 
 Objective = Literal["likelihood", "ratio"]
-"""What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
+"""Objective of the inner step: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192  # what a CPU's caches hold of layers 64-64; all tasks at once take half as long again
+_TRANSITIONS_AT_ONCE = 8_192  # for layers 64-64 they fit a CPU's caches; all tasks at once take 1.5 times as long
 
 
 @dataclass
 class TaskBatch:
-    """What was sampled in one stage of adaptation, by task: B transitions of each of M tasks."""
+    """The samples of one stage of adaptation, by task: B transitions for each of M tasks."""
 
     obs: Tensor  # normalised observations (M, B, d)
     actions: Tensor  # sampled actions (M, B, a)
@@ -68,12 +68,12 @@ class TaskBatch:
     weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """The fields, in order."""
+        """Return the fields in order."""
         return tuple(vars(self).values())
 
 
 class Adapter:
-    """Gradient steps on parameters of an actor, whose own are the meta-parameters; options as in ``MetaConfig``."""
+    """Gradient steps on an actor's parameters, which are the meta-parameters; options as in ``MetaConfig``."""
 
     def __init__(
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],
@@ -87,22 +87,22 @@ class Adapter:
 
     @torch.no_grad()
     def project(self) -> None:
-        """Moves standard deviations and step sizes back between their bounds: beyond one no gradient would."""
+        """Clamp standard deviations and step sizes to their bounds, because beyond a bound they get no gradient."""
         self.actor.log_std.clamp_(*self.log_std_range)
         if self.step_sizes is not None:
             self.step_sizes.project()
 
     def meta(self, count: int) -> Params:
-        """The meta-parameters once per task, a view with their graph."""
+        """Return the meta-parameters once per task, as views with their graph."""
         return {name: p.expand(count, *p.shape) for name, p in self.actor.named_parameters()}
 
     def distribution(self, params: Params, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (M, B, a) and logarithms of standard deviations (M, a) of all tasks' policies for (M, B, d)."""
+        """Return all tasks' means (M, B, a) and logarithms of standard deviations (M, a) for observations (M, B, d)."""
         means = stacked_forward(self.actor.mean, params, "mean.", obs, own=self._prefix)
         return means, params["log_std"].clamp(*self.log_std_range)
 
     def adapt(self, params: Params, batch: TaskBatch) -> Params:
-        """Parameters after one inner step of each task on its own batch."""
+        """Return the parameters after one inner step of each task on its own batch."""
         own = self._moved(list(params))
         parts = [self._slopes(*part, own) for part in _parts(params, batch)]
         slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
@@ -126,7 +126,7 @@ class Adapter:
         return grad(loss)({name: params[name] for name in own})
 
     def ratio_and_kl(self, params: Params, batch: TaskBatch) -> tuple[Tensor, Tensor]:
-        """Likelihood ratios of each transition (M, B), and the mean KL from the policies that sampled (M,)."""
+        """Return likelihood ratios of each transition (M, B), and the mean KL from the sampling policies (M,)."""
         means, log_stds = self.distribution(params, batch.obs)
         log_prob = gaussian_log_prob(batch.actions, means, log_stds[:, None])
         kl = gaussian_kl(batch.old_means, batch.old_log_stds[:, None], means, log_stds[:, None])
@@ -146,10 +146,10 @@ def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch
 
 
 def weighted_mean(x: Tensor, weights: Tensor) -> Tensor:
-    """Mean over the last axis of what has weight; 0 where nothing has."""
+    """Average over the last axis the entries that have weight; 0 if no entry has weight."""
     return (weights * x).sum(-1) / weights.sum(-1).clamp_min(1.0)
 
 
 def detached(params: Params) -> Params:
-    """The same numbers without their graph."""
+    """Return the same parameters without their graph."""
     return {name: p.detach() for name, p in params.items()}

@@ -1,7 +1,8 @@
-"""What the gradient-based meta-learners share: meta-batches of tasks, stages of adaptation, checkpoints.
+"""The base of the gradient-based meta-learners: meta-batches of tasks, stages of adaptation, checkpoints.
 
-They differ in the outer step alone. In an iteration every task starts from the meta-parameters; in each stage k = 0 ...
-inner_steps every environment plays an episode by its task's parameters, which, but after the last, take an inner step.
+The learners differ only in the outer step. In an iteration every task starts from the meta-parameters. In each stage k
+= 0 ... inner_steps every environment plays an episode with its task's parameters. After each stage except the last, the
+parameters take an inner step.
 """
 
 from abc import abstractmethod
@@ -27,10 +28,10 @@ from bidex_meta.world.contract import PooledWorld
 
 
 class MetaPolicy(nn.Module):
-    """A Gaussian actor with adapted copies, one a task; follows the protocol of adapting agents (bidex_meta.agents).
+    """A Gaussian actor with one adapted copy per task; follows the protocol of adapting agents (bidex_meta.agents).
 
-    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them. ``seed`` is that of
-    the exploring actions.
+    Its own parameters are the meta-parameters. Before the first ``adapt`` every task acts by the meta-parameters.
+    ``seed`` seeds the exploring actions.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class MetaPolicy(nn.Module):
             actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
             config.step_sizes
         )  # fmt: skip
-        self.step_sizes = self.adapter.step_sizes  # among the weights of a checkpoint, where there are such
+        self.step_sizes = self.adapter.step_sizes  # part of the weights of a checkpoint, unless None
         self.seed = seed
         self.generator: torch.Generator | None = None
         self.rows: TaskRows | None = None
@@ -52,17 +53,17 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """The task (N,) of each environment; those of one task share what they learn. None: each has its own."""
+        """Set the task (N,) of each environment; environments of one task adapt together. None: each adapts alone."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
     def init(self) -> None:
-        """Back to the meta-parameters; all adaptation and its data are forgotten."""
+        """Return to the meta-parameters and forget all adaptation and its data."""
         self.adapted, self.stage, self.elapsed = None, Stage(), None
 
     @torch.no_grad()
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sampled actions (N, a), not clamped, for raw observations (N, d); and their means."""
+        """Return sampled, unclamped actions (N, a) for raw observations (N, d), and their means."""
         if self.generator is None or self.generator.device != obs.device:
             self.generator = torch.Generator(obs.device).manual_seed(self.seed)
         mean, log_std = self._distribution(self.observations(obs))
@@ -71,7 +72,7 @@ class MetaPolicy(nn.Module):
 
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every environment."""
+        """Store one transition of every environment."""
         terminated, truncated = timestep.terminated.bool(), timestep.truncated.bool()
         valid = torch.ones_like(terminated) if timestep.valid is None else timestep.valid
         elapsed = torch.zeros_like(terminated, dtype=torch.int64) if self.elapsed is None else self.elapsed
@@ -84,12 +85,12 @@ class MetaPolicy(nn.Module):
         self.elapsed = (elapsed + 1).masked_fill(ended, 0)
 
     def adapt(self) -> None:
-        """One inner step of each task on all transitions since the last one; without any, nothing happens."""
+        """Take one inner step of each task on all transitions since the last inner step, if there are any."""
         if len(self.stage) == 0:
             return
         rows = self._rows(self.stage.obs[0])
         params = self.adapter.meta(rows.count) if self.adapted is None else self.adapted
-        params = detached(params)  # nobody differentiates this step
+        params = detached(params)  # this step is not differentiated
         log_std = params["log_std"].clamp(*self.adapter.log_std_range)
         batch = task_batch(self.stage, rows, log_std, self.config)
         self.adapted = detached(self.adapter.adapt(params, batch))
@@ -97,14 +98,14 @@ class MetaPolicy(nn.Module):
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Mean actions of the adapted policies for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        """Return mean actions of the adapted policies for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
         return self._distribution(self.observations(obs))[0].clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes."""
+        """Do nothing: no state has to be forgotten between episodes."""
 
     def _distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (N, a) and logarithms of standard deviations, (N, a) or (a,), for normalised observations (N, d)."""
+        """Return means (N, a) and log standard deviations, (N, a) or (a,), for normalised observations (N, d)."""
         if self.adapted is None:
             return self.actor(obs), self.actor.log_std.clamp(*self.adapter.log_std_range)
         rows = self._rows(obs)
@@ -120,13 +121,13 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """A policy with fresh weights of ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
+    """Make a policy with fresh weights from ``init``, a CPU generator; encoders of ``inputs`` do not adapt."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 
 
 class MetaLearner(Learner):
-    """Learns parameters from which one gradient step on a task's own data goes far; in one process."""
+    """Learns parameters from which one gradient step on a task's own data improves much; runs in one process."""
 
     world: PooledWorld
     config: OuterConfig
@@ -145,7 +146,7 @@ class MetaLearner(Learner):
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
-        # What can be drawn from; the world's own pools will be those of a meta-batch.
+        # The tasks to draw from; the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
         counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         for name, count, pool in zip(world.task_names, counts, self.pools, strict=True):
@@ -163,15 +164,15 @@ class MetaLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
-        """Whole episodes wait for each other, slices of them go on."""
+        """Return the autoreset mode: whole episodes wait for each other, and slices of episodes go on."""
         return "DISABLED" if config.slice_steps is None else "SAME_STEP"
 
     @abstractmethod
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        """Moves the meta-parameters by what the stages showed; returns scalars to be logged."""
+        """Update the meta-parameters from the batches of the stages; return scalars to be logged."""
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """The optimisers by the names they have in a checkpoint."""
+        """Return the optimisers by their names in a checkpoint."""
         return {"adam": self.adam}
 
     def _descend(self, loss: Tensor) -> Tensor:
@@ -219,7 +220,10 @@ class MetaLearner(Learner):
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
-        """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
+        """Play a whole episode, or a slice, in every environment.
+
+        Raw observations go into the statistics ``seen``; clipped ones go to the policy.
+        """
         policy, rows, stage = self.policy, self.rows, Stage()
         longest = min(int(self.world.max_episode_steps.max()), self.adapt_steps)
         horizon = self.config.slice_steps or longest
@@ -230,7 +234,8 @@ class MetaLearner(Learner):
             obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned = torch.zeros(len(running), device=self.device)
-        # A slice counts an episode if the suite's rule does where slice or episode ends, and it meets the goal within.
+        # A slice is a success if the suite's rule holds at the end of the slice or an episode, and the goal was met in
+        # it.
         success = torch.zeros_like(running)
         ended_well = torch.zeros_like(running)
         met = torch.zeros_like(running)
@@ -286,12 +291,12 @@ class MetaLearner(Learner):
         return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
     def policy_state_dict(self) -> State:
-        """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""
+        """Return the state that :meth:`load_policy` needs: network, statistics, sizes, config and exploration seed."""
         return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MetaPolicy:
-        """The adapting agent of a checkpoint (``learner.policy``), for a world of any number of environments."""
+        """Return the adapting agent of a checkpoint (``learner.policy``), for a world of any number of environments."""
         policy = super().load_policy(state, device)
         policy.seed = state["seed"]
         return policy

@@ -1,4 +1,4 @@
-"""What can be set about every gradient-based meta-learner; imports no torch, so that a command line can show it."""
+"""The options of every gradient-based meta-learner; imports no torch, so that a command line can show them quickly."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,12 +10,12 @@ from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
 USUAL_STEPS = 300
-"""Steps of an episode for estimates of memory, where no world says how long its episodes are."""
+"""Steps of an episode for estimates of memory when no world gives the length of its episodes."""
 
 
 @dataclass(frozen=True)
 class MetaConfig(LearnerConfig):
-    """Policy, sampling and inner steps; the defaults are the preset ``laptop``."""
+    """Options of the policy, sampling and inner steps; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
     activation: Activation = "tanh"  # Non-linearity of the hidden layers.
@@ -49,37 +49,38 @@ class MetaConfig(LearnerConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         steps = (self.slice_steps or self.max_adapt_steps or USUAL_STEPS) * (1 + self.inner_steps)
         return 4 * num_envs * width * steps + network_bytes(self.hidden, width, 2)
 
 
 class OuterConfig(MetaConfig):
-    """What the outer steps share. The learners' configs hold these as fields, each in its own place among the flags."""
+    """Options shared by the outer steps. Each learner's config repeats them as fields, in its own order of flags."""
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
     max_grad_norm: Positive  # Meta-gradients longer than this are shortened to it.
 
 
-# Table 48 of the Bi-DexHands appendix (ProMP), but for its outer step: eight steps of running episodes, and an inner
-# step which moves the weights too little to matter.
+# Table 48 of the Bi-DexHands appendix (ProMP), except the outer step. Its rollouts are eight steps of running episodes,
+# and its inner step moves the weights too little to matter.
 TABLE_48: Options = {
     "hidden": (2048, 1024, 512), "activation": "elu", "init_std": 1.0, "slice_steps": 8, "inner_steps": 1,
     "inner_learning_rate": 3e-4, "gamma": 0.9, "lam": 0.95, "normalise_observations": False,
 }  # fmt: skip
 
-# For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Before any
-# meta- training (seed 0) five shots of 100 episodes moved the return on ML1-wide's held-out task, 8, by +2.2 with inner
-# steps of 0.05 (0.02: +0.8; 0.1: less than 0), of all layers or the head alone; a trace of 0.95 by +1.7, of 0.7 by 0.0.
+# For policies that MT-PPO's preset laptop has trained on the same tasks (--start-from): its network and discount.
+# Before any meta-training (seed 0) we measured the return on ML1-wide's held-out task 8 after five shots of 100
+# episodes. With inner steps of 0.05 it rose by 2.2 (0.02: 0.8; 0.1: it fell), for all layers and for the head only. It
+# rose by 1.7 with a trace of 0.95, and by 0.0 with 0.7.
 TUNED: Options = {
     "hidden": (256, 256, 128), "activation": "elu", "std_range": (0.05, 1.5), "adapted": "head",
     "inner_learning_rate": 0.05, "gamma": 0.93, "lam": 0.9,
 }  # fmt: skip
 
-# The same where the test tasks are of classes that nobody has trained on (ML4, ML20): smaller steps and whole episodes.
-# docs/results/ml20.md: adapted to the first 150 of its 500 steps LiftUnderarm lost 317 of return, to all it gained 352.
+# The same for test tasks of unseen classes (ML4, ML20): smaller steps and whole episodes. In docs/results/ml20.md
+# LiftUnderarm lost 317 of return when it adapted to the first 150 of its 500 steps, and gained 352 with all steps.
 UNSEEN: Options = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}
 
-# For version 2 of the suites (docs/results/adaptation.md), from scratch or from what MT-PPO's preset v2 has learned.
-# The goal must be held at the end of longer episodes, so the discount reaches further.
+# For version 2 of the suites (docs/results/adaptation.md), from scratch or from a policy of MT-PPO's preset v2. The
+# goal must be held at the end of longer episodes, so the discount reaches further.
 V2: Options = TUNED | {"gamma": 0.96, "step_sizes": "layer"}

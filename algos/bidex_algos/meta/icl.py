@@ -1,9 +1,9 @@
-"""In-context learning: a memory that infers the goal, and an actor that is taught as if it were shown it.
+"""In-context learning: a memory infers the goal, and an actor learns to imitate teachers that know the goal.
 
-An iteration plays one trial, a few episodes of one task with one memory, in every environment. Teachers, to which the
-goal is shown, say what they would do in each of its states (DAgger); the actor learns that for the true goal. A model
-learns what any goal would have paid there, which makes a belief of what was seen and earned. The policy acts on its
-mean, and where it explores, on a goal drawn from it (posterior sampling).
+An iteration plays one trial in every environment: a few episodes of one task with one memory. Teachers, which see the
+goal, label each visited state with their action (DAgger); the actor learns these labels for the true goal. A model
+learns the reward that any goal would have given in a state. It turns observations and rewards into a belief about the
+goal. The policy acts on the mean of the belief, and when it explores, on a goal drawn from it (posterior sampling).
 """
 
 import math
@@ -32,13 +32,13 @@ from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
-# Added to the deviations of actions, in which errors count: 1.5 % of an action's range.
+# Added to the standard deviations of actions, which are the unit of errors: 1.5 % of an action's range.
 _FLOOR = 0.03
 
 
 @dataclass(frozen=True)
 class ICLConfig(LearnerConfig):
-    """Everything that can be set about in-context learning; the defaults are the preset ``laptop``."""
+    """All options of in-context learning; the defaults are the preset ``laptop``."""
 
     hidden: Widths = (256, 128)  # Widths of the layers that an observation passes in the model of rewards.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
@@ -63,7 +63,7 @@ class ICLConfig(LearnerConfig):
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         steps = self.episodes_per_trial * min(self.max_adapt_steps or USUAL_STEPS, USUAL_STEPS)
         kept = (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
         return kept + network_bytes(self.head, width, 1)
@@ -97,7 +97,10 @@ class ICL(TrialLearner):
     def _make_policy(
         cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device, belief: Belief | None = None
     ) -> BeliefPolicy:
-        seen, goals = cls._inputs(config, shape), max(1, shape.hidden)  # a 0 where nothing is hidden
+        seen, goals = (
+            cls._inputs(config, shape),
+            max(1, shape.hidden),
+        )  # at least one entry, which is 0 if no value is hidden
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
@@ -153,9 +156,9 @@ class ICL(TrialLearner):
         return self._episodes_metrics() | as_numbers(tensors)
 
     def _begin(self) -> Tensor:
-        """Starts the next trial, of tasks with the hidden part of one train task and the rest of another.
+        """Start the next trial, in which each task combines the hidden part of one train task with the rest of another.
 
-        A memory would learn fifty tasks by heart by where their objects start.
+        Otherwise a memory would memorise the fifty train tasks by the starting positions of their objects.
         """
         privileged = self.teachers.privileged
         hidden = {} if privileged is None else privileged.hidden_columns
@@ -168,13 +171,13 @@ class ICL(TrialLearner):
         return super()._begin()
 
     def teachers_share(self) -> float:
-        """Of the episodes that begin now: those that the teacher plays."""
+        """Return the share of the episodes beginning now that the teacher plays."""
         steps = self.config.teacher_steps
         return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
 
     @torch.no_grad()
     def _take_moments(self, data: TaughtTrials) -> None:
-        """Takes the labels of the trials into the statistics of their classes."""
+        """Update the statistics of each class with the labels of its trials."""
         filled = data.trials.filled()
         mean, var, count = torch.zeros(3, *self.label_stats.mean.shape, dtype=torch.float64, device=self.device)
         for task in self.tasks.tolist():
@@ -192,9 +195,10 @@ class ICL(TrialLearner):
         return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), "Loss/class": unlike.mean(), **found}
 
     def _descend(self, data: TaughtTrials) -> Tensor:
-        """A step down the mean of the classes' losses, of all processes (4, K).
+        """Take a step down the mean of the classes' losses over all processes; return the losses (4, K).
 
-        Of the actor, the model and the network that tells classes apart; last the model's squared errors.
+        The rows are the losses of the actor, the model and the network that classifies classes, and the model's squared
+        errors.
         """
         trial, row, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
@@ -213,26 +217,26 @@ class ICL(TrialLearner):
         return losses
 
     def _drawn(self, data: TaughtTrials, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """So many trials, evenly over the classes: trial, environment and class of each, (B,)."""
+        """Draw ``count`` trials evenly over the classes; return trial, environment and class of each, (B,)."""
         shape = len(self.tasks), math.ceil(count / len(self.tasks))
         trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
-        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=self.generator, device=self.device) % self.count[:, None]
         rows = self.rows[self.first[:, None] + row]
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
-        """Squared errors of actions in units of their deviation in the class (1: no better than a constant), (K,)."""
+        """Return squared action errors in units of the class's standard deviation (1: as good as a constant), (K,)."""
         policy = self.policy
         actions = policy.actor.act(policy.observations(steps.obs), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
         return self._of_class(off.square().mean(1))
 
     def _model(self, steps: Steps, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Minus the log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
+        """Return the negative log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
 
-        The former is weighted by the deviation (Seitzer et al. 2022, arXiv 2203.09168): else a model that is unsure
-        somewhere learns nothing there.
+        The likelihood is weighted by the standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model
+        learns nothing in the states where it is unsure.
         """
         policy, paid = self.policy, steps.paid[:, None].float()
         mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals), task)
@@ -241,7 +245,7 @@ class ICL(TrialLearner):
         return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))
 
     def _unlike(self, steps: Steps, task: Tensor) -> Tensor:
-        """Cross-entropy of the classes that observations look like, (K,)."""
+        """Return the cross-entropy of the classes predicted from observations, (K,)."""
         actor = self.policy.actor
         if actor.classes == 1:
             return torch.zeros(len(self.tasks), device=self.device)
@@ -256,20 +260,20 @@ class ICL(TrialLearner):
         return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
-        """As in the base; the data set makes its own copy, since two of it at once may not fit."""
+        """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or data set had another size."""
+        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the data set had another size."""
         super().load_state_dict(state)
         if self.data is not None:
             self.data.load_state_dict(state["data"])
 
 
 class _Pupil:
-    """Plays a trial: in some environments the teachers do, elsewhere the policy; all is labelled.
+    """Plays a trial: the teachers act in some environments, the policy in the others; all steps are labelled.
 
-    Episodes whose rewards the policy is shown explore, others are as those of an evaluation.
+    The policy explores in episodes whose rewards it is shown; the other episodes are played as in an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
@@ -279,7 +283,7 @@ class _Pupil:
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Which episodes explore; the teachers begin anew."""
+        """Store which episodes explore and reset the teachers."""
         learner = self._learner
         self._shown = shown[:, None]
         learner.teachers.reset(torch.ones_like(shown))
@@ -290,7 +294,10 @@ class _Pupil:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def _draw_goals(self, privileged: PrivilegedWorld) -> None:
-        """The tasks' own (N, k), and any others of their range. What a class has no use for is drawn too."""
+        """Store the tasks' own goals (N, k) and draw other goals of their range.
+
+        Entries that a class does not use are drawn too.
+        """
         goals, world = self._data.goals, self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
         sizes = torch.tensor([len(privileged.hidden_columns[name]) for name in world.task_names], device=goals.device)
@@ -298,11 +305,11 @@ class _Pupil:
         goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:
-        """Squared distance of what is believed from what the tasks hide, 1/3 for a guess; mean of entries and rows."""
+        """Return the squared distance of believed from hidden values, mean of entries and rows; 1/3 for a guess."""
         return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Keeps what the step was paid, and would have been for the other goals."""
+        """Store the reward of the step, and the rewards that the other goals would have given."""
         privileged = self._learner.teachers.privileged
         data = self._data
         data.rewards[slot, self._rows] = reward[:, None]
@@ -312,7 +319,7 @@ class _Pupil:
         data.rewards[slot, self._rows, 1:] = others.masked_fill(~valid, 0.0).T
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the teachers or the policy; keeps what the teachers would do."""
+        """Return actions of the teachers or the policy, and the memory's state; store the teachers' labels."""
         learner, data = self._learner, self._data
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels

@@ -1,8 +1,8 @@
 """MAML: model-agnostic meta-learning (Finn et al. 2017) for policies, on a batch of tasks at once.
 
-With theta_0 = theta and, on stages D_0 ... D_K, theta_k+1 = theta_k + rate * grad mean log pi(theta_k) * advantage, the
-outer step raises the mean of ratio(theta_K) * advantage on D_K, over theta, while KL(sampling policy || theta_K) stays
-below max_kl (or by one step of Adam); ``first_order`` leaves out how theta_K depends on theta.
+Let theta_0 = theta and, on stages D_0 ... D_K, theta_k+1 = theta_k + rate * grad mean log pi(theta_k) * advantage. The
+outer step raises the mean of ratio(theta_K) * advantage on D_K over theta, while KL(sampling policy || theta_K) stays
+below max_kl; alternatively it is one step of Adam. ``first_order`` ignores the dependence of theta_K on theta.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 
 @dataclass(frozen=True)
 class MAMLConfig(OuterConfig):
-    """Everything that can be set about MAML; the defaults are the preset ``laptop``."""
+    """All options of MAML; the defaults are the preset ``laptop``."""
 
     outer: Literal["trpo", "adam"] = "trpo"  # The meta-parameters' step: a trust-region one as in the paper, or Adam's.
     outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
@@ -33,7 +33,7 @@ class MAMLConfig(OuterConfig):
 
 
 PRESETS: dict[str, MAMLConfig] = {
-    # The Bi-DexHands appendix has no table for MAML: all but the trust region, MAML's own, is as in ProMP's.
+    # The Bi-DexHands appendix has no table for MAML. The trust region is MAML's own; the rest is ProMP's table.
     "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
     "tuned": MAMLConfig(**TUNED),
     "unseen": MAMLConfig(**UNSEEN),

@@ -1,4 +1,4 @@
-"""The agent of a policy that adapts by what it remembers of a trial (RL², in-context learning)."""
+"""The agent of a policy that adapts through its memory of a trial (RL², in-context learning)."""
 
 from dataclasses import replace
 
@@ -10,10 +10,10 @@ from bidex_meta.agents import Timestep
 
 
 class MemoryAgent:
-    """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` is of what it explores with.
+    """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` seeds its exploration.
 
-    Episodes that adapt write the memory, each environment its own; evaluation episodes play on a copy, each after the
-    same shots. No weight changes.
+    Adaptation episodes write the memory of their environment. Evaluation episodes run on a copy, so each of them
+    follows the same shots. No weight changes.
     """
 
     def __init__(self, policy: RecurrentPolicy, seed: int = 0):
@@ -23,24 +23,24 @@ class MemoryAgent:
         self.init()
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Nothing: each environment learns from its own episodes, rows of one task do not share what they learn."""
+        """Do nothing: each environment learns from its own episodes, and rows of one task do not share a memory."""
 
     def init(self) -> None:
-        """Every memory is as at the start of a trial."""
+        """Reset every memory to its state at the start of a trial."""
         self._learned: Memory | None = None
         self._playing: Memory | None = None
         self._next_state: Tensor | None = None
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """An episode begins where ``env_mask`` (N,): the memory learns of it, and forgets what was only evaluated."""
+        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory and discard the evaluation copy."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
         self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sampled actions (N, a) in [-1, 1] for raw observations (N, d), and the Gaussian they are from."""
+        """Return sampled actions (N, a) in [-1, 1] for raw observations (N, d), and their Gaussian distribution."""
         self._learned = self._memory(self._learned, len(obs))
         self._drawn = self.policy.drawn(self._drawn, len(obs), self.noise)
         mean, self._next_state = self.policy.step(obs, self._learned, self._drawn)
@@ -49,11 +49,11 @@ class MemoryAgent:
         return (mean + std * noise).clamp(-1.0, 1.0), {"mean": mean, "std": std}
 
     def step(self, timestep: Timestep) -> None:
-        """Remembers one transition of every environment but those whose episode is over: they wait for ``reset``."""
+        """Store one transition of every environment, except environments that wait for ``reset`` after an episode."""
         if self._learned is None or self._next_state is None:
             return
         valid, ended = timestep.valid, timestep.terminated | timestep.truncated
-        # Meta-World's evaluation names no valid rows: all are.
+        # Meta-World's evaluation does not pass valid rows: all are valid.
         known = torch.ones_like(ended) if valid is None else valid
         moved = torch.ones_like(ended) if valid is None else ~self._over
         after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
@@ -62,12 +62,12 @@ class MemoryAgent:
         self._next_state = None
 
     def adapt(self) -> None:
-        """Nothing: the memory has learned along the way."""
+        """Do nothing: the memory has already learned in :meth:`step`."""
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Mean actions (N, a) in [-1, 1] for raw observations (N, d).
+        """Return mean actions (N, a) in [-1, 1] for raw observations (N, d).
 
-        The memory goes on within the episode, shown that rewards are not known, as in training (``blind_share``).
+        The memory continues within the episode; its input marks rewards as unknown, as in training (``blind_share``).
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)

@@ -1,9 +1,10 @@
 """PEARL: SAC conditioned on a latent variable, whose posterior is inferred from a task's transitions.
 
-An environment keeps its task and plays trials: in the first episode it acts on a latent variable drawn from the prior,
-in each further one on one drawn from the posterior of the trial so far. In an update an encoder makes a posterior of
-what some environments did last, and actor and critics learn from all that the replay has of their tasks, on a sample of
-it. The encoder goes down the critics' loss and the divergence from the prior. See docs/learners/pearl.md.
+An environment keeps its task and plays trials. In the first episode it acts on a latent variable drawn from the prior,
+in each later episode on one drawn from the posterior of the trial so far. In an update an encoder computes a posterior
+from the latest trials of some environments. Actor and critics learn on a sample of it, from all replayed transitions of
+these environments' tasks. The encoder minimises the critics' loss and the divergence from the prior. See
+docs/learners/pearl.md.
 """
 
 import math
@@ -34,7 +35,7 @@ from bidex_meta.world.contract import Info, TaskWorld
 
 @dataclass(frozen=True)
 class PEARLConfig(MTSACConfig):
-    """Everything that can be set about PEARL; the defaults are the preset ``laptop``."""
+    """All options of PEARL; the defaults are the preset ``laptop``."""
 
     latent: Count = 8  # Entries of the latent variable that stands for the task.
     encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
@@ -53,7 +54,7 @@ class PEARLConfig(MTSACConfig):
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 
-# v2: as of MT-PPO.
+# v2: MT-PPO's discount.
 PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.96)}
 
 
@@ -74,26 +75,27 @@ class PEARL(MTSAC):
         trained = [*self.critic.parameters(), *self.policy.encoder.parameters()]
         self.adams["critic"] = self._adam(trained, config.critic_learning_rate)
         self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(2))
-        # Of each environment's trial: the latent variable it acts on, episodes that are over, and the vector steps
-        # after which it began and each of its episodes ended, of the trial before it too: (2, N, episodes + 1).
+        # For each environment's trial: the latent variable that it acts on, the number of finished episodes, and the
+        # vector steps at which the trial began and each episode ended. ``bounds`` also holds the previous trial: (2, N,
+        # episodes + 1).
         self.latent = torch.randn(rows, config.latent, generator=self.generator, device=device)
         self.played = torch.zeros(rows, dtype=torch.int64, device=device)
         self.bounds = torch.zeros(2, rows, config.episodes_per_trial + 1, dtype=torch.int64, device=device)
-        # Environments of each class: how many, and the first. In ``by_task`` those of one task stand side by side: of
-        # each environment's task how many, and where.
+        # Number and first index of each class's environments. ``by_task`` orders environments by task; ``count`` and
+        # ``first`` are number and first position of the environments of each environment's task.
         self.of_class = torch.bincount(world.task_id, minlength=world.num_tasks)
         self.start = self.of_class.cumsum(0) - self.of_class
         task = _tasks(world)
         self.by_task, self.count = torch.argsort(task, stable=True), torch.bincount(task)[task]
         self.first = torch.searchsorted(task[self.by_task], task)
-        # An update chooses so many environments of each class; ``which`` of all these each of its draws is for.
+        # An update chooses this many environments of each class; ``which`` maps each draw to a chosen environment.
         self.chosen = math.ceil(config.tasks_per_update / world.num_tasks)
         within = torch.arange(self.batch_per_task, device=device) % self.chosen
         self.which = (torch.arange(world.num_tasks, device=device)[:, None] * self.chosen + within).flatten()
 
     @classmethod
     def _inputs(cls, config: PEARLConfig, shape: Shape) -> Inputs:
-        """With the latent variable behind the observation."""
+        """Append the latent variable to the observation."""
         return super()._inputs(config, shape).extended("latent", config.latent)
 
     @classmethod
@@ -136,14 +138,14 @@ class PEARL(MTSAC):
         return torch.randint(low, high, shape, generator=self.generator, device=self.device)
 
     def _below(self, counts: Tensor, *shape: int) -> Tensor:
-        """Uniform whole numbers (shape) below ``counts``, which broadcast; 0 below 0."""
-        # The remainder of a number this large favours none by more than 1 in 2^40 / count.
+        """Draw uniform integers (shape) below ``counts``, which broadcast; 0 where a count is 0."""
+        # The remainder of so large a number favours no entry by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
-        """Sum of the evidence of the first ``episodes`` (M,) of a trial (0: the last but one) of environments (M,).
+        """Sum the evidence of the first ``episodes`` (M,) of a trial (0: the previous one) of environments (M,).
 
-        By ``context`` of its transitions, whose mean stands for all: (M, 2 * latent).
+        The sum is estimated from ``context`` random transitions of these episodes: (M, 2 * latent).
         """
         begin, end = self.bounds[trial, rows, 0], self.bounds[trial, rows, episodes]
         ages = (self.replay.added - end)[:, None] + self._below((end - begin)[:, None], len(rows), self.config.context)
@@ -165,7 +167,7 @@ class PEARL(MTSAC):
         return [self._infer(chosen[i], stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
     def _infer(self, rows: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """An update by transitions (B) of the tasks of some environments (M,)."""
+        """Update all networks with transitions (B) of the tasks of some environments (M,)."""
         episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
         trial = (self.played[rows] >= episodes).long()
         mean, std = self.policy.posterior(self._shown(rows, trial, episodes))
@@ -190,12 +192,12 @@ class PEARL(MTSAC):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> LatentAgent:
-        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        """Return the agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return LatentAgent(super().load_policy(state, device))
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Numbers of the environments' tasks over all classes, (N,); a BidexError where some are played by none."""
+    """Return the environments' task numbers over all classes, (N,); a BidexError if no environment plays some task."""
     for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
         if rows.stop - rows.start < tasks:
             raise BidexError(

@@ -1,8 +1,9 @@
 """ProMP: proximal meta-policy search (Rothfuss et al. 2019) on a batch of tasks at once.
 
-As ``maml.py``, but inner steps follow ratio * advantage, whose second derivative gives the policy before adaptation
-credit for the data that adaptation needs (their section 4), and the outer step, ``outer_epochs`` times on a meta-batch,
-raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k).
+ProMP differs from ``maml.py`` in two steps. Inner steps follow ratio * advantage, whose second derivative gives the
+policy before adaptation credit for collecting useful data (section 4 of the paper). The outer step, taken
+``outer_epochs`` times per meta-batch, raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of
+KL(policy that sampled D_k || theta_k).
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive, check_risi
 
 @dataclass(frozen=True)
 class ProMPConfig(OuterConfig):
-    """Everything that can be set about ProMP; the defaults are the preset ``laptop``."""
+    """All options of ProMP; the defaults are the preset ``laptop``."""
 
     outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts anew.
     outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the start.
@@ -38,14 +39,14 @@ class ProMPConfig(OuterConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. "Desired kl" is read by the original and used
-    # nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
+    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. The original reads "Desired kl" but never uses
+    # it; here the outer step size follows it, starting at 3e-4, as in PPO's tables.
     "paper": ProMPConfig(
         **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,
     ),
-    # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
-    # lost a third of the return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps.
+    # Outer steps for training from scratch are too large for a trained policy. Five steps of 1e-3 gave a KL of 1.1 and
+    # lost a third of the return. With a KL of 0.05 one seed lost 0.5 of a return of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
     "v2": ProMPConfig(**V2, outer_learning_rate=1e-4, desired_kl=0.0125),

@@ -1,7 +1,8 @@
-"""RL²: learning to learn by a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
+"""RL²: meta-learning with a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
 
-An iteration plays one trial, a few episodes of one task with one memory, in every environment, makes ``epochs`` passes
-over it in mini-batches of chunks, and starts the next without memory. The first only measures statistics.
+An iteration plays one trial in every environment: a few episodes of one task with one memory. The learner makes
+``epochs`` passes over the trial in mini-batches of chunks, and the next trial starts with an empty memory. The first
+trial only measures statistics.
 """
 
 import math
@@ -29,7 +30,7 @@ from bidex_meta.world.contract import PooledWorld
 
 @dataclass(frozen=True)
 class RL2Config(PPOConfig, TrialConfig):
-    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+    """All options of RL²; the defaults are the preset ``laptop``."""
 
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
@@ -43,24 +44,26 @@ class RL2Config(PPOConfig, TrialConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + self.hidden[-1])
         return 4 * num_envs * width * self.trial_steps + network_bytes(self.hidden, width, 2) + memory
 
 
 PRESETS: dict[str, RL2Config] = {
-    # The appendix has no table for RL²: what ProMP's (48) has too is from there, but for its 8 steps a rollout; memory,
-    # ten episodes a trial and 250 steps of backpropagation are of RL² in Meta-World's baselines (metaworld-algorithms).
+    # The appendix has no table for RL². Values that ProMP's table (48) also has are from there, except its 8 steps per
+    # rollout. Memory, ten episodes per trial and 250 steps of backpropagation are from RL² in Meta-World's baselines
+    # (metaworld-algorithms).
     "paper": RL2Config(
         hidden=(2048, 1024, 512), memory=256, value_heads=False, init_std=1.0, episodes_per_trial=10, gamma=0.9,
         lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
         critic_learning_rate=None, entropy_weight=0.0, max_grad_norm=1.0, normalise_observations=False,
     ),
-    # Discount and KL are MT-PPO's. With 0.97, so that what an episode finds out is paid in the next, and a KL of 0.02
-    # the egg of ML1-wide was carried and not thrown after 5 M steps (docs/results/ml1.md).
+    # Discount and KL are MT-PPO's. We also tried a discount of 0.97, which rewards exploration through the next
+    # episode, with a KL of 0.02: after 5 M steps the policy carried the egg of ML1-wide and did not throw it
+    # (docs/results/ml1.md).
     "laptop": RL2Config(),
-    # Version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes, and a
-    # step is rewarded with at most 1.
+    # For version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes, and
+    # the reward of a step is at most 1.
     "v2": RL2Config(gamma=0.96, reward_unit=0.3),
 }  # fmt: skip
 
@@ -97,8 +100,8 @@ class RL2(TrialLearner):
         valid = self.trials.valid & filled
         seen = self.trials.obs[filled], self.trials.rewards[valid]
         if self.trials_played == 0:
-            # The first trial only measures. Statistics of the starts alone, where nothing moves, made the policy see
-            # so much noise that it would have to unlearn most of what it learned from it.
+            # The first trial only measures. Statistics of the initial states only, in which nothing moves, made the
+            # policy see so much noise that it would have to unlearn most of what it learned from this trial.
             self.policy.update_statistics(*seen)
             losses, explained = {}, self._prepare()[1]
         else:
@@ -115,7 +118,7 @@ class RL2(TrialLearner):
         cfg, policy = self.config, self.policy
         old_log_std = policy.log_std.detach().clone()
         (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
-        # The same number of parts in every process, whatever the number of its chunks.
+        # Every process makes the same number of parts, independent of the number of its chunks.
         weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # of each chunk (S,)
         batches = mini_batches(weights, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
         for first, index, count in batches:

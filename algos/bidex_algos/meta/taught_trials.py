@@ -1,7 +1,7 @@
-"""The data set of a student with a memory: trials, what teachers would have done in them, and what the tasks hide.
+"""The data set of a student with a memory: trials, the teachers' labels, and the hidden values of the tasks.
 
-A ring of trials of all environments on the device, in half precision: 1,024 of ML1-v2, with three episodes of 225
-steps, take 0.9 GB.
+The data set is a ring buffer of trials of all environments on the device, in half precision. 1,024 trials of ML1-v2,
+with three episodes of 225 steps, take 0.9 GB.
 """
 
 from typing import NamedTuple
@@ -15,26 +15,26 @@ from bidex_meta.training.learner import State
 
 
 class Steps(NamedTuple):
-    """Steps of trials, with what each of g goals would have paid for getting there."""
+    """Steps of trials, with the reward that each of g goals would have given for reaching them."""
 
     obs: Tensor
     """Raw observations (B, d)."""
     labels: Tensor
-    """What teachers would have done there (B, a)."""
+    """The teachers' actions in these states (B, a)."""
     goals: Tensor
-    """What the tasks hide, and other goals (B, g, k)."""
+    """The tasks' hidden values, and other goals (B, g, k)."""
     rewards: Tensor
     """For each goal (B, g)."""
     paid: Tensor
-    """Whether there was a reward: not where an episode begins, bool (B,)."""
+    """True if the step had a reward, False at the beginning of an episode, bool (B,)."""
 
 
 class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
     ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,) are filled while ``trials`` is
-    played; then ``keep`` takes all. Of ``g`` goals the first is the task's; for the others the same steps are rewarded
-    in hindsight.
+    played; then ``keep`` stores everything. The first of ``g`` goals is the task's own; the same steps are rewarded in
+    hindsight for the others.
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int, size: int):
@@ -46,7 +46,7 @@ class TaughtTrials:
         self.taught = torch.zeros(rows, dtype=torch.bool, device=device)
 
         def empty(*shape: int, dtype: torch.dtype = torch.float16) -> Tensor:
-            # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+            # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
             return torch.empty(kept, slots, rows, *shape, dtype=dtype, device=device)
 
         self._ring = {
@@ -59,13 +59,13 @@ class TaughtTrials:
 
     @property
     def filled(self) -> int:
-        """Trials of each environment that can be drawn from."""
+        """Return the number of trials of each environment that can be drawn from."""
         return min(self.added, self.kept)
 
     def keep(self) -> None:
-        """Takes the trials that were played."""
+        """Store the trials that were played."""
         t = self.trials
-        # One slot later, so that a reward stands beside what it led to; an episode's last one led nowhere.
+        # Rewards move one slot later, to the state that they led to; an episode's last reward led to no recorded state.
         rewards, paid = (torch.cat([torch.zeros_like(x[:1]), x[:-1]]) for x in (self.rewards, t.valid & ~t.ended))
         new = {"obs": t.obs, "rewards": rewards, "paid": paid, "labels": self.labels, "goals": self.goals}
         for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():
@@ -73,20 +73,20 @@ class TaughtTrials:
         self.added += 1
 
     def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
-        """A step of each of some trials (B,), numbers below ``filled``, of environments (B,).
+        """Return one step of each given trial (B,), a number below ``filled``, of environments (B,).
 
-        It stands at a share in [0, 1) of their lengths (B,).
+        The step is chosen by its share in [0, 1) of the trial's length (B,).
         """
         slot, ring = (share * self._ring["lengths"][trial, row]).long(), self._ring
         obs, labels, rewards, paid = (ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid"))
         return Steps(obs.float(), labels.float(), ring["goals"][trial, row], rewards, paid)
 
     def state_dict(self) -> State:
-        """A copy of all that is kept."""
+        """Return a copy of the stored data."""
         return {"added": self.added, **{name: ring[: self.filled].clone() for name, ring in self._ring.items()}}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave. Raises BidexError where its environments or trials differ."""
+        """Restore the result of :meth:`state_dict`; raises BidexError if its environments or trials differ."""
         here, there = self._ring["obs"].shape[1:], state["obs"].shape[1:]
         if here != there or len(state["obs"]) != min(state["added"], self.kept):
             raise BidexError(

@@ -1,4 +1,4 @@
-"""What the learners of a policy with a memory share: trials, tasks by turns, statistics of first and last episodes."""
+"""The base of learners with a memory: trials, tasks by turns, statistics of first and last episodes."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from bidex_meta.world.contract import PooledWorld
 
 
 def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str, float]:
-    """Metrics of the first and the last episodes of trials."""
+    """Return metrics of the first and the last episodes of trials."""
     metrics = {}
     for which, statistics in (("first", firsts), ("last", lasts)):
         found = statistics.metrics()
@@ -37,26 +37,26 @@ class TrialLearner(Learner):
     going_on = ("trials_played", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: Any, seed: int):
-        if config.max_adapt_steps is None:  # memories are made to last for a trial
+        if config.max_adapt_steps is None:  # the memory is sized for a whole trial
             config = replace(config, max_adapt_steps=int(world.max_episode_steps.max()))
         super().__init__(world, config, seed)
         self.agent = MemoryAgent(self.policy, own_seed(seed))
         self.trials_played = 0
         self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
-        """Most steps of an episode of each environment (N,)."""
+        """Maximum steps of an episode of each environment (N,)."""
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
-        # Classes with fewer rows than tasks: their pools and numbers of rows. Each trial takes as many tasks as that.
+        # Pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         each = zip(world.task_names, world.pools, rows, strict=True)
         self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
-        """Episodes of a trial begin together."""
+        """Return DISABLED, because the episodes of a trial begin together."""
         return "DISABLED"
 
     def _play(self, trials: Trials, player: Player) -> None:
-        """Plays the next trial in all environments into ``trials``."""
+        """Play the next trial in all environments and record it in ``trials``."""
         counts = [[self.episodes] for _ in range(trials.episodes)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
@@ -67,7 +67,7 @@ class TrialLearner(Learner):
     def _begin(self) -> Tensor:
         if self.pools:
             trial = self.trials_played * world_size() + rank()
-            # By turns: all tasks of a class come equally often.
+            # The pool rotates, so all tasks of a class are played equally often.
             turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}
             self.world.set_tasks(turned)
         return self._first_observations() if self.trials_played == 0 else self.world.reset()[0]
@@ -81,5 +81,5 @@ class TrialLearner(Learner):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MemoryAgent:
-        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
+        """Return the agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return MemoryAgent(super().load_policy(state, device))

@@ -1,6 +1,7 @@
 """Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-A row whose episode is over waits, its memory untouched. Waiting is not recorded: slot t holds the memory's t-th step.
+A row whose episode is over waits, and its memory does not change. Waiting is not recorded: slot t holds the memory's
+t-th step.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class TrialConfig(LearnerConfig):
-    """Networks and trials of RL²."""
+    """Options of the networks and trials of RL²."""
 
     hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
     activation: Activation = "elu"  # Non-linearity of the encoder.
@@ -43,12 +44,15 @@ class TrialConfig(LearnerConfig):
 
     @property
     def trial_steps(self) -> int:
-        """Most steps of a trial; of whole episodes a guess, until a learner knows its world."""
+        """Return the maximum steps of a trial; for whole episodes an estimate, until a learner knows its world."""
         return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
-    """Slots of a trial of at most ``steps``, with one for the last observation: a multiple of a chunk's, the second."""
+    """Return the slots and the chunk size of a trial of at most ``steps`` steps.
+
+    One slot is added for the last observation. The number of slots is a multiple of the chunk size.
+    """
     size = steps + 1 if chunk is None or chunk >= steps else chunk
     return (steps // size + 1) * size, size
 
@@ -56,7 +60,7 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 class Trials:
     """One trial of N environments, preallocated on the device and overwritten by each :func:`play`.
 
-    There are slots S for as many whole chunks as the longest trial needs; ``limits`` are most steps of an episode (N,).
+    The slots S are the whole chunks that the longest trial needs; ``limits`` are the maximum steps of an episode (N,).
     """
 
     def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, chunk: int | None):
@@ -68,72 +72,74 @@ class Trials:
             return torch.zeros(slots, rows, *shape, dtype=dtype, device=limits.device)
 
         self.longest = longest
-        # Raw observations before each step, and in the slot after the last what that led to; sampled actions, not
-        # clamped; rewards, 0 where physics broke (not valid); whether the policy was shown them; true ends; steps that
-        # the time limit would still have allowed; slots that each environment has filled (N,).
+        # Per slot: the raw observation before the step (the slot after the last step holds the resulting one), the
+        # sampled and unclamped action, the reward (0 if not valid, when physics broke), whether the policy was shown
+        # it, true ends, and the steps left until the time limit. ``lengths`` (N,) counts the slots that each
+        # environment has filled.
         self.obs, self.actions, self.rewards = zeros(observations), zeros(actions), zeros()
         self.shown, self.valid, self.ended, self.terminated = (zeros(dtype=torch.bool) for _ in range(4))
         self.left = zeros(dtype=torch.int64)
         self.lengths = torch.zeros_like(limits)
 
     def filled(self, slots: int | None = None) -> Tensor:
-        """Which of the first ``slots`` (default: all) slots hold a step, bool (slots, N)."""
+        """Return whether each of the first ``slots`` (default: all) slots holds a step, bool (slots, N)."""
         slot = torch.arange(slots or len(self.obs), device=self.lengths.device)
         return slot[:, None] < self.lengths
 
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the memory was fed beside the observation: last action (slots, N, a), last reward, whether shown, end.
+        """Return the memory's inputs besides the observation: last action (slots, N, a), last reward, shown, end.
 
-        The slot after the last step counts as of the same episode: its value is what the time limit cut off.
+        The slot after the last step counts as part of the same episode, because its value replaces the rewards that the
+        time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
         return action, reward, known, done & self.filled(slots)
 
     def discounts(self, slots: int, gamma: float) -> Tensor:
-        """Discount of what follows each of the first ``slots`` transitions, (slots, N): gamma within an episode.
+        """Return the discount of the state after each of the first ``slots`` transitions, (slots, N): gamma per step.
 
-        After a true end a row stands still, unrewarded, until its time limit: else to end an episode would be to begin
-        anew.
+        After a true end a row stands still without reward until its time limit. Otherwise ending an episode would be
+        rewarded with the early start of a new one.
         """
         left = self.left[:slots].masked_fill(~self.terminated[:slots], 0)
         return gamma ** (1.0 + left.float())
 
 
 class Player(Protocol):
-    """Who acts in a trial."""
+    """Chooses the actions in a trial."""
 
     def begin(self, shown: Tensor) -> None:
-        """All environments are at the start of an episode, in which the policy is ``shown`` (N,) rewards."""
+        """Begin an episode in all environments; ``shown`` (N,) tells in which ones the policy sees rewards."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (N, a), not clamped, for raw observations (N, d), and the memory's next state (N, memory).
+        """Return unclamped actions (N, a) for raw observations (N, d), and the memory's next state (N, memory).
 
-        ``slot`` (N,) is where the step is recorded; of rows that wait, the next step overwrites it.
+        ``slot`` (N,) is the slot that records the step; the next step overwrites the slot of a waiting row.
         """
         ...
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """The step's rewards (N,), 0 where it teaches nothing: where physics broke or a row waits, not ``valid``."""
+        """Record the step's rewards (N,), which are 0 for a row that is not ``valid``: broken physics, or waiting."""
 
 
 class Sampling:
-    """Plays by the policy's Gaussian."""
+    """Samples actions from the policy's Gaussian."""
 
     def __init__(self, policy: RecurrentPolicy, generator: torch.Generator):
         self._policy, self._generator = policy, generator
 
     def begin(self, shown: Tensor) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Not clamped: the world does that, and the density must be that of what was drawn."""
+        """Sample without clamping: the world clamps, and the density must be of the sampled action."""
         mean, state = self._policy.step(obs, memory)
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
         return mean + self._policy.log_std.exp() * noise, state
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 @torch.no_grad()
@@ -141,10 +147,10 @@ def play(
     world: VectorWorld, policy: RecurrentPolicy, player: Player, trials: Trials, obs: Tensor, blind_share: float,
     generator: torch.Generator, statistics: list[list[EpisodeStatistics]]
 ) -> None:  # fmt: skip
-    """Fills ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
+    """Fill ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
 
-    In a ``blind_share`` of the episodes the policy is not shown rewards; ``statistics`` count, for each episode of a
-    trial.
+    In a ``blind_share`` of the episodes the policy is not shown rewards. ``statistics`` are the counters to update for
+    each episode of a trial.
     """
     rows, device = torch.arange(world.num_envs, device=world.device), world.device
     memory = policy.fresh_memory(world.num_envs)
@@ -166,7 +172,7 @@ def play(
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
-            # A waiting row writes into its next slot, and so leaves there the observation that its last step led to.
+            # A waiting row writes into its next slot, which therefore holds the observation after its last step.
             at = trials.lengths
             trials.obs[at, rows], trials.actions[at, rows], trials.rewards[at, rows] = obs, action, reward
             trials.shown[at, rows], trials.valid[at, rows], trials.ended[at, rows] = shown, valid, ended
@@ -187,11 +193,11 @@ def play(
 
 @dataclass
 class Batch:
-    """A trial made ready for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
+    """A trial prepared for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
-    # What the memory is fed beside the observation; see Trials.previous.
+    # Inputs of the memory besides the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
     old_means: Tensor  # means of the sampling policy (T, N, a)
     old_log_probs: Tensor  # log-density of the actions under it (T, N)
@@ -205,17 +211,17 @@ class Batch:
 
     @property
     def size(self) -> int:
-        """Steps of a chunk, C."""
+        """Return the steps of a chunk, C."""
         return len(self.weights) // len(self.actor_states)
 
     def take(self, x: Tensor, chosen: Tensor) -> Tensor:
-        """The chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
+        """Return the chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
         chunks = x.unflatten(0, (-1, self.size)).transpose(1, 2)
         return chunks[self.chunk[chosen], self.row[chosen]].transpose(0, 1)
 
 
 def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
-    """A critic's outputs (T, B, heads) as one value (T, B): the only one, or that of each environment's task (B,)."""
+    """Select one value (T, B) of a critic's outputs (T, B, heads): the only one, or the one of each task (B,)."""
     if outputs.shape[-1] == 1:
         return outputs.squeeze(-1)
     return outputs.gather(2, task_id.expand(len(outputs), -1)[..., None]).squeeze(-1)
@@ -226,12 +232,12 @@ def make_batch(
     t: Trials, policy: RecurrentPolicy, critic: RecurrentNet, return_stats: RunningStats, task_id: Tensor,
     config: TrialConfig
 ) -> tuple[Batch, Tensor]:  # fmt: skip
-    """Passes a trial through the networks, chunk by chunk from empty memories, and estimates advantages.
+    """Pass a trial through the networks, chunk by chunk from empty memories, and estimate advantages.
 
-    Also the explained variance per task (num_tasks,); ``return_stats`` takes in the trial's returns.
+    Also returns the explained variance per task (num_tasks,). ``return_stats`` is updated with the trial's returns.
     """
     num_tasks = len(return_stats.mean)
-    # The only wait for the device: how many steps the longest trial has.
+    # The only host sync: the number of steps of the longest trial.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
     means, values, actor_states, critic_states = [], [], [], []
@@ -250,9 +256,9 @@ def make_batch(
     filled = t.filled(slots)
     last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1
     valid = t.valid[:slots] & filled
-    # What follows the trial's last slot is never asked for.
+    # The value after the trial's last slot is never used.
     next_values = torch.cat([values[1:], values[-1:]])
-    # The end of an episode is none of the trial: the next one follows, and the memory with it.
+    # The end of an episode does not end the trial: the next episode follows with the same memory.
     advantages = gae(
         t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
         gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid

@@ -1,7 +1,8 @@
-"""VariBAD: RL² whose memory is a belief of the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
+"""VariBAD: RL² whose memory is a belief about the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
 
-An encoder turns what a trial has shown so far into a Gaussian over a latent. From a sample of it a decoder predicts the
-rewards of the whole trial: that trains both. The policy reads the belief; PPO trains the policy and not the encoder.
+An encoder turns the trial so far into a Gaussian over a latent variable. From a sample of the latent a decoder predicts
+the rewards of the whole trial; this prediction trains encoder and decoder. The policy reads the belief; PPO trains the
+policy but not the encoder.
 """
 
 from dataclasses import dataclass
@@ -23,13 +24,13 @@ from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
-# Times of a trial whose beliefs a mini-batch decodes, and steps whose rewards are predicted from each.
+# Number of times of a trial whose beliefs a mini-batch decodes, and of steps whose rewards each belief predicts.
 _TIMES, _STEPS = 16, 64
 
 
 @dataclass(frozen=True)
 class VariBADConfig(RL2Config):
-    """Everything that can be set about VariBAD; the defaults are the preset ``laptop``."""
+    """All options of VariBAD; the defaults are the preset ``laptop``."""
 
     latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
     kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
@@ -45,18 +46,18 @@ class VariBADConfig(RL2Config):
             )
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-# v2: as of RL².
+# v2: RL²'s discount.
 PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig(), "v2": VariBADConfig(gamma=0.96)}
 
 
 class BeliefActor(RecurrentNet):
-    """An actor that reads what is seen and the belief in the memory, and a decoder of rewards.
+    """An actor that reads the observation and the belief in the memory, and a decoder of rewards.
 
-    Of an input (..., inputs) the decoder sees the observation, its first ``seen`` entries.
+    The decoder sees the observation only: the first ``seen`` entries of an input (..., inputs).
     """
 
     def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
@@ -69,24 +70,27 @@ class BeliefActor(RecurrentNet):
         self.paid = MLP(hidden[-1], (hidden[-1],), 1, 0.01, generator, activation)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """As in the base; the memory gets no gradient."""
+        """Compute outputs as in the base class; the memory gets no gradient."""
         with torch.no_grad():
             mean, log_std, state = self.believe(x, state)
         return self.actor(torch.cat([x, mean, log_std], dim=-1)), state
 
     def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Means and log-deviations (T, B, latent) of the beliefs at steps (T, B, inputs), and the memory after them."""
+        """Return means and log standard deviations (T, B, latent) of the beliefs at steps (T, B, inputs).
+
+        The third result is the memory after these steps.
+        """
         belief, state = super().forward(x, state)
         mean, log_std = belief.chunk(2, dim=-1)
         return mean, log_std.clamp(-6.0, 2.0), state
 
     def pays(self, x: Tensor, latent: Tensor) -> Tensor:
-        """Normalised rewards (K, M, B) that led to inputs (M, B, inputs), by samples of the latent (K, B, latent)."""
+        """Decode normalised rewards (K, M, B) for reaching inputs (M, B, inputs) from latent samples (K, B, latent)."""
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
     def model(self) -> list[nn.Parameter]:
-        """Weights of encoder and decoder, which PPO leaves alone."""
+        """Return the weights of encoder and decoder, which PPO does not train."""
         return [weight for name, weight in self.named_parameters() if not name.startswith("actor.")]
 
 
@@ -108,7 +112,7 @@ class VariBAD(RL2):
         return BeliefActor(inputs, inputs.width - actions - 3, config, actions, init)
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
-        """PPO's update, with the beliefs that the trial was played by, then theirs."""
+        """Run PPO's update with the beliefs of the played trial, then update encoder and decoder."""
         losses, cfg = super()._update(b), self.config
         ones = torch.ones_like(b.row, dtype=torch.float32)
         batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
@@ -116,7 +120,7 @@ class VariBAD(RL2):
         return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """One step of encoder and decoder; what :meth:`_bound` returns, of all processes (2,)."""
+        """Take one step of encoder and decoder; return the result of :meth:`_bound` over all processes (2,)."""
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
@@ -126,9 +130,11 @@ class VariBAD(RL2):
         return found
 
     def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean squared error of decoded rewards and mean KL of each belief from the one before: this process's share.
+        """Return this process's share of the reward error and the KL.
 
-        Of the trials ``chosen``, int64 (B,): beliefs at random times predict rewards of random steps, past and future.
+        The reward error is the mean squared error of decoded rewards. The KL is the mean KL of each belief from the
+        previous one. In the trials ``chosen``, int64 (B,), beliefs at random times predict rewards of random steps,
+        past and future.
         """
         policy, net = self.policy, self.net
         previous = [b.take(each, chosen) for each in b.previous]
@@ -136,7 +142,8 @@ class VariBAD(RL2):
         mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
         before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
         divergence = valid * gaussian_kl(mean, log_std, *before)
-        # A slot shows the reward of the step before it, but where that ended an episode not what it led to.
+        # A slot shows the reward of the previous step, but after the end of an episode not the state that the step led
+        # to.
         paid = torch.cat([torch.zeros_like(valid[:1]), valid[:-1]]).masked_fill(previous[3], 0.0)
         time, step = (torch.randperm(len(x), generator=self.generator, device=x.device)[:k] for k in (_TIMES, _STEPS))
         noise = torch.randn(mean[time].shape, generator=self.generator, device=x.device)

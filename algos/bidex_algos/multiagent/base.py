@@ -1,6 +1,6 @@
-"""What the on-policy learners of several agents share: the agents' policy, a critic of all, its loss.
+"""The base of on-policy learners of several agents: the agents' policy, a common critic, and the critic's loss.
 
-To the base below it the agents are one policy, whose action is put together of theirs; an update takes it apart again.
+For the base class, the agents form one policy whose action joins their actions; an update splits it again.
 """
 
 import math
@@ -29,11 +29,11 @@ from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
 
 Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
-"""A partition of the hands' units, on the command line by a short name too."""
+"""A partition of the hands' units, with a short alias on the command line."""
 
 
 def keep_partition(config: ArchitectureConfig) -> None:
-    """Puts a file's partition in the place of its path, for checkpoints; a BidexError where it is none."""
+    """Replace the path of a partition file by its content, for checkpoints; a BidexError if it is no partition."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
     object.__setattr__(config, "agents", partition_line(vars(config)["agents"]))
@@ -41,7 +41,7 @@ def keep_partition(config: ArchitectureConfig) -> None:
 
 @dataclass(frozen=True)
 class MultiAgentConfig(OnPolicyConfig):
-    """Agents and the critic's loss."""
+    """Options of agents and of the critic's loss."""
 
     agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
@@ -65,7 +65,7 @@ class MultiAgentConfig(OnPolicyConfig):
 
 @dataclass(frozen=True)
 class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
-    """What IPPO, MAPPO and HAPPO share; the defaults are the preset ``laptop``."""
+    """Options shared by IPPO, MAPPO and HAPPO; the defaults are the preset ``laptop``."""
 
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
     value_loss_weight: Finite = 1.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
@@ -77,7 +77,7 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
 
 @dataclass(frozen=True)
 class InTurnConfig(LearnerConfig):
-    """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
+    """Options shared by HAPPO and HATRPO. A config that inherits others too lists these fields after the others'."""
 
     max_factor: NonNegative = 4.0
     """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""
@@ -94,20 +94,20 @@ PAPER: Options = {
     "hidden": (1024, 1024, 512), "popart": True, "rollout_steps": 8, "gamma": 0.96, "lam": 0.95,
     "normalise_observations": False, "huber_delta": 10.0, "value_clip": 0.2,
 }  # fmt: skip
-"""What Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix agree on, in their columns for other tasks than
-LiftUnderarm; B.2.1 and B.2.4 have the clipped value."""
+"""Values shared by Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix, in their columns for tasks other than
+LiftUnderarm; B.2.1 and B.2.4 describe the clipped value."""
 
 PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
-"""The same with the two tables' passes and clip."""
+"""PAPER with the passes and the clip of both tables."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # both tables' column for LiftUnderarm, where it differs
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # the values of both tables' column for LiftUnderarm that differ
 
 
 @torch.no_grad()
 def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> None:
-    """Moves the output layers of critics so that std V + mean stays: PopArt (van Hasselt 2016, Hessel et al. 2019).
+    """Move the critics' output layers so that std V + mean stays: PopArt (van Hasselt 2016, Hessel et al. 2019).
 
     Each critic has an output for each task. ``before`` and ``after`` are mean and standard deviation of the returns
     that define the critics' units, each (critics * tasks,).
@@ -121,7 +121,7 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
 
 @dataclass
 class AgentBatch:
-    """Samples (B,) of one agent with a_i actions. Cut out of the batch once, so that mini-batches take rows alone."""
+    """Samples (B,) of one agent with a_i actions, cut out of the batch once, so that mini-batches only select rows."""
 
     seen: Tensor  # what its network is fed (B, d_i)
     task: Tensor  # the tasks' one-hot (B, heads); without columns where the agent has one head
@@ -133,7 +133,7 @@ class AgentBatch:
     weights: Tensor  # as in the batch (B,)
 
     def select(self, index: Tensor) -> "AgentBatch":
-        """The samples at ``index``."""
+        """Return the samples at ``index``."""
         return AgentBatch(**{name: torch.index_select(value, 0, index) for name, value in vars(self).items()})
 
 
@@ -144,7 +144,7 @@ class TeamPolicy(GaussianPolicy):
 
 
 class MultiAgent(OnPolicy):
-    """Agents (``views``) that share a reward, each with a policy on what it sees and its part of the KL."""
+    """Agents (``views``) that share a reward; each has its own observations, policy and part of the KL."""
 
     config: MultiAgentConfig
     policy: TeamPolicy
@@ -167,7 +167,7 @@ class MultiAgent(OnPolicy):
         return TeamPolicy.made_of(actor, config, inputs, shape, device).to(device)
 
     def _critics(self) -> list[MLP]:
-        """The networks of the critic: one for all, or one an agent."""
+        """Return the networks of the critic: one for all agents, or one per agent."""
         return [self.critic]  # type: ignore[list-item]
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
@@ -176,7 +176,7 @@ class MultiAgent(OnPolicy):
         super()._merge_returns(mean, var, count)
         if self.config.popart:
             after = stats.mean, stats.std()
-            # Before the first returns of a task its values are none.
+            # A task has no values before its first returns.
             old_mean, old_std = (torch.where(known, *pair) for pair in zip(before, after, strict=True))
             keep_values(self._critics(), (old_mean, old_std), after)
 
@@ -187,7 +187,10 @@ class MultiAgent(OnPolicy):
             return self._critic(batch.obs, batch.task_id)
 
     def _value_loss(self, b: Batch, old_values: Tensor, weights: Tensor) -> Tensor:
-        """A scalar, twice Huber's loss; with ``value_clip`` at least that of the value moved as far as that."""
+        """Return twice Huber's loss, a scalar.
+
+        With ``value_clip`` the loss is at least the loss of the value clipped to that distance from the old value.
+        """
         delta, reach = self.config.huber_delta, self.config.value_clip
         values = self._critic(b.obs, b.task_id)
 
@@ -221,7 +224,7 @@ class MultiAgent(OnPolicy):
 
 
 class OwnAdams(MultiAgent):
-    """Agents whose networks have an optimiser each, whose step size follows their share of the KL."""
+    """Agents whose networks each have an optimiser, whose step size follows the agent's share of the KL."""
 
     config: MultiAgentPPOConfig
 
@@ -235,11 +238,11 @@ class OwnAdams(MultiAgent):
 
 
 class Sequential(MultiAgent):
-    """Agents that are updated one after another, in a random order (Kuba et al. 2022), alike in all processes.
+    """Agents that are updated one after another, in a random order that is equal in all processes (Kuba et al. 2022).
 
-    Each sees the advantage times the ratios, new over old, of all before it. All learn from the same samples, so that
-    the same few can earn from every one: with twelve agents products grew to 20,000 within an update. ``max_factor``
-    bounds them.
+    Each agent sees the advantage times the ratios, new over old, of all agents before it. All agents learn from the
+    same samples, so every agent can raise the ratios of the same few samples: with twelve agents the products grew to
+    20,000 within an update. ``max_factor`` bounds the products.
     """
 
     config: Any
@@ -249,7 +252,10 @@ class Sequential(MultiAgent):
         self.order = torch.Generator().manual_seed(seed)
 
     def _in_turn(self, batch: Batch) -> Iterator[tuple[int, AgentBatch]]:
-        """(agent, share) in turn; ``gain``: the advantage times the ratios of those before, at most ``max_factor``."""
+        """Yield (agent, share) in turn, with the advantage scaled by the previous agents' ratios as ``gain``.
+
+        The product of the ratios is at most ``max_factor``.
+        """
         actor, task = self.policy.actor, self.policy.actor.one_hot(batch.obs)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
         columns = [actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)]

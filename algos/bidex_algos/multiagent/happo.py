@@ -1,7 +1,7 @@
 """HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
 
-Each agent, in an order drawn anew in each iteration, climbs PPO's clipped surrogate with the advantage times the ratios
-of the agents before it, so that its step is to the gain of all; then the critic of all learns.
+The order of agents is random in each iteration. Each agent climbs PPO's clipped surrogate with the advantage times the
+ratios of the agents before it, so that its step improves the joint policy. Afterwards the common critic learns.
 """
 
 from dataclasses import dataclass, replace
@@ -25,11 +25,11 @@ from bidex_meta.training.distributed import sum_gradients
 
 @dataclass(frozen=True)
 class HAPPOConfig(InTurnConfig, MultiAgentPPOConfig):
-    """Everything that can be set about HAPPO; the defaults are the preset ``laptop``."""
+    """All options of HAPPO; the defaults are the preset ``laptop``."""
 
 
 PRESETS: dict[str, HAPPOConfig] = {
-    # Table 44; its replay, Polyak factor and reward scale are of no use to an on-policy learner.
+    # Table 44; an on-policy learner has no use for its replay, Polyak factor and reward scale.
     "paper": HAPPOConfig(
         **PAPER_PPO, learning_rate=1e-4, critic_learning_rate=1e-4, max_grad_norm=1.0, init_std=1.0,
         max_factor=0.0,

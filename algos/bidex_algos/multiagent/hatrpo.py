@@ -1,6 +1,7 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-As HAPPO, with MT-TRPO's step on each agent's own parameters, within its share of the trust region.
+The learner works like HAPPO, but takes MT-TRPO's step on each agent's own parameters, within the agent's share of the
+trust region.
 """
 
 from dataclasses import dataclass, replace
@@ -17,14 +18,14 @@ from bidex_meta.utils.validation import Positive
 
 @dataclass(frozen=True)
 class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
-    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
+    """All options of HATRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.05
     """Mean KL of the new joint policy from the sampling one that no update exceeds; each agent has an even share."""
 
 
 PRESETS: dict[str, HATRPOConfig] = {
-    # There is no table for HATRPO: HAPPO's (44), with the trust region of our TRPO's preset of this name.
+    # There is no table for HATRPO. The values are HAPPO's (44), with the trust region of TRPO's preset of this name.
     "paper": HATRPOConfig(
         **PAPER, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
         accept_ratio=0.1, critic_learning_rate=1e-4, critic_epochs=5, num_minibatches=1, max_grad_norm=1.0,

@@ -1,6 +1,6 @@
-"""IPPO: PPO of several agents, each with a critic that sees no more than it does (de Witt et al. 2020; appendix B.2.1).
+"""IPPO: PPO of several agents, each with a critic of its own observations (de Witt et al. 2020; appendix B.2.1).
 
-MAPPO but for the critics: each agent has its own values, returns and advantages, normalised per task.
+IPPO differs from MAPPO only in the critics: each agent has its own values, returns and advantages, normalised per task.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class IPPOConfig(MAPPOConfig):
-    """Everything that can be set about IPPO; the defaults are the preset ``laptop``."""
+    """All options of IPPO; the defaults are the preset ``laptop``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -29,7 +29,7 @@ class IPPOConfig(MAPPOConfig):
 
 
 PRESETS: dict[str, IPPOConfig] = {
-    # There is no table for IPPO: MAPPO's. B.2.1 has a policy and a critic for each agent.
+    # There is no table for IPPO. The values are MAPPO's; B.2.1 has a policy and a critic for each agent.
     "paper": IPPOConfig(**vars(replace(MAPPO_PRESETS["paper"], share_parameters=False))),
     "laptop": IPPOConfig(),
 }
@@ -56,7 +56,7 @@ class IPPO(MAPPO):
         return [*self.critic.nets]  # type: ignore[list-item]
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
-        """Values (B, agents); of one agent alone (B,)."""
+        """Return values (B, agents); with a single agent (B,)."""
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
         out = of_head(out, task_id) if self.config.value_heads else out.squeeze(1)

@@ -1,7 +1,8 @@
 """MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
 
-Each agent i climbs Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; all else is DDPG's. The
-original has a critic for each agent, since rewards may differ; here they are shared, so that all would be alike.
+Each agent i climbs Q(x, a_1, ..., mu_i(o_i), ..., a_n) with the other agents' actions from the replay; the rest is
+DDPG. The original has a critic for each agent because rewards may differ. Here the agents share rewards, so all critics
+would be equal and there is only one.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class MADDPGConfig(DDPGConfig):
-    """Everything that can be set about MADDPG; the defaults are the preset ``laptop``."""
+    """All options of MADDPG; the defaults are the preset ``laptop``."""
 
     agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
@@ -33,12 +34,12 @@ class MADDPGConfig(DDPGConfig):
         keep_partition(self)
 
 
-# There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
+# There is no table for MADDPG (B.2.5 describes it). The values are DDPG's preset of this name.
 PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop": MADDPGConfig()}
 
 
 class DeterministicTeam(Team):
-    """All agents as one actor without a distribution, in the place of a ``DeterministicActor``."""
+    """All agents as one actor without a distribution; replaces a ``DeterministicActor``."""
 
     def __init__(
         self, views: tuple[AgentView, ...], config: MADDPGConfig, groups: Inputs, generator: torch.Generator, heads: int
@@ -50,11 +51,11 @@ class DeterministicTeam(Team):
         self.register_buffer("_order", order, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Joint actions of normalised observations (B, d): float32 (B, a) in [-1, 1]."""
+        """Return joint actions for normalised observations (B, d): float32 (B, a) in [-1, 1]."""
         return torch.tanh(self.raw(x))
 
     def raw(self, x: Tensor) -> Tensor:
-        """The same before the squashing: float32 (B, a)."""
+        """Return the joint actions before squashing: float32 (B, a)."""
         outputs = self.outputs(x)
         if self.heads > 1:
             head = self.one_hot(x).argmax(1)
@@ -84,7 +85,7 @@ class MADDPG(DDPG):
             value = self._climbed(
                 self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
             )
-            # Of all actions, not of its own: the price of an action shall not depend on the partition.
+            # The price is relative to all actions, not the agent's own, so that it does not depend on the partition.
             price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())
         loss = torch.stack(losses).sum()

@@ -1,7 +1,7 @@
 """MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
 
-As MT-PPO, and with one agent the same: in each mini-batch every agent climbs its own clipped surrogate. The advantage
-is of all agents together, normalised per task like the returns.
+MAPPO with one agent equals MT-PPO. In each mini-batch every agent climbs its own clipped surrogate. All agents share
+one advantage, normalised per task like the returns.
 """
 
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ from bidex_meta.training.distributed import sum_gradients
 
 @dataclass(frozen=True)
 class MAPPOConfig(MultiAgentPPOConfig):
-    """Everything that can be set about MAPPO; the defaults are the preset ``laptop``."""
+    """All options of MAPPO; the defaults are the preset ``laptop``."""
 
     share_parameters: bool = False
     """Share one network between agents with equal observation groups and action sizes; it sees who acts."""
 
 
 PRESETS: dict[str, MAPPOConfig] = {
-    # Table 45. Its deviation is 0.5 sigmoid(s), s = 1 at first (std y and x coef); B.2.4 has one policy for all agents.
+    # Table 45. Its std is 0.5 sigmoid(s), initially s = 1 (std y and x coef); B.2.4 has one policy for all agents.
     "paper": MAPPOConfig(
         **PAPER_PPO, learning_rate=5e-4, critic_learning_rate=5e-4, max_grad_norm=10.0, adam_eps=5e-4,
         init_std=0.3655, std_range=(0.01, 0.5), share_parameters=True,
@@ -68,7 +68,7 @@ class MAPPO(OwnAdams):
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)
         value = self._value_loss(b, old_values, weights)
-        # Of agents that share a network the mean (B.2.4), else each its own loss.
+        # Agents that share a network get the mean of their losses (B.2.4), other agents their own loss.
         share = [1.0 / actor.net_of.count(net) for net in actor.net_of]
         surrogate = torch.stack([part * loss.surrogate for part, loss in zip(share, losses, strict=True)]).sum()
         entropy = torch.stack([part * loss.entropy for part, loss in zip(share, losses, strict=True)]).sum()

@@ -1,4 +1,4 @@
-"""A network for each agent on what it sees; agents of one form are computed in one pass."""
+"""One network per agent on its own observations; agents of one form are computed in one pass."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` an agent; with ``share`` one for each form (columns of groups, actions); it sees who acts.
+    """One :class:`MLP` per agent; with ``share`` one per form (columns of groups, actions) that sees which agent acts.
 
     Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
     """
@@ -44,11 +44,11 @@ class Team(nn.Module):
         self.nets = nn.ModuleList(made)
 
     def output(self, agent: int, x: Tensor) -> Tensor:
-        """What one agent's network says of normalised observations (B, d): float32 (B, its outputs)."""
+        """Return one agent's network output for normalised observations (B, d): float32 (B, its outputs)."""
         return self.nets[self.net_of[agent]](self.seen(agent, x))
 
     def outputs(self, x: Tensor) -> list[Tensor]:
-        """What every agent's network says of normalised observations (B, d)."""
+        """Return every agent's network output for normalised observations (B, d)."""
         found: dict[int, Tensor] = {}
         for family in self.families:
             if len(family) == 1:
@@ -69,7 +69,7 @@ class Team(nn.Module):
         return stacked_forward(nets[0], stacked, "", x)
 
     def seen(self, agent: int, x: Tensor) -> Tensor:
-        """What one agent's network is fed of normalised observations (..., d)."""
+        """Select one agent's network input from normalised observations (..., d)."""
         seen = self.columns[agent](x)
         family = next(family for family in self.families if agent in family)
         if not self.share or len(family) == 1:
@@ -80,9 +80,10 @@ class Team(nn.Module):
 
 
 class TeamActor(Team):
-    """Diagonal Gaussians of all agents, together one of the world's action: in the place of a ``GaussianActor``.
+    """Diagonal Gaussians of all agents, which together form one Gaussian of the world's action.
 
-    ``log_stds`` are of each network, (a_i,), or (heads, a_i), which the group ``task_id`` chooses.
+    The class replaces a ``GaussianActor``. Each network has ``log_stds`` of shape (a_i,), or (heads, a_i) from which
+    the group ``task_id`` selects a row.
     """
 
     def __init__(
@@ -104,52 +105,55 @@ class TeamActor(Team):
 
     @property
     def own(self) -> list[Tensor]:
-        """The world's actions that are each agent's."""
+        """Return each agent's indices of the world's actions."""
         return list(self._taken.split(self._sizes))
 
     @property
     def log_std(self) -> Tensor:
-        """Logarithms of the standard deviations in the order of the world's actions, (a,) or (heads, a)."""
+        """Return log standard deviations in the order of the world's actions, (a,) or (heads, a)."""
         return torch.cat([self.log_stds[k] for k in self.net_of], dim=-1).index_select(-1, self._order)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mean joint action of normalised observations (B, d), float32 (B, a), not clamped."""
+        """Return the mean joint action for normalised observations (B, d), float32 (B, a), not clamped."""
         return torch.cat(self.means(x), dim=-1).index_select(-1, self._order)
 
     def means(self, x: Tensor) -> list[Tensor]:
-        """The mean action (B, a_i) of each agent."""
+        """Return the mean action (B, a_i) of each agent."""
         task = self.one_hot(x)
         return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """One agent's mean (B, a_i), and its log deviation (a_i,) or (B, a_i), of what it sees and the one-hot."""
+        """Return one agent's mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i).
+
+        ``seen`` is the agent's input, ``task`` the one-hot.
+        """
         return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:
-        """The second of :meth:`distribution_of`."""
+        """Return one agent's log standard deviation, the second result of :meth:`distribution_of`."""
         return row_of(task, self.log_stds[self.net_of[agent]])
 
     def parts(self, joint: Tensor) -> tuple[Tensor, ...]:
-        """Each agent's entries (..., a_i) of what the world's actions have (..., a)."""
+        """Split a tensor over the world's actions (..., a) into each agent's entries (..., a_i)."""
         return joint.index_select(-1, self._taken).split(self._sizes, dim=-1)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """The joint ``log_std`` that holds for observations (B, d): (a,) with one head, else (B, a)."""
+        """Return the rows of ``log_std`` (default: own) for observations (B, d): (a,) with one head, else (B, a)."""
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:
-        """The parameters of a network and its standard deviations."""
+        """Return the parameters of a network and its standard deviations."""
         return [*self.nets[net].parameters(), self.log_stds[net]]
 
     @torch.no_grad()
     def clamp_std(self, low: float, high: float) -> None:
-        """Keeps all standard deviations within bounds."""
+        """Clamp all standard deviations to bounds."""
         for log_std in self.log_stds:
             log_std.clamp_(math.log(low), math.log(high))
 
 
 class TeamCritic(Team):
-    """A critic for each agent, on what it sees, with ``heads`` outputs; other arguments as for :class:`Team`."""
+    """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
         self, views: Sequence[AgentView], config: NetworkConfig, heads: int, generator: torch.Generator,
@@ -158,5 +162,5 @@ class TeamCritic(Team):
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Values of normalised observations (B, d): float32 (B, heads, agents)."""
+        """Return values for normalised observations (B, d): float32 (B, heads, agents)."""
         return torch.stack(self.outputs(x), dim=-1)

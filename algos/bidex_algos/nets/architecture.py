@@ -1,4 +1,4 @@
-"""Which network stands between observation and output, and the critics of actions that are made of it."""
+"""The choice of the network between observation and output, and the critics of actions that are built from it."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -36,13 +36,13 @@ class ArchitectureConfig(LearnerConfig):
 
     @property
     def shares_a_trunk(self) -> bool:
-        """Whether the trunk is the plain one."""
+        """Return whether the trunk is the plain one."""
         return self.architecture in ("shared", "multi_head")
 
 
 @dataclass(frozen=True)
 class NetworkConfig(ArchitectureConfig):
-    """Networks of actor and critics; raises BidexError where the layers do not fit the architecture."""
+    """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
     task_embedding: Whole = 0
@@ -83,22 +83,22 @@ class NetworkConfig(ArchitectureConfig):
 
 
 def network_of(config: ArchitectureConfig) -> MakeNetwork:
-    """The constructor of a config's networks."""
+    """Return the constructor of a config's networks."""
     trunk = _TRUNKS.get(config.architecture)
     return MLP if trunk is None else partial(trunk, modules=config.modules)
 
 
 def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
-    """Bytes of a network's layers on observations of a width, with gradient and Adam's two moments, so many times."""
+    """Return the bytes of ``copies`` networks on observations of a ``width``, with gradient and Adam's two moments."""
     widths = (width, *hidden)
     return 4 * 4 * copies * sum(a * b for a, b in zip(widths, hidden, strict=False))
 
 
 class Critics(nn.Module):
-    """``count`` networks of observation and action, alike but for their initial weights.
+    """``count`` networks of observation and action that differ only in their initial weights.
 
-    ``inputs`` are the groups of both together, ``heads`` the outputs of each, one per task or 1. Two against
-    overestimation (Fujimoto et al. 2018), or one.
+    ``inputs`` are the groups of observation and action together; ``heads`` is the number of outputs of each network,
+    one per task or 1. Two networks reduce overestimation (Fujimoto et al. 2018).
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Critics(nn.Module):
         self.nets = nn.ModuleList(network(*given) for _ in range(count))
 
     def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Values of each action: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
+        """Return values of actions: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
         x = torch.cat([obs, actions], dim=1)
         all_values = torch.stack([net(x) for net in self.nets])
         if self.heads == 1:
@@ -121,6 +121,6 @@ class Critics(nn.Module):
 
 @torch.no_grad()
 def follow(target: nn.Module, network: nn.Module, tau: float) -> None:
-    """Moves a target network a share ``tau`` of the way to its network (Polyak averaging)."""
+    """Move a target network a share ``tau`` of the way to its network (Polyak averaging)."""
     for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
         behind.lerp_(ahead, tau)

@@ -1,8 +1,8 @@
-"""What rewards tell of a goal: a model of what any goal would have paid, candidates, and a policy that acts on them.
+"""Inference of a goal from rewards: a reward model for any goal, candidate goals, and a policy on their belief.
 
-The model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348) for a goal in numbers that are known
-in training. With it belief is Bayes' rule: the memory holds the log-likelihood of each of some fixed candidates, to
-which every rewarded step adds its own.
+The model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348) for a goal whose numbers are known in
+training. The belief follows from Bayes' rule: the memory holds the log-likelihood of each fixed candidate, and every
+rewarded step adds its own log-likelihood.
 """
 
 import math
@@ -19,12 +19,12 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_meta.utils import maths
 
-_WHICH = 64  # width of the hidden layer of the network that tells classes apart
-_TAIL = 4.0  # degrees of freedom of the Student distribution that errors of the model are taken to have
+_WHICH = 64  # width of the hidden layer of the network that classifies observations
+_TAIL = 4.0  # degrees of freedom of the Student distribution assumed for the model's errors
 
 
 def spread(count: int, size: int) -> Tensor:
-    """Points (count, size) spread evenly over [-1, 1]: an additive recurrence (R_d of Roberts 2018)."""
+    """Return points (count, size) spread evenly over [-1, 1]: an additive recurrence (R_d of Roberts 2018)."""
     root = 1.5
     for _ in range(50):  # x^(size + 1) = x + 1
         root = (1.0 + root) ** (1.0 / (size + 1.0))
@@ -33,10 +33,10 @@ def spread(count: int, size: int) -> Tensor:
 
 
 class BeliefNet(nn.Module):
-    """A model of rewards, and an actor that is given a goal. ``hidden``: layers that an observation passes there.
+    """A model of rewards, and an actor that is given a goal; ``hidden`` are the model's layers for an observation.
 
-    With more than one of ``classes``, whose numbers the observation does not show, a third network says which it is
-    of. A goal's numbers enter the model by weights of the class's own, and behind the first layer so does the actor.
+    With more than one of ``classes``, whose numbers the observation does not show, a third network predicts the class.
+    Each class has its own weights for a goal in the model, and its own layers of the actor after the first.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class BeliefNet(nn.Module):
         super().__init__()
         width, self.classes = hidden[-1], classes
         self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
-        # One layer of all classes: of each, the columns have length 1.
+        # One layer holds all classes; the columns of each class have length 1.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)
         self.activation = ACTIVATIONS[activation]()
         self.paid = MLP(width, (max(1, width // 2),), 2, 0.01, generator, activation)
@@ -61,15 +61,15 @@ class BeliefNet(nn.Module):
         self.register_buffer("candidates", spread(candidates, goals))
 
     def class_of(self, seen: Tensor) -> Tensor:
-        """The class (B,) that normalised observations (B, d) look like."""
+        """Predict the class (B,) of normalised observations (B, d)."""
         if self.classes == 1:
             return torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
         return self.which(seen).argmax(-1)
 
     def pays(self, seen: Tensor, goals: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-deviation (B, g) of the reward in states (B, d) of classes (B,), for goals (B, g, n) or (g, n).
+        """Predict mean and log standard deviation (B, g) of the rewards for goals (B, g, n) or (g, n).
 
-        All normalised.
+        The states are (B, d), their classes (B,); all numbers are normalised.
         """
         if self.classes == 1:
             wanted = self.goal(goals)
@@ -81,7 +81,7 @@ class BeliefNet(nn.Module):
         return mean, log_std.clamp(-6.0, 2.0)
 
     def act(self, seen: Tensor, goal: Tensor, task: Tensor) -> Tensor:
-        """Mean actions (B, actions) for normalised observations and goals, in states of classes (B,)."""
+        """Return mean actions (B, actions) for normalised observations and goals, in states of classes (B,)."""
         given = torch.cat([seen, goal], dim=1)
         if self.classes == 1:
             return self.head(given)
@@ -97,11 +97,11 @@ class Belief(Protocol):
 
     @property
     def candidates(self) -> Tensor:
-        """The goals (C, n) over which belief is distributed."""
+        """Return the goals (C, n) over which belief is distributed."""
         ...
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return log-likelihoods (N, C) of rewards (N,) that led to raw observations (N, d); 0 where not ``known``."""
+        """Return log-likelihoods (N, C) of rewards (N,) that led to raw observations (N, d); 0 if not ``known``."""
         ...
 
     def believed(self, state: Tensor) -> Tensor:
@@ -110,9 +110,9 @@ class Belief(Protocol):
 
 
 class ModelBelief:
-    """The belief by the reward model of a policy's ``actor``, with ``actor.candidates``.
+    """The belief by the reward model of a policy's ``actor``, over ``actor.candidates``.
 
-    Each log-likelihood counts ``trust`` times, because the model's errors in successive steps are correlated.
+    Each log-likelihood is multiplied by ``trust``, because the model's errors in successive steps are correlated.
     """
 
     def __init__(self, policy: "BeliefPolicy", trust: float):
@@ -121,11 +121,11 @@ class ModelBelief:
 
     @property
     def candidates(self) -> Tensor:
-        """The candidates of the actor, (C, n)."""
+        """Return the candidates of the actor, (C, n)."""
         return self._policy.actor.candidates
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return what :class:`Belief` says.
+        """Return log-likelihoods as described in :class:`Belief`.
 
         The evidence takes most of a step's time, so on the CPU, where a host sync is free, unknown rewards are skipped.
         """
@@ -149,7 +149,7 @@ class ModelBelief:
 
 
 class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on its belief of the goal, and where it explores, on a candidate drawn from the belief.
+    """A policy that acts on its belief about the goal; when it explores, on a candidate drawn from the belief.
 
     ``actor`` is a :class:`BeliefNet`. The memory (N, candidates) sums the evidence of the steps. A candidate is tried
     for ``try_steps`` steps on average.
@@ -179,9 +179,9 @@ class BeliefPolicy(RecurrentPolicy):
         self.belief: Belief = belief or ModelBelief(self, trust)
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
-        """Return which candidate each of ``rows`` environments tries.
+        """Draw the candidate that each of ``rows`` environments tries.
 
-        The result (rows, 1) is a place in [0, 1) within the cumulative probabilities of the candidates.
+        The result (rows, 1) is a position in [0, 1) within the cumulative probabilities of the candidates.
         """
         device = self.log_std.device
         new, again = torch.rand(2, rows, 1, generator=generator, device=device)
@@ -189,8 +189,8 @@ class BeliefPolicy(RecurrentPolicy):
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return what the base class does; where ``drawn`` is negative nothing is tried."""
-        known = memory.known & ~memory.done  # what the last step of an episode led to was not seen
+        """Return mean actions and state as in the base class; a row with negative ``drawn`` tries no candidate."""
+        known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
         goal = self.belief.believed(state)
         if drawn is not None:

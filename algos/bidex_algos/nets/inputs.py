@@ -1,4 +1,4 @@
-"""What a network is fed: the named groups of an observation, each as it is or by an encoder of its own."""
+"""The inputs of a network: the named groups of an observation, each unchanged or passed through its own encoder."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from bidex_meta.world.contract import ObservationGroup, plain_groups
 
 
 class Columns(nn.Module):
-    """Reads and writes some columns, in ascending order, of tensors (..., d); nothing of it is in a checkpoint."""
+    """Reads and writes some columns, in ascending order, of tensors (..., d); a checkpoint contains no part of it."""
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
@@ -26,25 +26,25 @@ class Columns(nn.Module):
         self.register_buffer("index", torch.tensor(index, dtype=torch.int64), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The columns (..., size) of ``x`` (..., d); a view where they stand side by side."""
+        """Return the columns (..., size) of ``x`` (..., d); a view if the columns are adjacent."""
         return x.index_select(-1, self.index) if self.range is None else x[..., self.range]
 
     def write(self, x: Tensor, values: Tensor) -> None:
-        """Puts ``values`` (..., size) into the columns of ``x`` (..., d)."""
+        """Write ``values`` (..., size) into the columns of ``x`` (..., d)."""
         x[..., self.index if self.range is None else self.range] = values
 
 
 MakeEncoder = Callable[[int, torch.Generator], nn.Module]
-"""Makes an encoder for a group of so many entries, its weights drawn from a CPU generator: a module that maps
+"""Makes an encoder for a group, given its number of entries and a CPU generator for the weights: a module that maps
 (..., entries) to (..., ``size``) and has the attribute ``size``."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
+    """Describes the networks' reading of an observation, before weights exist; a ``BidexError`` names a missing group.
 
-    Groups enter as they are, by an encoder, or, ``hidden``, not at all; ``unscaled`` ones are normalised by no
-    statistics.
+    Groups enter unchanged, through an encoder, or, if ``hidden``, not at all. Groups in ``unscaled`` are not
+    normalised.
     """
 
     groups: tuple[ObservationGroup, ...]
@@ -57,47 +57,47 @@ class Inputs:
 
     @classmethod
     def of(cls, inputs: "int | Inputs") -> "Inputs":
-        """Itself, or of a width: so many columns of one kind."""
+        """Return ``inputs``; an integer becomes a single kind of that many columns."""
         return cls(plain_groups(inputs, 0)) if isinstance(inputs, int) else inputs
 
     @property
     def width(self) -> int:
-        """Columns of the observation, d."""
+        """Return the columns of the observation, d."""
         return sum(group.size for group in self.groups)
 
     def columns(self, *names: str) -> Columns:
-        """The columns of some groups."""
+        """Return the columns of some groups."""
         ranges = {group.name: group.where for group in self.groups}
         for name in set(names) - ranges.keys():
             raise unknown_name("observation group", name, ranges)
         return Columns(part for name in names for part in ranges[name])
 
     def extended(self, name: str, size: int) -> "Inputs":
-        """With one more group behind the others, for example the actions that a critic judges."""
+        """Append a group behind the others, for example the actions that a critic judges."""
         end = slice(self.width, self.width + size)
         return replace(self, groups=(*self.groups, ObservationGroup(name, (end,))))
 
     def encoded(self, name: str, make: MakeEncoder, scaled: bool = True) -> "Inputs":
-        """With an encoder for a group; not ``scaled``: running statistics leave its columns as they are."""
+        """Add an encoder for a group; if not ``scaled``, running statistics leave its columns unchanged."""
         unscaled = self.unscaled if scaled else self.unscaled | {name}
         return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
 
     def without(self, *names: str) -> "Inputs":
-        """With some groups hidden besides."""
+        """Hide further groups."""
         self.columns(*names)
         return replace(self, hidden=self.hidden | {*names})
 
     def only(self, *names: str) -> "Inputs":
-        """With all other groups hidden: what an agent sees that has a view of its own."""
+        """Hide all other groups, for example for an agent with its own view."""
         self.columns(*names)
         return replace(self, hidden=frozenset(group.name for group in self.groups) - {*names})
 
 
 class GroupEncoder(nn.Module):
-    """Makes of observations (..., d) what the layers of a network compute with (..., size).
+    """Encodes observations (..., d) as the input (..., size) of a network's layers.
 
-    Groups without an encoder come first, in the order of their columns, then those with one; without any encoder it is
-    the identity and has no weights.
+    Groups without an encoder come first, in the order of their columns, followed by groups with one. Without any
+    encoder the module is the identity and has no weights.
     """
 
     def __init__(self, inputs: int | Inputs, generator: torch.Generator):
@@ -112,7 +112,7 @@ class GroupEncoder(nn.Module):
         self.identity = self.plain.size == inputs.width
 
     def forward(self, x: Tensor) -> Tensor:
-        """Encodes (..., d)."""
+        """Encode (..., d)."""
         if self.identity:
             return x
         encoded = [encoder(self.columns[name](x)) for name, encoder in self.groups.items()]
@@ -128,11 +128,11 @@ class TaskEmbedding(nn.Module):
         self.vectors = nn.Parameter(torch.randn(tasks, size, generator=generator))
 
     def forward(self, one_hot: Tensor) -> Tensor:
-        """The vectors of the tasks."""
+        """Return the vectors of the tasks."""
         vectors = nn.functional.normalize(self.vectors, dim=1) if self.unit else self.vectors
         return one_hot @ vectors
 
 
 def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
-    """The same with the task read by an embedding of so many entries, of length 1 if ``unit``; 0: as it was."""
+    """Encode the task by an embedding of ``size`` entries, of length 1 if ``unit``; 0 leaves ``inputs`` unchanged."""
     return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit)) if size else inputs

@@ -1,4 +1,4 @@
-"""A squashed policy that acts on a latent variable of the task, and the posterior of that, which adds up evidence."""
+"""A squashed policy that acts on a latent variable of the task, and the posterior of the latent given evidence."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,15 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 
 _NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
-"""Groups that the encoder is not shown: by the hands it learns fifty tasks by heart, and not the rewards."""
+"""Groups hidden from the encoder: given the hands, it memorises fifty tasks instead of reading the rewards."""
 
 
 class LatentPolicy(SquashedPolicy):
-    """``actor`` reads normalised observations with a latent variable of ``size`` entries behind them.
+    """A policy whose ``actor`` reads normalised observations followed by a latent variable of ``size`` entries.
 
     The posterior is the unit Gaussian times a Gaussian factor for each transition of the task, which an ``encoder``
-    makes of (s, a, r, s'). So it is two sums, of precisions and of precisions times means, both 0 at first.
+    computes from (s, a, r, s'). Two sums therefore define it, of precisions and of precisions times means, both 0 at
+    first.
     """
 
     def __init__(
@@ -34,11 +35,17 @@ class LatentPolicy(SquashedPolicy):
         self.encoder = MLP(transition, hidden, 2 * size, 1.0, generator, activation)
 
     def compressed(self, reward: Tensor) -> Tensor:
-        """Rewards (...) as ``rewards`` takes them, (..., 1): of unknown classes they differ by orders of magnitude."""
+        """Compress rewards (...) to the input (..., 1) of ``rewards``.
+
+        Rewards of unknown classes differ by orders of magnitude.
+        """
         return torch.asinh(reward / self.reward_unit)[..., None]
 
     def evidence(self, obs: Tensor, actions: Tensor, reward: Tensor, next_obs: Tensor) -> Tensor:
-        """What each transition adds to the sums (..., 2 * size), of raw observations (..., d) and rewards (...)."""
+        """Return each transition's addend to the sums (..., 2 * size).
+
+        Observations (..., d) and rewards (...) are raw.
+        """
         before, after = (self.observations.some(self.noted(x), self.noted) for x in (obs, next_obs))
         seen = [before, actions, self.rewards(self.compressed(reward)), after]
         mean, raw = self.encoder(torch.cat(seen, dim=-1)).chunk(2, dim=-1)
@@ -46,17 +53,17 @@ class LatentPolicy(SquashedPolicy):
         return torch.cat([precision, precision * mean], dim=-1)
 
     def posterior(self, sums: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and deviation (..., size) of the latent variable, of sums of evidence (..., 2 * size)."""
+        """Return mean and standard deviation (..., size) of the latent variable from evidence sums (..., 2 * size)."""
         precision, weighted = sums.chunk(2, dim=-1)
         return weighted / (1.0 + precision), (1.0 + precision).rsqrt()
 
     def seen(self, obs: Tensor, latent: Tensor) -> Tensor:
-        """What actor and critics read, (N, d + size), of raw observations and the latent variable."""
+        """Return the input of actor and critics, (N, d + size), for raw observations and the latent variable."""
         return torch.cat([self.observations(obs), latent], dim=1)
 
     @torch.no_grad()
     def latent_action(self, obs: Tensor, latent: Tensor) -> Tensor:
-        """The squashed mean (N, a) in [-1, 1] for raw observations (N, d)."""
+        """Return the squashed mean (N, a) in [-1, 1] for raw observations (N, d)."""
         with autocast(obs.device, self.low_precision):
             mean, _ = self.actor(self.seen(obs, latent))
         return torch.tanh(mean)

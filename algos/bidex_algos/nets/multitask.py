@@ -1,4 +1,4 @@
-"""Trunks in the place of an ``MLP``: MOORE, PaCo, soft modules and towers divide weights among tasks; a transformer."""
+"""Trunks that replace an ``MLP``: MOORE, PaCo, soft modules and towers divide weights among tasks; a transformer."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from bidex_meta.utils import maths
 
 
 class StackedLinear(nn.Module):
-    """``count`` (K) linear layers of one form side by side, orthogonal weights of a ``gain`` and zero biases."""
+    """``count`` (K) parallel linear layers of one form, with orthogonal weights of a ``gain`` and zero biases."""
 
     def __init__(
         self, count: int, inputs: int, outputs: int, gain: float, generator: torch.Generator, bias: bool = True
@@ -28,12 +28,12 @@ class StackedLinear(nn.Module):
             nn.init.orthogonal_(layer, gain, generator=generator)
 
     def each(self) -> list[Callable[[Tensor], Tensor]]:
-        """The layers one by one: (batch, inputs) to (batch, outputs)."""
+        """Return the layers one by one: (batch, inputs) to (batch, outputs)."""
         biases = [None] * len(self.weight) if self.bias is None else self.bias.unbind()
         return [partial(affine, weight=w, bias=b) for w, b in zip(self.weight.unbind(), biases, strict=True)]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs), the same for all, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
+        """Map (batch, inputs), shared by all layers, or (K, batch, inputs), one per layer, to (K, batch, outputs)."""
         if x.dim() == 2:
             bias = None if self.bias is None else self.bias.flatten()
             out = affine(x, self.weight.flatten(0, 1), bias)
@@ -42,7 +42,10 @@ class StackedLinear(nn.Module):
 
 
 class TaskWeights(nn.Module):
-    """``count`` (K) numbers for each task, by its one-hot; drawn of length 1, so that mixtures keep their size."""
+    """``count`` (K) numbers for each task, selected by its one-hot.
+
+    The numbers of a task are drawn with length 1, so that mixtures keep their size.
+    """
 
     def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
         super().__init__()
@@ -51,32 +54,33 @@ class TaskWeights(nn.Module):
         self.rows = nn.Parameter(drawn / drawn.norm(dim=1, keepdim=True))
 
     def forward(self, x: Tensor) -> Tensor:
-        """The numbers (batch, K), float32, of the tasks of observations (batch, d)."""
+        """Return the numbers (batch, K), float32, of the tasks of observations (batch, d)."""
         with torch.autocast(x.device.type, enabled=False):  # a bfloat16 weight would round means by 0.4 %
             return self.one_hot(x).to(self.rows.dtype) @ self.rows
 
 
 def mixed(weights: Tensor, parts: Tensor) -> Tensor:
-    """Sums of parts (K, batch, n) with the weights (batch, K) of each environment: (batch, n)."""
+    """Sum parts (K, batch, n) with the weights (batch, K) of each environment: (batch, n)."""
     return torch.einsum("bk,kbn->bn", weights, parts)
 
 
 class PlainNorm(nn.Module):
-    """Layer normalisation without weights of its own, so that it may stand behind stacked layers; or nothing."""
+    """Layer normalisation without weights, so that it can follow stacked layers; the identity if not ``enabled``."""
 
     def __init__(self, enabled: bool):
         super().__init__()
         self.enabled = enabled
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalises the last axis."""
+        """Normalise the last axis."""
         return nn.functional.layer_norm(x, x.shape[-1:]) if self.enabled else x
 
 
 def gram_schmidt(vectors: Tensor) -> Tensor:
-    """Makes vectors (K, batch, n) orthonormal, each environment of the batch for itself; the first keeps its direction.
+    """Make vectors (K, batch, n) orthonormal, separately for each entry of the batch; the first keeps its direction.
 
-    Each is freed of those before it twice: where two are almost parallel the first time leaves large rounding errors.
+    The projections on the previous vectors are removed twice, because the first pass leaves large rounding errors if
+    two vectors are almost parallel.
     """
     found: list[Tensor] = []
     for vector in vectors:
@@ -89,10 +93,12 @@ def gram_schmidt(vectors: Tensor) -> Tensor:
 class Moore(Headed):
     """MOORE: a mixture of orthogonal experts (Hendawy et al. 2024).
 
-    y = head(V w_k), V the Gram-Schmidt basis of K experts' representations of a state, w_k what task k takes of each.
-    The task's one-hot chooses w_k and is not fed to the experts. Heads of tasks are the paper's multi-head variant.
-    Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another
-    layer, and goes through the config's non-linearity; w starts as a random direction of length 1.
+    y = head(V w_k), with V the Gram-Schmidt basis of K experts' representations of a state and w_k task k's weights of
+    the experts. The task's one-hot selects w_k and is not fed to the experts. Heads per task are the paper's multi-head
+    variant.
+
+    Our additions: the mixture is multiplied by the root of its width, so that its entries are as large as the entries
+    of another layer, and passes through the config's non-linearity; w starts as a random direction of length 1.
     """
 
     def __init__(
@@ -107,18 +113,18 @@ class Moore(Headed):
         for before, width in pairwise([self.encoder.size, *hidden]):
             layers += [StackedLinear(modules, before, width, math.sqrt(2.0), generator)]
             layers += [PlainNorm(layer_norm), ACTIVATIONS[activation]()]
-        self.body = nn.Sequential(*layers[:-2])  # what is made orthogonal has not been through a non-linearity
+        self.body = nn.Sequential(*layers[:-2])  # vectors are orthogonalised before the non-linearity
         self.activation, self.scale = ACTIVATIONS[activation](), math.sqrt(hidden[-1])
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def experts(self, x: Tensor) -> Tensor:
-        """Orthonormal representations (K, batch, width), float32, of observations (batch, inputs)."""
+        """Return orthonormal representations (K, batch, width), float32, of observations (batch, inputs)."""
         raw = self.body(self.encoder(x))
         with torch.autocast(x.device.type, enabled=False):
             return gram_schmidt(raw.to(self.head.weight.dtype))
 
     def features(self, x: Tensor) -> Tensor:
-        """As in the base; float32."""
+        """Compute the features as in the base class, in float32."""
         experts = self.experts(x)
         with torch.autocast(x.device.type, enabled=False):
             return self.activation(self.scale * mixed(self.weights(x), experts))
@@ -127,11 +133,12 @@ class Moore(Headed):
 class PaCo(nn.Module):
     """PaCo: a task's parameters are a mixture of a few parameter sets, theta_k = Phi w_k (Sun et al. 2022).
 
-    A layer is linear in its parameters, so that the composed layer's output is the mixture of the K layers' outputs;
-    the non-linearity comes after. The task's one-hot chooses w_k and is not fed to the layers.
-    Ours: actor and each critic have their own w, which starts as a random direction of length 1; biases of the output
-    are not composed, since the actor's hold its initial standard deviation. Of the paper's training, the masking and
-    fresh start of tasks whose loss explodes is left out.
+    A layer is linear in its parameters, so the composed layer's output is the mixture of the K layers' outputs; the
+    non-linearity follows. The task's one-hot selects w_k and is not fed to the layers.
+
+    Our changes: actor and each critic have their own w, which starts as a random direction of length 1. Biases of the
+    output are not composed, because the actor's biases hold its initial standard deviation. We omit the paper's masking
+    and restart of tasks whose loss explodes.
     """
 
     def __init__(
@@ -151,7 +158,7 @@ class PaCo(nn.Module):
         self.output_bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        """Map (batch, inputs) to float32 (batch, outputs)."""
         weights, features = self.weights(x), self.encoder(x)
         for layer in self.layers:
             features = self.between(mixed(weights, layer(features)))
@@ -160,12 +167,13 @@ class PaCo(nn.Module):
 
 
 class SoftModules(Headed):
-    """Soft modularisation: layers of modules, and for each task soft routes between them (Yang et al. 2020).
+    """Soft modularisation: layers of modules, with soft routes between them for each task (Yang et al. 2020).
 
-    With e = f(s) * h(k), entry by entry: p^1 = D^1 relu(e), p^l+1 = D^l+1 relu(U^l p^l * e) are logits of the routes,
-    and module i takes g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first of ``hidden`` is the width of f(s), each
-    further one that of a layer of modules. Ours: the head takes shares of the last layer, where the paper adds its
-    modules up; f is one layer; modules have the config's non-linearity. The loss weights by temperature are left out.
+    Let e = f(s) * h(k), entry by entry. Then p^1 = D^1 relu(e), p^l+1 = D^l+1 relu(U^l p^l * e) are logits of the
+    routes, and the input of module i is g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first entry of ``hidden`` is the
+    width of f(s); each further entry is the width of a layer of modules. Our changes: the head weights the modules of
+    the last layer, while the paper adds them up; f is one layer; modules have the config's non-linearity. We omit the
+    weighting of losses by temperature.
     """
 
     def __init__(
@@ -187,7 +195,10 @@ class SoftModules(Headed):
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def routes(self, x: Tensor, state: Tensor) -> list[Tensor]:
-        """Shares (batch, modules that take, that give) between layers, sum 1; ``state`` embeds x as (batch, width)."""
+        """Return shares (batch, receiving modules, giving modules) between layers, with sum 1.
+
+        ``state`` (batch, width) is the embedding of x.
+        """
         both = state * self.task(self.one_hot(x).to(state.dtype))
         logits = self.down[0](both.relu())
         found = [logits]
@@ -197,11 +208,11 @@ class SoftModules(Headed):
         return [each.unflatten(1, (-1, self.modules_of_layer)).softmax(-1) for each in found]
 
     def embedded(self, x: Tensor) -> Tensor:
-        """Embeddings of the states of observations (batch, inputs): (batch, width)."""
+        """Return embeddings of the states of observations (batch, inputs): (batch, width)."""
         return self.between(self.state(self.encoder(x)))
 
     def features(self, x: Tensor) -> Tensor:
-        """As in the base."""
+        """Compute the features as in the base class."""
         features = state = self.embedded(x)
         for layer, shares in zip(self.layers, self.routes(x, state), strict=True):
             features = torch.einsum("bij,jbn->ibn", shares, self.between(layer(features)))
@@ -209,9 +220,9 @@ class SoftModules(Headed):
 
 
 class Towers(Headed):
-    """Behind ``shared`` common layers those of each task alone; 0: a network for each task, in one.
+    """``shared`` common layers, followed by separate layers of each task; with 0 each task has its own network.
 
-    The task's one-hot chooses and is not fed to the layers.
+    The task's one-hot selects the layers and is not fed to them.
     """
 
     def __init__(
@@ -230,7 +241,7 @@ class Towers(Headed):
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """As in the base."""
+        """Compute the features as in the base class."""
         one_hot, features = self.one_hot(x), self.encoder(x)
         for layer in self.common:
             features = self.between(layer(features))
@@ -248,10 +259,10 @@ class Towers(Headed):
 
 
 class Transformer(Headed):
-    """A token of each group of the observation, all attending to all (Vaswani et al. 2017, arXiv 1706.03762).
+    """One token per group of the observation; every token attends to all (Vaswani et al. 2017, arXiv 1706.03762).
 
-    A block for each entry of ``hidden``, which are one width, with ``modules`` heads of attention. Tokens are
-    normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745) whatever ``layer_norm`` says. The
+    Each entry of ``hidden`` adds a block with ``modules`` attention heads; all entries are one width. Tokens are
+    normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745), independent of ``layer_norm``. The
     output layer reads the mean of the tokens.
     """
 
@@ -279,7 +290,7 @@ class Transformer(Headed):
         self.head = linear(width, outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """As in the base."""
+        """Compute the features as in the base class."""
         tokens = [token(encoder(x)) for encoder, token in zip(self.encoders, self.tokens, strict=True)]
         with sdpa_kernel(SDPBackend.MATH):  # the others have no gradient of their gradient, which TRPO needs
             return self.norm(self.blocks(torch.stack(tokens, dim=1)).mean(1))

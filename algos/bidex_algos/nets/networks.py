@@ -1,4 +1,4 @@
-"""Networks and the diagonal Gaussian that the learners share; knows no loss and no optimiser."""
+"""Networks and the diagonal Gaussian that the learners share; the module contains no loss and no optimiser."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,51 +18,51 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh
 Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
 Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; none makes a linear map
 MakeNetwork = Callable[..., Any]
-"""Takes the arguments of :class:`MLP`; what it makes has ``output_bias``, the biases of the output (outputs,)."""
+"""Takes the arguments of :class:`MLP`; the result has ``output_bias``, the biases of the output (outputs,)."""
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
-    """Whether hidden layers run in bfloat16; auto: on CUDA, or a CPU that has it (AMX tiles or AVX-512's BF16)."""
+    """Return whether hidden layers run in bfloat16; auto: on CUDA, or a CPU with AMX tiles or AVX-512's BF16."""
     if setting != "auto":
         return setting == "on"
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    # Functions of some of PyTorch's versions.
+    # These functions exist only in some versions of PyTorch.
     supported = [vars(torch.cpu).get(f"_is_{name}_supported") for name in ("amx_tile", "avx512_bf16")]
     return device.type == "cpu" and any(check is not None and check() for check in supported)
 
 
 def autocast(device: torch.device, enabled: bool) -> torch.autocast:
-    """The autocast context for ``device``; does nothing unless ``enabled``."""
+    """Return the autocast context for ``device``; it does nothing unless ``enabled``."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=enabled)
 
 
 class Headed(nn.Module):
     """A network whose output layer is ``head``, on :meth:`features`.
 
-    These follow an enclosing autocast; the output layer is always float32: in bfloat16 a mean of 1 would be rounded by
-    0.004, enough to move the likelihood ratio of 52 actions.
+    The features follow an enclosing autocast. The output layer is always float32, because bfloat16 would round a mean
+    of 1 by 0.004, enough to move the likelihood ratio of 52 actions.
     """
 
     head: nn.Linear
 
     @property
     def output_bias(self) -> Tensor:
-        """As in :data:`MakeNetwork`."""
+        """Return the output's biases, as described in :data:`MakeNetwork`."""
         return self.head.bias
 
     def features(self, x: Tensor) -> Tensor:
-        """What the output layer reads of (batch, inputs): (batch, width)."""
+        """Return the output layer's input for (batch, inputs): (batch, width)."""
         raise NotImplementedError
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        """Map (batch, inputs) to float32 (batch, outputs)."""
         features = self.features(x)
         with torch.autocast(x.device.type, enabled=False):
             return self.head(features.to(self.head.weight.dtype))
 
     def of_head(self, x: Tensor, index: Tensor, heads: int) -> Tensor:
-        """The same (batch, outputs / heads), of the head that int64 (batch,) names."""
+        """Return the outputs (batch, outputs / heads) of the head ``index``, int64 (batch,)."""
         features = self.features(x)
         with torch.autocast(x.device.type, enabled=False):
             weight, bias = self.head.weight, self.head.bias
@@ -70,7 +70,7 @@ class Headed(nn.Module):
 
 
 class MLP(Headed):
-    """Fully connected network; orthogonal weights with gain sqrt 2, of the output ``output_gain``, and zero biases."""
+    """Fully connected network: zero biases, orthogonal weights of gain sqrt 2 and, in the output, ``output_gain``."""
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
@@ -88,15 +88,16 @@ class MLP(Headed):
         self.head = linear(before, outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """As in the base."""
+        """Compute the features as in the base class."""
         return self.body(self.encoder(x))
 
 
 def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor, own: str = "") -> Tensor:
-    """The outputs of M networks of one form on a batch each: (M, B, inputs) to (M, B, outputs).
+    """Return the outputs of M networks of one form on a batch each: (M, B, inputs) to (M, B, outputs).
 
-    ``network`` gives the form and the encoders, ``params`` (M, ...) the weights, by names that begin with ``prefix``;
-    of those that do not begin with ``own`` the first serves all. 1.5 to 1.8 times as fast as ``functional_call``.
+    ``network`` provides the form and the encoders, ``params`` (M, ...) the weights, by names that begin with
+    ``prefix``. If a name does not begin with ``own``, its first entry is used for all networks. 1.5 to 1.8 times as
+    fast as ``functional_call``.
     """
 
     def stacked(name: str, x: Tensor) -> Tensor:
@@ -115,8 +116,8 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 
 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
-    """A layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
-    # Made without memory first: the default initialisation would draw from (and so disturb) the global generator.
+    """Make a layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
+    # The layer is made without memory first: the default initialisation would draw from the global generator.
     layer = Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
@@ -124,7 +125,7 @@ def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -
 
 
 def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
-    """Of outputs (..., heads * n) those (..., n) of the head that a one-hot (..., heads) names."""
+    """Select from outputs (..., heads * n) the outputs (..., n) of the head of a one-hot (..., heads)."""
     if heads == 1:
         return out
     with torch.autocast(out.device.type, enabled=False):  # like the output layer: means would be rounded
@@ -132,7 +133,7 @@ def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
 
 
 def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
-    """The rows (..., n) of (heads, n) that a one-hot (..., heads) names; a single one, (n,), as it is."""
+    """Select the rows (..., n) of (heads, n) for a one-hot (..., heads); a single row (n,) is returned unchanged."""
     if rows.dim() == 1:
         return rows
     with torch.autocast(rows.device.type, enabled=False):
@@ -140,9 +141,10 @@ def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
 
 
 class GaussianActor(nn.Module):
-    """Diagonal Gaussian: the mean from a network, a standard deviation per action that knows no state.
+    """Diagonal Gaussian: a network computes the mean; the standard deviations do not depend on the state.
 
-    With several heads the group ``task_id`` chooses; ``log_std`` is (actions,), or then (heads, actions).
+    With several heads the group ``task_id`` selects the head. ``log_std`` is (actions,), or (heads, actions) with
+    several.
     """
 
     def __init__(
@@ -155,29 +157,29 @@ class GaussianActor(nn.Module):
         self.log_std = nn.Parameter(torch.full((heads, actions) if heads > 1 else (actions,), math.log(init_std)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
+        """Return unclamped mean actions for normalised observations (batch, observations), float32 (batch, actions)."""
         if self.heads > 1 and x.dim() == 2 and isinstance(self.mean, Headed) and maths.may_look(x.device):
             return self.mean.of_head(x, self.one_hot(x).argmax(-1), self.heads)
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """The ``log_std`` that holds for observations (batch, d): (actions,) with one head, else (batch, actions)."""
+        """Return the rows of ``log_std`` (default: own) for observations (batch, d): (actions,) or (batch, actions)."""
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
 
 def gaussian_log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """Log-density of N(mean, exp(log_std)^2), summed over the last axis. Shape (...)."""
+    """Return the log-density of N(mean, exp(log_std)^2), summed over the last axis. Shape (...)."""
     z = (action - mean) * torch.exp(-log_std)
     return -0.5 * z.square().sum(-1) - (log_std + 0.5 * math.log(2.0 * math.pi)).expand(mean.shape).sum(-1)
 
 
 def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Tensor) -> Tensor:
-    """KL(p || q) of two diagonal Gaussians, summed over the last axis. Shape (...)."""
+    """Return KL(p || q) of two diagonal Gaussians, summed over the last axis. Shape (...)."""
     variance_ratio = torch.exp(2.0 * (log_std_p - log_std_q))
     shift = ((mean_p - mean_q) * torch.exp(-log_std_q)).square()
     return (log_std_q - log_std_p + 0.5 * (variance_ratio + shift - 1.0)).sum(-1)
 
 
 def gaussian_entropy(log_std: Tensor) -> Tensor:
-    """Differential entropy of a diagonal Gaussian, summed over the last axis. Shape (...)."""
+    """Return the differential entropy of a diagonal Gaussian, summed over the last axis. Shape (...)."""
     return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum(-1)

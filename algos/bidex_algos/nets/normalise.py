@@ -1,4 +1,4 @@
-"""Running statistics: of observations, and of returns per task."""
+"""Running statistics of observations, and of returns per task."""
 
 import math
 
@@ -9,14 +9,14 @@ from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.training.distributed import pool_moments
 from bidex_meta.training.learner import LearnerConfig
 
-_FLOOR = 3e-3  # of a deviation: keeps a column that has been constant so far from blowing up noise a thousandfold
-_FOREVER = 1e18  # observations beside which all that follow count nothing
+_FLOOR = 3e-3  # of a standard deviation: a column that was constant so far must not amplify noise a thousandfold
+_FOREVER = 1e18  # a count so large that further observations have no weight
 
 
 class RunningStats(nn.Module):
     """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element, in float64.
 
-    Where the count never grows beyond ``max_count``, older batches fade.
+    If ``max_count`` bounds the count, older batches fade.
     """
 
     mean: Tensor
@@ -30,7 +30,7 @@ class RunningStats(nn.Module):
             self.register_buffer(name, torch.full(shape, value, dtype=torch.float64))
 
     def merge(self, mean: Tensor, var: Tensor, count: Tensor | float) -> None:
-        """Merges a batch's mean, (biased) variance and count; elements whose count is 0 stay as they are."""
+        """Merge a batch's mean, (biased) variance and count; elements whose count is 0 do not change."""
         count = torch.as_tensor(count, dtype=torch.float64, device=self.mean.device).expand_as(self.count)
         total = self.count + count
         share = torch.where(count > 0, count / total.clamp_min(1.0), torch.zeros_like(total))
@@ -40,27 +40,27 @@ class RunningStats(nn.Module):
         self.count.copy_(total.clamp_max(self.max_count))
 
     def std(self, floor: float = 1e-4) -> Tensor:
-        """Standard deviation, at least ``floor``, float64."""
+        """Return the standard deviation, at least ``floor``, float64."""
         return (self.var + floor**2).sqrt()
 
     def normalise(self, x: Tensor, element: Tensor) -> Tensor:
-        """``x`` (..., n) to zero mean and unit variance by the statistics of each entry's element, int64 (n,)."""
+        """Scale ``x`` (..., n) to zero mean and unit variance by the statistics of each entry's element, int64 (n,)."""
         return (x - self.mean.float()[element]) / self.std().float()[element]
 
     def restore(self, x: Tensor, element: Tensor) -> Tensor:
-        """What :meth:`normalise` made ``x`` of, (..., n); 0 where the element has no statistics yet.
+        """Invert :meth:`normalise` for ``x`` (..., n); the result is 0 if the element has no statistics yet.
 
-        An untrained critic says numbers about 1, which may be a hundred times a return: the first statistics would be
-        of these, and a hundred iterations would have to forget them.
+        An untrained critic outputs numbers of about 1, which may be a hundred times a return. The first statistics
+        would be of these outputs, and a hundred iterations would be needed to forget them.
         """
         return (x * self.std().float()[element] + self.mean.float()[element]) * (self.count > 0)[element]
 
 
 class ObservationNormaliser(nn.Module):
-    """Observations to zero mean and unit variance, clipped; columns of ``inputs.unscaled`` are not ``measured``.
+    """Scales observations to zero mean and unit variance and clips them, except columns of ``inputs.unscaled``.
 
-    Statistics change only in :meth:`update` (never while ``settled``), so that a rollout looks the same to the sampling
-    policy and to the update. Not ``enabled`` it is the identity.
+    Statistics of the ``measured`` columns change only in :meth:`update` (never while ``settled``), so that the sampling
+    policy and the update see the same rollout. If not ``enabled``, the module is the identity.
     """
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
@@ -69,27 +69,27 @@ class ObservationNormaliser(nn.Module):
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
-        # float32 copies of what forward needs, refreshed by update.
+        # float32 copies for forward, refreshed by update.
         self.shift: Tensor
         self.scale: Tensor
         self.register_buffer("shift", torch.zeros(inputs.width))
         self.register_buffer("scale", torch.ones(inputs.width))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Normalises (..., columns), float32."""
+        """Normalise (..., columns), float32."""
         if not self.enabled:
             return obs
         return ((obs - self.shift) * self.scale).clamp_(-self.clip, self.clip)
 
     def some(self, obs: Tensor, columns: Columns) -> Tensor:
-        """The same of some columns (..., n) alone."""
+        """Normalise only some columns (..., n)."""
         if not self.enabled:
             return obs
         return ((obs - columns(self.shift)) * columns(self.scale)).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Takes (..., columns) raw observations, of all processes, into the statistics."""
+        """Add raw observations (..., columns) of all processes to the statistics."""
         if not self.enabled or self.settled or self.measured.size == 0:
             return
         flat = self.measured(obs.reshape(-1, obs.shape[-1]))
@@ -98,13 +98,13 @@ class ObservationNormaliser(nn.Module):
 
     @torch.no_grad()
     def keep(self) -> None:
-        """From here on the statistics of columns that have varied stay: the network's weights were made for them."""
+        """Freeze the statistics of columns that have varied, because the network's weights were made for them."""
         varied = (self.stats.count > 0) & (self.stats.var > _FLOOR**2)  # variances begin at 1
         self.stats.count[varied] = _FOREVER
 
     @torch.no_grad()
     def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
-        """Takes moments of raw observations, of all processes, into the statistics: (measured columns,) each."""
+        """Add moments of raw observations, of all processes, to the statistics: (measured columns,) each."""
         if not self.enabled:
             return
         self.stats.merge(*pool_moments(mean, var, count))
@@ -113,7 +113,7 @@ class ObservationNormaliser(nn.Module):
 
 
 def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:
-    """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
+    """Make the normaliser for a config's ``normalise_observations`` and ``normalise_per_task`` and number of tasks."""
     options = vars(config)
     if options.get("normalise_per_task") and options["normalise_observations"] and tasks > 1:
         return TaskNormaliser(inputs, tasks)
@@ -121,7 +121,7 @@ def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) ->
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Normalises by the statistics of each of ``tasks`` tasks, which the group ``task_id`` names."""
+    """Normalises by the statistics of each of ``tasks`` tasks, which the group ``task_id`` identifies."""
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)
@@ -130,13 +130,13 @@ class TaskNormaliser(ObservationNormaliser):
         self.shift, self.scale = torch.zeros(tasks, inputs.width), torch.ones(tasks, inputs.width)
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Normalises (..., columns), float32."""
+        """Normalise (..., columns), float32."""
         task = self.one_hot(obs).argmax(-1)
         return ((obs - self.shift[task]) * self.scale[task]).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Takes (..., columns) raw observations, of all processes, into the statistics of their tasks."""
+        """Add raw observations (..., columns) of all processes to the statistics of their tasks."""
         if self.settled or self.measured.size == 0:
             return
         flat = obs.reshape(-1, obs.shape[-1])

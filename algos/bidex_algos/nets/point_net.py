@@ -1,4 +1,4 @@
-"""PointNet (Qi et al. 2017, arXiv 1612.00593), no transforms: a shared network on each point, then the largest."""
+"""PointNet (Qi et al. 2017, arXiv 1612.00593) without transforms: a shared network on each point, then the maximum."""
 
 import math
 from collections.abc import Sequence
@@ -14,15 +14,15 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
-_SPREAD = 0.2  # what distances from a cloud's centre are divided by, metres: about a hand's length
+_SPREAD = 0.2  # metres; divides distances from a cloud's centre: about a hand's length
 _CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
 
 
 class PointNet(nn.Module):
-    """Maps clouds (..., entries) to features (..., size): the largest of each over all points, and the centre (metres).
+    """Maps clouds (..., entries) to features (..., size): the maximum of each over all points, and the centre (metres).
 
     Points of ``channels`` numbers, position first, enter relative to the centre of their cloud, so that the first
-    layers see shapes rather than where the hands are. It reads all, or ``read`` of them evenly.
+    layers see shapes rather than the position of the hands. The network reads all points, or ``read`` of them evenly.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class PointNet(nn.Module):
         self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
 
     def forward(self, x: Tensor) -> Tensor:
-        """Encodes clouds."""
+        """Encode clouds."""
         cloud = x.unflatten(-1, (-1, self.channels))[..., :: self.step, :]
         place, rest = cloud[..., :3], cloud[..., 3:]
         centre = place.mean(dim=-2, keepdim=True)
@@ -49,25 +49,26 @@ class PointNet(nn.Module):
         return torch.cat((self._largest(points.flatten(0, -3)).view(*x.shape[:-1], -1), centre[..., 0, :]), dim=-1)
 
     def _largest(self, points: Tensor) -> Tensor:
-        """The largest of each feature, (n, features), over points (n, points, channels)."""
+        """Return the maximum of each feature, (n, features), over points (n, points, channels)."""
         last = cast(nn.Linear, self.shared[-1])
         if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
-        # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
+        # Only the point with the maximum of a feature has a gradient: find these points first, then differentiate only
+        # them.
         with torch.no_grad():
             found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
         chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
         return (self.shared[:-1](chosen) * last.weight).sum(dim=2) + last.bias
 
     def _parts(self, points: Tensor) -> tuple[Tensor, ...]:
-        """On a CPU so many clouds at once that what is computed of them fits its cache."""
+        """Split the clouds on a CPU so that the results for each part fit its cache."""
         if points.device.type != "cpu":
             return (points,)
         return points.split(max(1, _CACHED // (points.shape[1] * (self.size - 3))))
 
 
 def _largest_of(values: Tensor) -> Tensor:
-    """``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, where argmax and max are no vector code."""
+    """Return ``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, where argmax is not vectorised."""
     points = values.shape[1]
     step = next(d for d in range(min(16, points), 0, -1) if points % d == 0)
     blocks = values.unflatten(1, (-1, step))
@@ -77,7 +78,7 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
-    """The same with clouds, unscaled, read by a PointNet; a BidexError where the config has no ``point_widths``."""
+    """Add a PointNet for unscaled clouds; a BidexError if the config has no ``point_widths``."""
     options = vars(config)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)

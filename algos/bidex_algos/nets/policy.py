@@ -1,4 +1,4 @@
-"""The agents that evaluation and sampling use: observation statistics, actor and precision in one module."""
+"""The agents for evaluation and sampling: observation statistics, actor and precision in one module."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from bidex_algos.nets.shape import Shape
 
 
 class ActorPolicy(nn.Module):
-    """A normaliser and an actor, on raw observations; an agent for evaluation, with ``eval_action``."""
+    """A normaliser and an actor on raw observations; an agent for evaluation, with ``eval_action``."""
 
     def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
@@ -32,39 +32,39 @@ class ActorPolicy(nn.Module):
 
     @classmethod
     def made_of(cls, actor: nn.Module, config: Any, inputs: Inputs, shape: Shape, device: torch.device) -> Self:
-        """That of an actor, with the statistics and the precision that a learner's config asks for."""
+        """Make the policy of an actor, with the statistics and the precision that a learner's config asks for."""
         observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return cls(observations, actor, use_bfloat16(config.autocast, device))
 
     def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes; the argument is part of the Agent protocol."""
+        """Do nothing: no state has to be forgotten between episodes; the argument is part of the Agent protocol."""
 
 
 class GaussianPolicy(ActorPolicy):
-    """A Gaussian actor on raw observations; arguments are those of its base."""
+    """A Gaussian actor on raw observations; arguments as in the base class."""
 
     actor: GaussianActor
 
     @torch.no_grad()
     def distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean action (N, a) and logarithm of the standard deviation, (a,) or (N, a), of raw observations (N, d)."""
+        """Return mean action (N, a) and log standard deviation, (a,) or (N, a), for raw observations (N, d)."""
         obs = self.observations(obs)
         with autocast(obs.device, self.low_precision):
             return self.actor(obs), self.actor.log_std_of(obs)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        """Return the mean action for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
         return self.distribution(obs)[0].clamp(-1.0, 1.0)
 
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
-        """Actions drawn from the distribution for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        """Sample actions from the distribution for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
         mean, log_std = self.distribution(obs)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
         return (mean + log_std.exp() * noise).clamp(-1.0, 1.0)
 
 
 def of_head(out: Tensor, head: Tensor) -> Tensor:
-    """Of outputs (B, heads, ...) those (B, ...) of the heads that int64 (B,) names."""
+    """Select from outputs (B, heads, ...) the outputs (B, ...) of the heads ``head``, int64 (B,)."""
     return out.gather(1, head.view(-1, *[1] * (out.dim() - 1)).expand(-1, 1, *out.shape[2:]))[:, 0]
 
 
@@ -80,11 +80,11 @@ class DeterministicActor(nn.Module):
         self.net = network(inputs, hidden, heads * actions, 0.01, generator, activation)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Actions of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        """Return actions for normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
         return torch.tanh(self.raw(x))
 
     def raw(self, x: Tensor) -> Tensor:
-        """The same before the squashing: float32 (batch, a)."""
+        """Return the actions before squashing: float32 (batch, a)."""
         out = self.net(x)
         if self.heads == 1:
             return out
@@ -97,13 +97,13 @@ class DeterministicPolicy(ActorPolicy):
     actor: DeterministicActor
 
     def raw(self, obs: Tensor) -> Tensor:
-        """What tanh makes the actions of (N, a), for normalised observations (N, d), with their slopes."""
+        """Return the actions before squashing (N, a), with gradients, for normalised observations (N, d)."""
         with autocast(obs.device, self.low_precision):
             return self.actor.raw(obs)
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The action for raw observations (N, d): (N, a) in [-1, 1]."""
+        """Return the action for raw observations (N, d): (N, a) in [-1, 1]."""
         return torch.tanh(self.raw(self.observations(obs)))
 
 
@@ -111,7 +111,7 @@ def gaussian_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
     make: type[GaussianActor] = GaussianActor
 ) -> GaussianPolicy:  # fmt: skip
-    """A policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
+    """Make a policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
     heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
     actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
     return GaussianPolicy.made_of(actor, config, inputs, shape, device)
@@ -120,32 +120,34 @@ def gaussian_policy(
 def deterministic_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device
 ) -> DeterministicPolicy:
-    """The same without a distribution."""
+    """Make a deterministic policy as in :func:`gaussian_policy`."""
     heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
     actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
     return DeterministicPolicy.made_of(actor, config, inputs, shape, device)
 
 
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
+    """Return the log-density of the action tanh(raw), with raw drawn from N(mean, exp(log_std)^2).
 
-    Of what was squashed, (..., a), to (...): in float32 tanh rounds to 1 from 9 on, whose way back is infinite.
+    The argument is the value before squashing, (..., a) to (...), because in float32 tanh rounds to 1 from 9 on and has
+    no finite inverse.
     """
-    # log(1 - tanh(u)^2), written so that no difference of almost equal numbers occurs.
+    # log(1 - tanh(u)^2), written without a difference of almost equal numbers.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
     return gaussian_log_prob(raw, mean, log_std) - log_slope.sum(-1)
 
 
 def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Actions (..., a) in [-1, 1] and their log-densities (...), from standard normal ``noise`` (..., a)."""
+    """Return actions (..., a) in [-1, 1] and their log-densities (...), from standard normal ``noise`` (..., a)."""
     raw = mean + log_std.exp() * noise
     return torch.tanh(raw), squashed_log_prob(raw, mean, log_std)
 
 
 class SquashedActor(nn.Module):
-    """Mean and log standard deviation, before the squashing, from one network.
+    """Mean and log standard deviation, before squashing, from one network.
 
-    The latter moves between its bounds on a tanh: from beyond a hard clamp, without a gradient, it would never return.
+    The log standard deviation moves between its bounds on a tanh. Beyond a hard clamp it would have no gradient and
+    never return.
     """
 
     def __init__(
@@ -163,19 +165,19 @@ class SquashedActor(nn.Module):
             self.net.output_bias.view(heads, 2, actions)[:, 1] = start
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation of normalised observations (batch, d): float32 (batch, a) each."""
+        """Return mean and log standard deviation for normalised observations (batch, d): float32 (batch, a) each."""
         out = self.net(x).unflatten(1, (self.heads, 2, -1))
         mean, log_std = (out[:, 0] if self.heads == 1 else of_head(out, self.one_hot(x).argmax(1))).unbind(1)
         return mean, self.middle + self.reach * torch.tanh(log_std)
 
 
 class SquashedPolicy(ActorPolicy):
-    """A squashed actor on raw observations; arguments are those of its base."""
+    """A squashed actor on raw observations; arguments as in the base class."""
 
     actor: SquashedActor
 
     def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Actions (N, a) and their log-densities (N,) for normalised observations (N, d)."""
+        """Sample actions (N, a) and return their log-densities (N,) for normalised observations (N, d)."""
         with autocast(obs.device, self.low_precision):
             mean, log_std = self.actor(obs)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
@@ -183,14 +185,14 @@ class SquashedPolicy(ActorPolicy):
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The squashed mean for raw observations (N, d): (N, a) in [-1, 1]."""
+        """Return the squashed mean for raw observations (N, d): (N, a) in [-1, 1]."""
         with autocast(obs.device, self.low_precision):
             mean, _ = self.actor(self.observations(obs))
         return torch.tanh(mean)
 
     @torch.no_grad()
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
-        """Actions drawn from the distribution for raw observations (N, d): (N, a) in [-1, 1]."""
+        """Sample actions from the distribution for raw observations (N, d): (N, a) in [-1, 1]."""
         return self.sample(self.observations(obs), generator)[0]
 
 
@@ -198,7 +200,7 @@ def squashed_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
     network: MakeNetwork | None = None
 ) -> SquashedPolicy:  # fmt: skip
-    """As :func:`gaussian_policy`, squashed."""
+    """Make a squashed policy as in :func:`gaussian_policy`."""
     heads, network = shape.num_id_columns if config.policy_heads else 1, network or network_of(config)
     sizes = config.hidden, shape.actions, heads
     actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)

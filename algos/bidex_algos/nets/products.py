@@ -1,7 +1,7 @@
-"""The products of layers with weights, by the faster of the two libraries that PyTorch computes them with on a CPU.
+"""The products of layers with weights, by the faster of the two libraries that PyTorch uses on a CPU.
 
-PyTorch takes MKL, which runs AMD's processors without their AVX-512: oneDNN, of the same precision, is more than twice
-as fast there (docs/results/speed.md). ``torch.backends.mkldnn.flags(enabled=False)`` turns it off.
+PyTorch prefers MKL, which does not use AVX-512 on AMD's processors. On these, oneDNN is more than twice as fast with
+the same precision (docs/results/speed.md). ``torch.backends.mkldnn.flags(enabled=False)`` turns oneDNN off.
 """
 
 import platform
@@ -13,11 +13,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-_LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call costs is more than what it saves
+_LEAST = 1 << 21  # multiplications from which oneDNN is faster; below, the call's overhead exceeds the gain
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``, differentiable: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
+    """Return differentiable ``x @ weight.T + bias``: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
     if not _pays(x, weight):
         if x.is_cuda and torch.is_autocast_enabled("cuda"):
             x, weight = _in_eights(x, weight)
@@ -28,16 +28,17 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Both with zero columns to a multiple of eight: else cuBLAS's bfloat16 product is a slow one of older GPUs.
+    """Pad both with zero columns to a multiple of eight; else cuBLAS's bfloat16 product is a slow one of older GPUs.
 
-    Of 422 columns the first layer took 51 of 106 ms of MT-PPO's products on an H200, with 18 % of the multiplications.
+    With 422 columns the first layer took 51 of the 106 ms of MT-PPO's products on an H200, although it has only 18 % of
+    the multiplications.
     """
     missing = -x.shape[-1] % 8
     return (nn.functional.pad(x, (0, missing)), nn.functional.pad(weight, (0, missing))) if missing else (x, weight)
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Layers of one form with a batch each: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
+    """Apply layers of one form to a batch each: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
     if _pays(x[0], weight[0]):
         biases = [None] * len(x) if bias is None else bias.unbind()
         return torch.stack([affine(*each) for each in zip(x.unbind(), weight.unbind(), biases, strict=True)])
@@ -47,9 +48,9 @@ def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Ten
 
 
 def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]]) -> Tensor:
-    """Each row (B, inputs) by the one of ``layers`` that int64 (B,) names: (B, outputs). Looks at numbers."""
+    """Apply to each row (B, inputs) the one of ``layers`` at ``index``, int64 (B,): (B, outputs); needs a host sync."""
     sizes = torch.bincount(index, minlength=len(layers)).tolist()
-    in_order = bool((index[1:] >= index[:-1]).all())  # batches that are drawn task by task: nothing to move
+    in_order = bool((index[1:] >= index[:-1]).all())  # batches drawn task by task need no reordering
     order = slice(None) if in_order else index.argsort(stable=True)
     parts = x[order].split(sizes)
     out = torch.cat([layer(part) for layer, part in zip(layers, parts, strict=True) if len(part)])
@@ -57,9 +58,10 @@ def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]
 
 
 def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int) -> Tensor:
-    """Each row by a layer of its own: (B, inputs), (heads * n, inputs), (heads * n,), int64 (B,) to (B, n).
+    """Apply to each row its own layer: (B, inputs), (heads * n, inputs), (heads * n,), int64 (B,) to (B, n).
 
-    Looks at numbers. With twenty heads of 52 actions it takes a twentieth of what all heads of all rows take.
+    The function needs a host sync. With twenty heads of 52 actions it takes a twentieth of the time that all heads take
+    on all rows.
     """
     layers = zip(weight.unflatten(0, (heads, -1)), bias.unflatten(0, (heads, -1)), strict=True)
     return by_own(x, index, [partial(affine, weight=each, bias=offset) for each, offset in layers])
@@ -69,12 +71,12 @@ class Linear(nn.Linear):
     """PyTorch's layer, computed by :func:`affine`."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Maps (..., inputs) to (..., outputs)."""
+        """Map (..., inputs) to (..., outputs)."""
         return affine(input, self.weight, self.bias)
 
 
 class _Affine(torch.autograd.Function):
-    """oneDNN's product, which knows no gradient; those are products too, so that there are gradients of them."""
+    """oneDNN's product, which has no gradient of its own; the gradients here are products, so they have one too."""
 
     generate_vmap_rule = True
 
@@ -102,12 +104,12 @@ def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def _dense(x: Tensor) -> Tensor:
-    """The same numbers without gaps, by rows or by columns: others oneDNN multiplies by its slowest code."""
+    """Make the tensor contiguous by rows or by columns; oneDNN multiplies other layouts by its slowest code."""
     return x if x.is_contiguous() or x.t().is_contiguous() else x.contiguous()
 
 
 def _pays(x: Tensor, weight: Tensor) -> bool:
-    """Whether oneDNN is to make ``x @ weight.T``."""
+    """Return whether oneDNN should compute ``x @ weight.T``."""
     return (
         x.device.type == "cpu"
         and torch.backends.mkldnn.enabled  # before sizes, which an export leaves open
@@ -120,7 +122,7 @@ def _pays(x: Tensor, weight: Tensor) -> bool:
 
 @cache
 def is_faster_here() -> bool:
-    """Whether this machine's processor is AMD's with AVX-512, and PyTorch has both libraries."""
+    """Return whether this machine has an AMD processor with AVX-512, and PyTorch has both libraries."""
     both = torch.backends.mkl.is_available() and torch.backends.mkldnn.is_available()
     if not both or torch.backends.cpu.get_cpu_capability() != "AVX512" or "AuthenticAMD" not in _processor():
         return False
@@ -134,4 +136,4 @@ def _processor() -> str:
     try:
         return Path("/proc/cpuinfo").read_text(errors="ignore")
     except OSError:
-        return platform.processor()  # where it is no Linux
+        return platform.processor()  # not on Linux

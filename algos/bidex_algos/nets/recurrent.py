@@ -1,4 +1,4 @@
-"""Networks with a memory: encoder, GRU, output; and a Gaussian policy that remembers what it did and what it earned."""
+"""Networks with a memory: encoder, GRU, output; and a Gaussian policy that remembers its actions and rewards."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,10 +13,11 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 
 
 class RecurrentNet(nn.Module):
-    """An encoder, a GRU on its features, and a linear output of both, so that a reflex need not pass the memory.
+    """An encoder, a GRU on its features, and a linear output of both, so that a reflex can bypass the memory.
 
-    All in float32: a memory would carry the rounding of bfloat16 on. At the start its numbers fade over 2 to
-    ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
+    All layers are float32, because a memory would carry the rounding of bfloat16 on. At the start the memory's numbers
+    fade over 2 to ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv
+    1804.11188).
     """
 
     def __init__(
@@ -26,7 +27,7 @@ class RecurrentNet(nn.Module):
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
         self.encoder = nn.Sequential(last, ACTIVATIONS[activation]())
-        # Made without memory first: the default initialisation would draw from the global generator.
+        # The layer is made without memory first: the default initialisation would draw from the global generator.
         self.gru = nn.GRU(hidden[-1], memory, device="meta").to_empty(device=torch.get_default_device())
         for name, weight in self.gru.named_parameters():
             if "bias" in name:
@@ -39,7 +40,10 @@ class RecurrentNet(nn.Module):
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after, from that before them."""
+        """Return outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after them.
+
+        ``state`` is the memory before the steps.
+        """
         features = self.encoder(x)
         remembered, last = self.gru(features, state[None].contiguous())
         return self.head(torch.cat([features, remembered], dim=-1)), last[0]
@@ -47,10 +51,10 @@ class RecurrentNet(nn.Module):
 
 @dataclass
 class Memory:
-    """What each environment brings along from the step before; zeros at first. ``state`` (N, memory) is the network's.
+    """The values that each environment carries over from the previous step; zeros at first.
 
-    Of the action (N, a) what exceeds [-1, 1] was not done; ``known`` (N,): whether the policy is shown the reward (N,);
-    ``done`` (N,): whether the step ended an episode.
+    ``state`` (N, memory) belongs to the network. The action (N, a) is executed clamped to [-1, 1]. ``known`` (N,) is
+    whether the policy is shown the reward (N,); ``done`` (N,) is whether the step ended an episode.
     """
 
     state: Tensor
@@ -60,17 +64,17 @@ class Memory:
     done: Tensor
 
     def replaced(self, mask: Tensor, other: "Memory") -> "Memory":
-        """The same with the rows of ``mask``, bool (N,), from another one."""
+        """Return the memory with the rows of ``mask``, bool (N,), taken from ``other``."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Memory(*(torch.where(mask if a.dim() == 1 else mask[:, None], b, a) for a, b in pairs))
 
 
 class RecurrentPolicy(nn.Module):
-    """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
+    """A Gaussian policy whose memory reads observation, last action, last reward and end of episode.
 
-    Rewards of unknown classes differ by orders of magnitude; one rule serves all: asinh(reward / ``reward_unit``),
-    normalised by running statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation, and
-    ``make_actor`` the result.
+    Rewards of unknown classes differ by orders of magnitude, so all rewards enter as asinh(reward / ``reward_unit``),
+    normalised by running statistics. ``inputs`` is extended by a group ``last_step`` of all inputs besides the
+    observation; ``make_actor`` gets the result.
     """
 
     def __init__(
@@ -86,34 +90,35 @@ class RecurrentPolicy(nn.Module):
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
-        """What the networks see (..., width of ``inputs``): normalised observation, last action, last reward or 0.
+        """Return the networks' input (..., width of ``inputs``): normalised observation, last action, last reward or 0.
 
-        ``obs`` are raw (..., d), ``action`` (..., a); ``known`` and ``done`` as in :class:`Memory`, (...); both go in.
+        ``obs`` are raw (..., d), ``action`` (..., a). ``known`` and ``done`` (...) are described in :class:`Memory`;
+        both are part of the input.
         """
         earned = torch.where(known, self.earned(reward), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)
         return torch.cat([self.observations(obs), action.clamp(-1.0, 1.0), last], dim=-1)
 
     def earned(self, reward: Tensor) -> Tensor:
-        """Raw rewards (...) as the networks know them."""
+        """Normalise raw rewards (...) for the networks."""
         return self.rewards(self._compressed(reward)).squeeze(-1)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Mean actions (N, a), not clamped, and the memory's next state (N, memory), for raw observations (N, d).
+        """Return unclamped mean actions (N, a) and the memory's next state (N, memory) for raw observations (N, d).
 
-        ``drawn``: what an exploring episode tries now, of :meth:`drawn`; None: nothing.
+        ``drawn`` is the result of :meth:`drawn` for an exploring episode; None: the policy tries nothing.
         """
         x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
         mean, state = self.actor(x[None], memory.state)
         return mean[0], state
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor | None:
-        """What so many exploring environments try in the next step, from that in the last; None: nothing."""
+        """Draw what each of ``rows`` exploring environments tries next, given the ``last`` draw; None: nothing."""
         return None
 
     def fresh_memory(self, rows: int) -> Memory:
-        """The memory at the start of a trial of so many environments."""
+        """Return the memory of ``rows`` environments at the start of a trial."""
         device = self.log_std.device
         flags = torch.zeros(2, rows, dtype=torch.bool, device=device)
         state, action = (torch.zeros(rows, width, device=device) for width in (self.memory, self.num_actions))
@@ -121,7 +126,7 @@ class RecurrentPolicy(nn.Module):
 
     @torch.no_grad()
     def update_statistics(self, obs: Tensor, rewards: Tensor) -> None:
-        """Takes raw observations (B, d) and rewards (B',) of all processes into the running statistics."""
+        """Add raw observations (B, d) and rewards (B',) of all processes to the running statistics."""
         self.observations.update(obs)
         self.rewards.update(self._compressed(rewards))
 

@@ -1,4 +1,4 @@
-"""What a policy's networks must know of the world they were made for; a checkpoint keeps it."""
+"""The sizes and groups of the world for which a policy's networks were made; a checkpoint keeps them."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Shape:
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
-        """That of a world."""
+        """Return the shape of a world."""
         observations, actions = world.single_observation_space, world.single_action_space
         hidden = int(getattr(world, "hidden_size", 0))
         groups = tuple(world.observation_groups)
@@ -31,15 +31,15 @@ class Shape:
 
     @property
     def num_id_columns(self) -> int:
-        """Entries of the task's one-hot, 0 where the observation has none."""
+        """Return the entries of the task's one-hot, 0 if the observation has none."""
         return sum(group.size for group in self.groups if group.name == "task_id")
 
     def sizes(self) -> dict[str, int]:
-        """The numbers without the places of the groups."""
+        """Return the sizes without the positions of the groups."""
         return {"observations": self.observations, "actions": self.actions, "num_id_columns": self.num_id_columns}
 
     def state_dict(self) -> State:
-        """Plain values for a checkpoint."""
+        """Return plain values for a checkpoint."""
         hidden = {"hidden": self.hidden} if self.hidden else {}
         classes = {"classes": self.classes} if self.classes > 1 else {}
         groups = {group.name: [[where.start, where.stop] for where in group.where] for group in self.groups}
@@ -57,10 +57,12 @@ _OF_SEVERAL = ("task_embedding", "normalise_per_task")
 
 
 def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: Shape) -> None:
-    """Options that tell tasks apart need the one-hot of the tasks. Raises BidexError: the world does not show one."""
+    """Raise BidexError if an option needs the tasks' one-hot and the world does not show it."""
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
-        wanted = [option for option in wanted if option not in _OF_SEVERAL]  # one task needs none; heads it cannot have
+        wanted = [
+            option for option in wanted if option not in _OF_SEVERAL
+        ]  # one task needs no one-hot, but cannot have heads
     if isinstance(config, ArchitectureConfig) and not config.shares_a_trunk:
         wanted.append(f"architecture {config.architecture}")
     for option in wanted:
@@ -72,7 +74,7 @@ def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: S
 
 
 def check_discounts(name: str, world: VectorWorld, by_class: bool) -> None:
-    """A suite's own discounts need a learner that takes them. Raises BidexError: this one does not."""
+    """Raise BidexError if classes of a suite have their own discounts and the learner has a single one."""
     own = [task for task, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
     if own and not by_class:
         raise BidexError(

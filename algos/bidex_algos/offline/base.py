@@ -1,6 +1,6 @@
-"""What the offline learners share: batches of stored transitions, critics and targets, updates, checkpoints.
+"""The base of the offline learners: batches of stored transitions, critics and targets, updates, checkpoints.
 
-The world tells sizes and names and is never stepped; what other learners count as environment steps are updates here.
+The world provides sizes and names and is never stepped; ``env_steps`` counts updates instead of environment steps.
 """
 
 import copy
@@ -28,7 +28,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class OfflineConfig(NetworkConfig):
-    """Networks, batches, statistics; the defaults are the preset ``laptop``."""
+    """Options of networks, batches and statistics; the defaults are the preset ``laptop``."""
 
     updates_per_iteration: Count = 1000  # Updates between two reports, which --evaluate-every and --video-every count.
     batch_size: Count = 256  # Transitions of an update, split evenly over the tasks.
@@ -43,13 +43,13 @@ class OfflineConfig(NetworkConfig):
     autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Of the networks; the data are counted when they are read."""
+        """Estimate the bytes of the networks; the data are counted when they are read."""
         return network_bytes(self.hidden, width, 4)
 
 
 @dataclass(frozen=True)
 class CriticConfig(OfflineConfig):
-    """What learners with critics add."""
+    """Additional options of learners with critics."""
 
     value_heads: bool = True  # Give each critic one output per task instead of one for all.
     critic_layer_norm: bool = True
@@ -61,7 +61,7 @@ class CriticConfig(OfflineConfig):
 
 
 PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
-"""What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
+"""Options that the preset ``paper`` turns off in all learners with critics: Table 46 and the papers lack them."""
 
 
 class Batches:
@@ -78,14 +78,14 @@ class Batches:
         self.fingerprint = data.fingerprint()
 
     def draw(self, batches: int, generator: torch.Generator) -> Tensor:
-        """Places of transitions, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
         shape = (batches, len(self._count), self._per_task)
         # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
         drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]
         return self._of_task[self._first[:, None] + drawn].flatten(1)
 
     def take(self, places: Tensor) -> Transitions:
-        """The transitions at ``places`` (B,)."""
+        """Return the transitions at the indices ``places`` (B,)."""
         at = self._at[places]
         return Transitions(
             obs=self._observations.index_select(0, at), actions=self._actions.index_select(0, places),
@@ -94,15 +94,15 @@ class Batches:
         )  # fmt: skip
 
     def chunks(self) -> tuple[Tensor, ...]:
-        """All states, some at a time, (n, d) each."""
+        """Return all states in chunks, (n, d) each."""
         return self._observations.split(65_536)
 
 
 def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Tensor:
-    """Standard deviation of each task's discounted returns, from every state to the end of its episode: (num_tasks,).
+    """Return the standard deviation of each task's discounted returns, from every state to the end: (num_tasks,).
 
-    An episode that was cut by time counts up to there; 1 where all returns are equal; ``gamma`` for all or
-    (num_tasks,). The steps that a sum spans are doubled until it spans the longest episode.
+    An episode that a time limit cut counts up to the cut. The result is 1 if all returns are equal. ``gamma`` is a
+    number or (num_tasks,). The steps that a sum spans are doubled until the sum spans the longest episode.
     """
     returns = data.rewards.double()
     factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]
@@ -110,7 +110,7 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
     while span < longest:
         inside = data.left[:-span] >= span
         behind = factor[:-span] ** span * returns[span:]
-        # One sum of both, not in place: what stands behind must still be of the shorter span.
+        # The sum is not in place, because the later entries must still have the shorter span.
         returns = torch.cat([returns[:-span] + torch.where(inside, behind, 0.0), returns[-span:]])
         span *= 2
     count = torch.bincount(data.task, minlength=num_tasks)
@@ -123,8 +123,8 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
 class Offline(Learner):
     """A learner from data (``Sources.data``).
 
-    ``generator`` draws transitions alone, so that learners of one seed see the same ones, ``noise`` all else. A batch
-    has ``batch_per_task`` of each task, task after task (``task_of_draw``).
+    ``generator`` draws only transitions, so that learners of one seed see the same transitions; ``noise`` draws
+    everything else. A batch has ``batch_per_task`` transitions of each task, task after task (``task_of_draw``).
     """
 
     offline = True
@@ -151,7 +151,7 @@ class Offline(Learner):
         self._batches = self._read(sources.data)
 
     def _read(self, data: Joined) -> Batches:
-        """Return the batches of transitions, and take their statistics of observations and returns."""
+        """Return the batches of transitions, and compute their statistics of observations and returns."""
         tasks = self.world.num_tasks
         batches = Batches(data, tasks, self.batch_per_task, self.device)
         for chunk in batches.chunks():
@@ -163,7 +163,7 @@ class Offline(Learner):
 
     @abstractmethod
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
-        """One update of all networks by a batch, task after task; returns scalars to be logged, as means."""
+        """Update all networks once with a batch, task after task; return scalars to be logged, as means."""
 
     def _make_critics(self) -> Critics:
         heads = self.world.num_tasks if self.config.value_heads else 1

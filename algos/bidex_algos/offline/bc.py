@@ -1,4 +1,4 @@
-"""BC: an actor that does in each state what the data did (behaviour cloning), by the mean squared distance."""
+"""BC: an actor that repeats the data's action in each state (behaviour cloning), by the mean squared distance."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ from bidex_algos.replay import Transitions
 
 @dataclass(frozen=True)
 class BCConfig(OfflineConfig):
-    """Everything that can be set about BC; the defaults are the preset ``laptop``."""
+    """All options of BC; the defaults are the preset ``laptop``."""
 
 
-# Bi-DexHands compares with BC and has no table for it: layers, step size and batch are TD3+BC's of Table 46.
+# Bi-DexHands has results for BC but no table; layers, step size and batch are TD3+BC's in Table 46.
 PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 
 

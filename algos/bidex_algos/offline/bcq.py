@@ -1,7 +1,8 @@
 """BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; appendix B.3.1).
 
-G down on |G(s, z) - a|^2 + KL, z the code of a; a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, |xi'| <= Phi;
-Q_i towards r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j); xi up on Q_1(s, a + xi(s, a)).
+G minimises |G(s, z) - a|^2 + KL, with z the code of a. Let a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, with
+|xi'| <= Phi. Q_i regresses to r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j). xi maximises
+Q_1(s, a + xi(s, a)).
 """
 
 import copy
@@ -24,13 +25,13 @@ from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-_FARTHEST = 0.5  # codes are cut to this when actions are proposed: near the middle the model has seen most
+_FARTHEST = 0.5  # bound of the codes of proposed actions: the model has seen most data near the middle
 _LOG_STD = (-4.0, 15.0)
 
 
 @dataclass(frozen=True)
 class BCQConfig(CriticConfig):
-    """Everything that can be set about BCQ; the defaults are the preset ``laptop``."""
+    """All options of BCQ; the defaults are the preset ``laptop``."""
 
     vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the actions' model, a variational autoencoder.
     vae_learning_rate: Positive = 1e-3  # Adam's step size for it.
@@ -41,12 +42,12 @@ class BCQConfig(CriticConfig):
     lower_weight: Fraction = 0.75  # Weight of the lower of both critics in a target; the higher one has the rest.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As of its base, with the autoencoder."""
+        """Estimate the bytes of memory as in the base class, with the autoencoder."""
         return super().bytes_held(num_envs, width) + network_bytes(self.vae_hidden, width, 2)
 
 
-# "paper": layers, step size, batch, Phi and the number of actions are Table 46's; the autoencoder's layers, its weight
-# and lower_weight, which it leaves out, those of Fujimoto et al. (2019, their code).
+# "paper": layers, step size, batch, Phi and the number of actions are from Table 46. The table omits the autoencoder's
+# layers, its weight and lower_weight; these values are from Fujimoto et al. (2019, their code).
 PRESETS: dict[str, BCQConfig] = {
     "paper": BCQConfig(
         hidden=(400, 300), vae_hidden=(750, 750), learning_rate=1e-3, critic_learning_rate=1e-3, batch_size=100,
@@ -57,7 +58,7 @@ PRESETS: dict[str, BCQConfig] = {
 
 
 class ActionModel(nn.Module):
-    """A conditional variational autoencoder: which actions the data hold in a state; a code has ``codes`` entries."""
+    """A conditional variational autoencoder of the data's actions in a state; a code has ``codes`` entries."""
 
     def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
         super().__init__()
@@ -67,25 +68,25 @@ class ActionModel(nn.Module):
         self.decoder = MLP(decoded, config.vae_hidden, actions, 1.0, generator, config.activation)
 
     def encode(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and logarithm of the standard deviation of the codes of actions (B, a): (B, z) each."""
+        """Return mean and log standard deviation of the codes of actions (B, a): (B, z) each."""
         mean, log_std = self.encoder(torch.cat([obs, actions], 1)).chunk(2, 1)
         return mean, log_std.clamp(*_LOG_STD)
 
     def decode(self, obs: Tensor, codes: Tensor) -> Tensor:
-        """Actions (B, a) in [-1, 1] of codes (B, z)."""
+        """Return actions (B, a) in [-1, 1] of codes (B, z)."""
         return torch.tanh(self.decoder(torch.cat([obs, codes], 1)))
 
 
 def bounded(codes: Tensor) -> Tensor:
-    """Standard normal codes, cut to where the model is sure."""
+    """Clamp standard normal codes to the range in which the model is reliable."""
     return codes.clamp(-_FARTHEST, _FARTHEST)
 
 
 class BCQPolicy(nn.Module):
-    """The best, by the first critic, of what ``model`` proposes and ``actor`` changes, on raw observations.
+    """A policy on raw observations that selects the best proposed action by the first critic.
 
-    The codes of the proposals are the same in every state, drawn when the policy is created: the policy is a function
-    of the observation.
+    ``model`` proposes actions and ``actor`` changes them. The codes of the proposals are drawn when the policy is
+    created and are equal in every state, so that the policy is a function of the observation.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class BCQPolicy(nn.Module):
             judged, config.hidden, shape.actions, heads if config.policy_heads else 1, generator, config.activation,
             network_of(config)
         )  # fmt: skip
-        # A policy knows its task by the one-hot alone: without it, one value serves all.
+        # A policy knows its task only by the one-hot; without a one-hot, one value serves all tasks.
         judges = heads if config.value_heads and heads else 1
         self.critic = Critics(judged, judges, config, config.critic_layer_norm, generator)
         self.model = ActionModel(inputs, config, shape.actions, generator)
@@ -108,20 +109,20 @@ class BCQPolicy(nn.Module):
         self.register_buffer("codes", bounded(torch.randn(config.candidates, self.model.codes, generator=generator)))
 
     def propose(self, actor: nn.Module, obs: Tensor, codes: Tensor) -> Tensor:
-        """Actions (B, a) of codes (B, z), changed by ``actor``, for normalised observations (B, d)."""
+        """Return actions (B, a) of codes (B, z), changed by ``actor``, for normalised observations (B, d)."""
         return self.changed(actor, obs, self.model.decode(obs, codes))
 
     def changed(self, actor: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:
-        """Actions (B, a), each moved by no more than ``perturbation``, within [-1, 1]."""
+        """Move each of the actions (B, a) by at most ``perturbation``, within [-1, 1]."""
         moved = actions + self.perturbation * actor(torch.cat([obs, actions], 1))
         return moved.clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes; the argument is part of the Agent protocol."""
+        """Do nothing: no state has to be forgotten between episodes; the argument is part of the Agent protocol."""
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The action for raw observations (N, d): (N, a) in [-1, 1]."""
+        """Return the action for raw observations (N, d): (N, a) in [-1, 1]."""
         count, rows = len(self.codes), len(obs)
         many = self.observations(obs).repeat_interleave(count, 0)
         with autocast(obs.device, self.low_precision):
@@ -197,6 +198,6 @@ class BCQ(Offline):
 
 
 def best_of(values: Tensor, count: int, lower_weight: float) -> Tensor:
-    """The best proposal's value of each state (B,), of both critics' values (2, B * count), state after state."""
+    """Return the best proposal's value of each state (B,) from both critics' values (2, B * count), by state."""
     mixed = lower_weight * values.amin(0) + (1.0 - lower_weight) * values.amax(0)
     return mixed.view(-1, count).amax(1)

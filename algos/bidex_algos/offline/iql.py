@@ -1,7 +1,7 @@
-"""IQL: values without an action that the data do not hold (Kostrikov et al. 2022; appendix B.3.3).
+"""IQL: values computed only from actions of the data (Kostrikov et al. 2022; appendix B.3.3).
 
-V down on |t - 1(u < 0)| u^2, u = min_i Q'_i(s, a) - V(s): the t-expectile of the data's actions; pi up on
-min(exp(beta u), bound) log pi(a | s); Q_i towards r + gamma (1 - terminated) V(s').
+V minimises |t - 1(u < 0)| u^2 with u = min_i Q'_i(s, a) - V(s), so V is the t-expectile over the data's actions. pi
+maximises min(exp(beta u), bound) log pi(a | s). Q_i regresses to r + gamma (1 - terminated) V(s').
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class IQLConfig(CriticConfig):
-    """Everything that can be set about IQL; the defaults are the preset ``laptop``."""
+    """All options of IQL; the defaults are the preset ``laptop``."""
 
     expectile: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.7
     """Which expectile of the values of the data's actions a state is worth: 0.5 their mean, towards 1 the best one."""
@@ -38,15 +38,15 @@ class IQLConfig(CriticConfig):
         check_rising(self, self.algo, "std_range")
 
 
-# Table 46's numbers are the defaults. The bound of the weight is that of Kostrikov et al. (2022, their code).
+# The defaults are from Table 46. The bound of the weight is from Kostrikov et al. (2022, their code).
 PRESETS: dict[str, IQLConfig] = {"paper": IQLConfig(normalise_observations=False, **PAPER), "laptop": IQLConfig()}
 
 
 class BoundedMean(GaussianActor):
-    """A Gaussian whose mean is squashed by tanh; arguments are those of its base."""
+    """A Gaussian whose mean is squashed by tanh; arguments as in the base class."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mean action of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        """Return the mean action for normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
         return torch.tanh(super().forward(x))
 
 
@@ -98,5 +98,8 @@ class IQL(Offline):
 
 
 def expectile_loss(ahead: Tensor, expectile: float) -> Tensor:
-    """|t - 1(u < 0)| u^2 of each difference u; its mean is least where the t-expectile is subtracted. Shape of u."""
+    """Return |t - 1(u < 0)| u^2 of each difference u, in the shape of u.
+
+    The mean of the loss is smallest if the subtracted value is the t-expectile.
+    """
     return torch.where(ahead < 0.0, 1.0 - expectile, expectile) * ahead.square()

@@ -1,6 +1,7 @@
 """TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
 
-TD3's targets and delay; mu down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)), lambda = alpha / mean |Q_1(s, mu(s))|.
+Targets and delay are TD3's. mu minimises (mu(s) - a)^2 - lambda Q_1(s, mu(s)), with lambda = alpha / mean |Q_1(s,
+mu(s))|.
 """
 
 import copy
@@ -21,7 +22,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class TD3BCConfig(CriticConfig):
-    """Everything that can be set about TD3+BC; the defaults are the preset ``laptop``."""
+    """All options of TD3+BC; the defaults are the preset ``laptop``."""
 
     alpha: NonNegative = 2.5
     """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
@@ -30,8 +31,8 @@ class TD3BCConfig(CriticConfig):
     policy_delay: Count = 2  # Updates of the critics for each of the actor and the targets.
 
 
-# "paper": alpha is Table 46's, whose other numbers are the defaults; noise, its bound and the delay, which it leaves
-# out, and alpha of "laptop" are those of Fujimoto and Gu (2021, table 3), who also normalise observations.
+# "paper": alpha is from Table 46, whose other numbers are the defaults. The table omits noise, its bound and the delay;
+# these values, and alpha of "laptop", are from Fujimoto and Gu (2021, table 3), who also normalise observations.
 PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "laptop": TD3BCConfig()}
 
 

@@ -1,8 +1,8 @@
-"""What the off-policy learners share: a replay per task, updates after each step, critics, targets, checkpoints.
+"""The base of the off-policy learners: a replay per task, updates after each step, critics, targets, checkpoints.
 
-They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is some
-times one step in every environment, then ``updates_per_step`` updates on equally many transitions of each task. Rewards
-are divided by the running deviation of their task's discounted return, so that no task outweighs another.
+The learners differ in exploration, in the critics' targets and in the actor's update. An iteration repeats one step in
+every environment, followed by ``updates_per_step`` updates on the same number of transitions of each task. Rewards are
+divided by the running standard deviation of their task's discounted return, so that no task dominates another.
 """
 
 import copy
@@ -31,7 +31,7 @@ from bidex_meta.world.contract import Info, VectorWorld
 
 @dataclass(frozen=True)
 class OffPolicyConfig(NetworkConfig):
-    """Networks, replay, updates, statistics; a vector step is one step in every environment of the world."""
+    """Options of networks, replay, updates, statistics; a vector step is one step in every environment of the world."""
 
     value_heads: bool = True  # Give each critic one output per task instead of one for all.
     critic_layer_norm: bool = True
@@ -61,18 +61,18 @@ class OffPolicyConfig(NetworkConfig):
     autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 3)
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """As in the base: the replay."""
+        """Estimate the bytes of the replay, as in the base class."""
         return int(min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps))
 
 
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is for all, or of each environment (N,).
+    Returns of a task fade after ``horizon`` newer ones. ``gamma`` is a number, or one per environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -81,7 +81,7 @@ class ReturnScale:
         self.discounted = torch.zeros(world.num_envs, device=world.device)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """Takes one step of all environments: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        """Add one step of all environments: rewards (N,) and end flags, bool (N,); broken steps do not count."""
         self.discounted = self.gamma * self.discounted + reward
         self._take(truncated & ~terminated, ~broken)
         self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
@@ -90,20 +90,20 @@ class ReturnScale:
         self.stats.merge(*task_moments(self.discounted[None], self.task_id, self.num_tasks, valid[None]))
 
     def deviation(self) -> Tensor:
-        """The deviation of each task's returns, at least a tenth of their mean (num_tasks,)."""
-        # Where all returns are about the same, their deviation alone would blow them up.
+        """Return the standard deviation of each task's returns (num_tasks,), at least a tenth of their mean."""
+        # If all returns are almost equal, dividing by their standard deviation would inflate them.
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 
     def parts(self) -> Parts:
-        """What a checkpoint holds, by name."""
+        """Return the parts that a checkpoint holds, by name."""
         return {"return_stats": self.stats, "discounted": self.discounted}
 
 
 class OffPolicy(Learner):
-    """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
+    """An actor and critics that learn from a replay; critics learn from the next state's value by target networks.
 
-    Of several processes each has a replay and draws ``batch_per_task`` of each task, task after task
-    (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are discounts of environments and of a draw.
+    With several processes each has a replay and draws ``batch_per_task`` transitions of each task, task after task
+    (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are the discounts of environments and of a draw.
     """
 
     config: OffPolicyConfig
@@ -130,7 +130,7 @@ class OffPolicy(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
         self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
-        # Rewards that have left the replay fade from the statistics too.
+        # Rewards that have left the replay also fade from the statistics.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
@@ -146,11 +146,14 @@ class OffPolicy(Learner):
 
     @abstractmethod
     def _explore(self, obs: Tensor) -> Tensor:
-        """Actions (N, a) in [-1, 1] to try, for raw observations (N, d)."""
+        """Return exploring actions (N, a) in [-1, 1] for raw observations (N, d)."""
 
     @abstractmethod
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update by a draw (B), whose weights (B,) are 0 for what teaches nothing; ``counts``: of all processes."""
+        """Update the networks once with a draw (B).
+
+        ``weights`` (B,) are 0 for transitions that teach nothing; ``counts`` cover all processes.
+        """
 
     def _own_parts(self) -> Parts:
         return {}
@@ -192,7 +195,7 @@ class OffPolicy(Learner):
         return info["unstable"].sum()
 
     def _note(self, reward: Tensor, info: Info) -> None:
-        """Takes rewards (N,) and report of a step, after the replay and the statistics."""
+        """Handle rewards (N,) and info of a step, after the replay and the statistics."""
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()
@@ -203,7 +206,7 @@ class OffPolicy(Learner):
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
         stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
         weights = self.replay.weights(stretches.last)
-        # Divided by the draws of all processes, losses and gradients become means by being summed over them.
+        # Losses and gradients are divided by the draws of all processes, so their sum over processes is a mean.
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
         return [self._update(stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
@@ -215,7 +218,7 @@ class OffPolicy(Learner):
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next value, 0 after a true end."""
+        """Return targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next value, 0 after a true end."""
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
         return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
@@ -223,9 +226,9 @@ class OffPolicy(Learner):
         self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor,
         beside: Tensor | float = 0.0, also: Iterable[nn.Parameter] = ()
     ) -> dict[str, Tensor]:  # fmt: skip
-        """One step of all critics towards ``target`` (B, ...), of normalised observations (B, d).
+        """Take one step of all critics towards ``target`` (B, ...), for normalised observations (B, d).
 
-        What their optimiser has ``also`` goes down their loss and another one ``beside``.
+        The parameters ``also`` belong to the critics' optimiser and descend the critics' loss plus the loss ``beside``.
         """
         losses, values = self._critic_losses(obs, draw.actions, target)
         loss = (weights / counts.sum().clamp_min(1.0) * losses).sum()
@@ -240,7 +243,7 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """One step of the optimisers named, down ``loss`` summed over processes; sums ``numbers`` (n,) too."""
+        """Take one step of the named optimisers down ``loss`` summed over processes; also sum ``numbers`` (n,)."""
         weights = [weight for each in parameters.values() for weight in each]
         for name in parameters:
             self.adams[name].zero_grad()
@@ -260,10 +263,10 @@ class OffPolicy(Learner):
         return {**networks, "adams": self.adams, **statistics}
 
     def state_dict(self) -> State:
-        """As in the base; the replay makes its own copy, since two of it at once may not fit."""
+        """Return the state as in the base class; the replay copies itself, because two copies at once may not fit."""
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or replay had another size."""
+        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the replay had another size."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)

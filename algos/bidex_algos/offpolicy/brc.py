@@ -1,8 +1,9 @@
-"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks by one large critic.
+"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks, one large critic.
 
-Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' the mean of both critics' distributions,
-which are wide residual networks; rewards are over their task's largest return (the paper's equation 2); the task enters
-by a learned vector of length 1. All else is as in ``mtsac.py`` and ``categorical.py``; see ``docs/learners/brc.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' the mean of both critics'
+distributions. The critics are wide residual networks. Rewards are divided by their task's largest return (equation 2 of
+the paper). The task enters as a learned vector of length 1. The rest is described in ``mtsac.py`` and
+``categorical.py``; see ``docs/learners/brc.md``.
 """
 
 import math
@@ -24,7 +25,7 @@ from bidex_meta.utils.validation import Count, Finite, NonNegative, Share, Whole
 
 
 class ResidualBlock(nn.Module):
-    """x plus two normalised layers of it, with the non-linearity between them; sizes stay as they are."""
+    """Adds to x two normalised layers of x, with the non-linearity between the layers; sizes do not change."""
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -33,15 +34,15 @@ class ResidualBlock(nn.Module):
         self.layers = nn.Sequential(first, norms[0], ACTIVATIONS[activation](), second, norms[1])
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, width) to (batch, width)."""
+        """Map (batch, width) to (batch, width)."""
         return x + self.layers(x)
 
 
 class ResidualMLP(MLP):
-    """One normalised layer, then residual blocks: stands in the place of :class:`MLP`, whose arguments it takes.
+    """One normalised layer followed by residual blocks; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` is the width as often as there are blocks, and once more for the first layer. The layer norm is part of
-    it: ``layer_norm`` changes nothing.
+    ``hidden`` repeats the width once per block, plus once for the first layer. The layer norm is always used;
+    ``layer_norm`` has no effect.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class ResidualMLP(MLP):
 
 @dataclass(frozen=True)
 class BRCConfig(CategoricalConfig, MTSACConfig):
-    """Everything that can be set about BRC; the defaults are the preset ``laptop``."""
+    """All options of BRC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (256, 256, 256)
     """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
@@ -77,10 +78,11 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
 
 PRESETS: dict[str, BRCConfig] = {
-    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py, jaxrl/agent/brc_learner.py and
-    # jaxrl/networks.py. There each task has one environment, 5,000 transitions of it come first and 1,000,000 are kept:
-    # here as many at 256 environments of each task. Log standard deviations go from -10 to 2 and begin in the middle.
-    # Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as they are.
+    # The values are from the authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py,
+    # jaxrl/agent/brc_learner.py and jaxrl/networks.py. There each task has one environment, a warm-up of 5,000
+    # transitions and a replay of 1,000,000; the same numbers result here with 256 environments per task. Log standard
+    # deviations range from -10 to 2 and start in the middle. The decay is AdamW's default there, 1e-4. The gradient has
+    # no limit (here a huge one), and observations are not normalised.
     "paper": BRCConfig(
         hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
         batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
@@ -112,7 +114,7 @@ class BRC(Categorical, MTSAC):
         tasks = torch.arange(self.world.num_tasks, device=self.device)
         gamma = discounts(self.world, self.config.gamma, tasks)
         bound, each = self.config.value_bound, abs(self.target_entropy) / (1.0 - gamma)
-        # Room for the entropy of all steps to come, but half of the atoms are the rewards' in any case.
+        # Room for the entropy of all future steps, but at least half of the range is left for rewards.
         room = bound - (self.log_alpha.detach().exp() * each).clamp_max(0.5 * bound)
         return (self.returns.bound / room).clamp_min(1e-8)
 

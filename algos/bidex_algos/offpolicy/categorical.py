@@ -1,8 +1,9 @@
-"""What FastTD3, BRC and FlashSAC share: critics that give a distribution of the return, taught by cross-entropy.
+"""The base of FastTD3, BRC and FlashSAC: critics that predict a distribution of the return, trained by cross-entropy.
 
-Z(s, a) has probabilities of fixed values ("atoms"); targets r + gamma (1 - terminated) Z'(s', a') are projected back on
-them (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike a regression's, its gradient does not grow with the scale of
-a task's returns; but rewards must be scaled into the atoms' range, by the task's largest return (``ReturnBound``).
+Z(s, a) has probabilities of fixed values ("atoms"). Targets r + gamma (1 - terminated) Z'(s', a') are projected back on
+the atoms (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike in regression, the gradient does not grow with the
+scale of a task's returns. However, rewards must be scaled into the atoms' range by the task's largest return
+(``ReturnBound``).
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from bidex_meta.world.contract import VectorWorld
 
 
 class Atoms(nn.Module):
-    """``count`` values (A >= 2), evenly spaced, that a distribution gives probabilities to; it has no weights."""
+    """``count`` (A >= 2) evenly spaced values with probabilities given by a distribution; the module has no weights."""
 
     def __init__(self, low: float, high: float, count: int):
         super().__init__()
@@ -34,20 +35,20 @@ class Atoms(nn.Module):
         self.register_buffer("values", torch.linspace(low, high, count), persistent=False)
 
     def mean(self, probs: Tensor) -> Tensor:
-        """Expected values (...) of distributions (..., A)."""
+        """Return expected values (...) of distributions (..., A)."""
         return (probs * self.values).sum(-1)
 
     def projected(self, probs: Tensor, shift: Tensor, factor: Tensor) -> Tensor:
-        """The distribution (B, A) of shift + factor * Z on the atoms, where Z is distributed as ``probs`` (B, A).
+        """Return the distribution (B, A) of shift + factor * Z on the atoms, with Z distributed as ``probs`` (B, A).
 
-        What falls between two atoms is split between them so that its mean stays; what falls beyond the range goes to
-        the atom at its end. ``shift`` and ``factor`` are (B,).
+        Probability between two atoms is split so that its mean does not change. Probability beyond the range goes to
+        the atom at that end. ``shift`` and ``factor`` are (B,).
         """
         moved = shift[:, None] + factor[:, None] * self.values
-        # In units of the distance of two atoms, from the lowest.
+        # Positions in units of the distance between two atoms, counted from the lowest.
         place = (moved.clamp(self.low, self.high) - self.low) * ((self.count - 1) / (self.high - self.low))
         share = place - place.floor()
-        # What is not a number shall stay so and not become a place in memory.
+        # NaN must stay NaN and must not become an index.
         index = place.long().clamp(0, self.count - 1)
         out = torch.zeros_like(probs).scatter_add_(1, index, probs * (1.0 - share))
         return out.scatter_add_(1, (index + 1).clamp_max(self.count - 1), probs * share)
@@ -55,7 +56,7 @@ class Atoms(nn.Module):
 
 @dataclass(frozen=True)
 class CategoricalConfig(OffPolicyConfig):
-    """The critics' distributions and layers, beside what all off-policy learners have."""
+    """Options of the critics' distributions and layers, in addition to the options of all off-policy learners."""
 
     critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; ``hidden`` is then the actor's alone.
     atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Values that a distribution of the return gives probabilities to.
@@ -63,12 +64,12 @@ class CategoricalConfig(OffPolicyConfig):
     clipped_double_q: bool = True  # Targets and actor take the critic that says less; off: the mean of both.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base, where ``hidden`` is of all networks, and the critics'."""
+        """Estimate the bytes as in the base class, which counts ``hidden`` for all networks, plus the critics'."""
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 
 def check_residual(config: CategoricalConfig) -> None:
-    """Raises BidexError where residual networks cannot be made of a config's layers."""
+    """Raise BidexError if residual networks cannot be made of a config's layers."""
     if not config.shares_a_trunk:
         raise BidexError(f"{config.algo}: its networks are residual; architecture must be shared or multi_head.")
     for name, widths in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
@@ -77,7 +78,7 @@ def check_residual(config: CategoricalConfig) -> None:
 
 
 class CategoricalCritics(nn.Module):
-    """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
+    """Networks of observation and action that predict distributions; arguments as for ``Critics``."""
 
     def __init__(
         self, inputs: int | Inputs, heads: int, config: CategoricalConfig, generator: torch.Generator, count: int,
@@ -89,8 +90,9 @@ class CategoricalCritics(nn.Module):
         outputs, norm = heads * config.atoms, config.critic_layer_norm
         given = inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm
         nets = [network(*given) for _ in range(count)]
-        # At first the mean is 0, the deviation a tenth of the bound: from an even distribution, which is much wider,
-        # means move slowly, since a cross-entropy pulls at them with its inverse variance.
+        # At first the mean is 0 and the standard deviation a tenth of the bound. From a uniform distribution, which is
+        # much wider, means would move slowly, because the gradient of a cross-entropy on them scales with the inverse
+        # variance.
         place = self.atoms.values / (0.1 * config.value_bound)
         with torch.no_grad():
             for net in nets:
@@ -98,7 +100,10 @@ class CategoricalCritics(nn.Module):
         self.nets = nn.ModuleList(nets)
 
     def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Of each atom: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms)."""
+        """Return each atom's log-probability: observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms).
+
+        The observations are normalised.
+        """
         x = torch.cat([obs, actions], dim=1)
         logits = torch.stack([net(x) for net in self.nets])
         if self.heads > 1:
@@ -107,19 +112,20 @@ class CategoricalCritics(nn.Module):
         return torch.log_softmax(logits, dim=2)
 
     def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Expected values (count, B); arguments as for :meth:`log_probs`."""
+        """Return expected values (count, B); arguments as for :meth:`log_probs`."""
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
-RECENT = 0.9  # weight of a reward in the recent ones' mean over that of the next: about the last ten steps count
+RECENT = 0.9  # decay per step of the mean of recent rewards: about the last ten steps count
 
 
 class ReturnBound(ReturnScale):
-    """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
+    """Adds to the statistics the largest absolute return of each task, which a fixed range of values must contain.
 
-    The sum is discounted towards the episode's beginning, since its end is not known; both weigh any stretch of rewards
-    alike. At a time limit the episode is taken to go on as it went, or as it went most recently if that is more.
-    ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most :data:`RECENT` (2, N).
+    The sum is discounted towards the episode's beginning, because its end is unknown; both directions weigh any stretch
+    of rewards equally. At a time limit the episode is assumed to continue at its mean reward, or at its most recent
+    reward if that is larger. ``mass`` is the sum (N,) if all rewards had been 1; ``recent`` holds both sums with a
+    discount of at most :data:`RECENT` (2, N).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -130,7 +136,7 @@ class ReturnBound(ReturnScale):
         self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """As in the base."""
+        """Add one step as in the base class."""
         self.mass = self.gamma * self.mass + 1.0
         self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
         super().note(reward, terminated, truncated, broken)
@@ -145,12 +151,15 @@ class ReturnBound(ReturnScale):
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
 
     def parts(self) -> Parts:
-        """As in the base."""
+        """Return the parts that a checkpoint holds, as in the base class."""
         return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}
 
 
 class Categorical(OffPolicy):
-    """The part of a learner with such critics that knows no actor; stands before the learner whose actor it takes."""
+    """The part of a learner with categorical critics that does not depend on the actor.
+
+    In a class's bases it precedes the learner whose actor it uses.
+    """
 
     config: CategoricalConfig
     critic: CategoricalCritics
@@ -180,7 +189,10 @@ class Categorical(OffPolicy):
         return probs.gather(0, lower.view(1, -1, 1).expand(1, -1, probs.shape[2]))[0]
 
     def _projected(self, draw: Transitions, following: Tensor, bonus: Tensor) -> Tensor:
-        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``."""
+        """Return targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z).
+
+        The distribution of Z is ``following``.
+        """
         shift = self._bootstrapped(draw, bonus)
         factor = (self.gamma_of_draw**draw.steps) * (~draw.terminated).to(shift.dtype)
         return self.critic.atoms.projected(following, shift, factor)

@@ -1,8 +1,9 @@
 """DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
-Q towards r + gamma (1 - terminated) Q'(s', mu'(s')), mu up on Q(s, mu(s)). A critic's slope drives actions into corners
-where tanh has no slope back (on two hands 86 % were beyond 0.99 after 0.4 M steps): ``squash_price`` keeps them out.
-The noise, normal, differs in size from environment to environment of a task (the spread of Horgan et al. 2018).
+Q regresses to r + gamma (1 - terminated) Q'(s', mu'(s')); mu maximises Q(s, mu(s)). The critic's slope drives actions
+to the bounds, where tanh has almost no slope (on two hands 86 % of the actions exceeded 0.99 after 0.4 M steps);
+``squash_price`` prevents this. The noise is normal; its size differs between the environments of a task (the spread of
+Horgan et al. 2018).
 """
 
 import copy
@@ -24,7 +25,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class DDPGConfig(OffPolicyConfig):
-    """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
+    """All options of DDPG; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
     """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
@@ -41,10 +42,10 @@ OF_PAPER: Options = {
     "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
     "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
 }  # fmt: skip
-"""What DDPG and TD3 share of the preset ``paper``. The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no
-table for either. Table 43 (SAC, "other tasks") has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps
-of replay and 1 epoch of 4 mini-batches of 32 (here of each task); Table 49 32 steps between two reports. The noise of
-0.1 is Fujimoto et al.'s (2018, section 6.1)."""
+"""Values of the preset ``paper`` shared by DDPG and TD3. The Bi-DexHands appendix describes both (B.1.3, B.1.4) but has
+no table for either. Layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4
+mini-batches of 32 (here of each task) are from Table 43 (SAC, "other tasks"). The 32 steps between two reports are from
+Table 49. The noise of 0.1 is from Fujimoto et al. (2018, section 6.1)."""
 PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDPGConfig()}
 
 
@@ -58,8 +59,8 @@ class DDPG(OffPolicy):
     policy_of = staticmethod(deterministic_policy)
     num_critics = 1
     delayed_targets: ClassVar[bool] = True
-    """Whether targets take the actions of an actor that follows the actor, and all that follow move only when the actor
-    learns. Off: they take the present actor's, and the target critics move in each update."""
+    """True: targets use the actions of a target actor, and all target networks move only when the actor learns. False:
+    targets use the present actor's actions, and the target critics move in each update."""
 
     def __init__(self, world: VectorWorld, config: DDPGConfig, seed: int):
         super().__init__(world, config, seed)
@@ -119,7 +120,10 @@ class DDPG(OffPolicy):
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
-    """Numbers (N,) that go evenly from ``low`` in each task's first environment to ``high`` in its last, or only."""
+    """Return numbers (N,) that rise evenly from ``low`` in each task's first environment to ``high`` in its last.
+
+    A single environment gets ``high``.
+    """
     numbers = torch.empty(len(task_id), device=task_id.device)
     for task in range(num_tasks):
         rows = (task_id == task).nonzero().squeeze(1)

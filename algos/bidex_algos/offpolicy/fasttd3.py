@@ -1,8 +1,9 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-Few updates of many transitions follow each vector step; targets take the present actor's actions and follow fast, mu
-climbs min_i E Z_i, returns may take several steps, weights decay; rewards are over max(deviation, largest / bound) of
-their task's returns. All else is as in ``td3.py`` and ``categorical.py``; see ``docs/learners/fasttd3.md``.
+Few updates of many transitions follow each vector step. Targets use the present actor's actions, and target networks
+follow fast. mu climbs min_i E Z_i, returns may span several steps, and weights decay. Rewards are divided by
+max(standard deviation, largest / bound) of their task's returns. The rest is described in ``td3.py`` and
+``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Share
 
 @dataclass(frozen=True)
 class FastTD3Config(CategoricalConfig, TD3Config):
-    """Everything that can be set about FastTD3; the defaults are the preset ``laptop``."""
+    """All options of FastTD3; the defaults are the preset ``laptop``."""
 
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
@@ -27,10 +28,10 @@ class FastTD3Config(CategoricalConfig, TD3Config):
 
 
 PRESETS: dict[str, FastTD3Config] = {
-    # The authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py, 2025), since the paper
-    # has no table of all: replay, discount, steps, bound and scaled rewards of its class for several tasks
-    # (MTBenchArgs, MetaWorldMT10Args), the rest its defaults (BaseArgs), whose 0 for the gradient's norm means no
-    # limit. replay_memory holds those steps of its 4,096 environments, of 441 columns.
+    # The values are from the authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py,
+    # 2025), because the paper has no complete table. Replay, discount, steps, bound and scaled rewards are from its
+    # class for several tasks (MTBenchArgs, MetaWorldMT10Args). The rest are its defaults (BaseArgs), whose gradient
+    # norm of 0 means no limit. replay_memory holds these steps of its 4,096 environments, with 441 columns.
     "paper": FastTD3Config(
         hidden=(512, 256, 128), critic_hidden=(1024, 512, 256), critic_layer_norm=False, task_embedding=32,
         replay_steps=2048, replay_memory=18.0, warmup_steps=10, updates_per_step=2, batch_size=32_768, gamma=0.97,
@@ -39,8 +40,9 @@ PRESETS: dict[str, FastTD3Config] = {
         squash_price=0.0,
     ),
     "laptop": FastTD3Config(),
-    # Meta-World's suites on one core: discount, steps and bound of the authors' class for them, narrower layers, one
-    # update of fewer transitions: a vector step is 4 rows of a class here instead of hundreds.
+    # For Meta-World's suites on one core: discount, steps and bound are from the authors' class for these suites.
+    # Layers are narrower and there is one update of fewer transitions, because a vector step has 4 rows per class here
+    # instead of hundreds.
     "metaworld": FastTD3Config(
         hidden=(256, 256, 128), critic_hidden=(256, 256, 128), replay_steps=100_000, warmup_steps=500,
         steps_per_iteration=500, updates_per_step=1, batch_per_task=256, gamma=0.97, n_steps=8, tau=0.05,

@@ -1,9 +1,9 @@
 """FlashSAC: SAC with bounded networks and few updates of large batches (Kim et al. 2026, arXiv 2604.04539).
 
-Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' of the critic with the lower mean. Layers
-have rows of length 1, batch norms hold what they give in bounds; a critic sees (s, a) and (s', a') as one batch. Each
-environment repeats its noise for some steps. All else is as in ``mtsac.py`` and ``categorical.py``; differences from
-the paper: ``docs/learners/flashsac.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' of the critic with the lower mean.
+Layers have rows of length 1, and batch norms bound their outputs; a critic sees (s, a) and (s', a') as one batch. Each
+environment repeats its noise for some steps. The rest is described in ``mtsac.py`` and ``categorical.py``; for
+differences from the paper see ``docs/learners/flashsac.md``.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, Finite, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
-WIDER = 4  # width within a block over that of what it adds to
+WIDER = 4  # ratio of the width within a block to the width of its input
 MOMENTUM = 0.01  # share of a batch in the running statistics
 
 
@@ -37,7 +37,7 @@ def _directions(inputs: int, outputs: int, generator: torch.Generator) -> nn.Lin
 
 
 class InvertedBlock(nn.Module):
-    """x plus two layers of it without biases, each with batch norm and non-linearity, wide between them."""
+    """Adds to x two layers of x without biases, each with batch norm and non-linearity; the block is wider inside."""
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -48,7 +48,7 @@ class InvertedBlock(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, width) to (batch, width)."""
+        """Map (batch, width) to (batch, width)."""
         return x + self.layers(x)
 
 
@@ -56,15 +56,15 @@ class FloatRMSNorm(nn.RMSNorm):
     """Scales (..., n) to a root mean square of 1, in the precision of its weights."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (..., n) to (..., n)."""
+        """Map (..., n) to (..., n)."""
         return super().forward(x.to(self.weight.dtype))
 
 
 class UnitMLP(MLP):
-    """Batch norm, a layer, inverted blocks, RMS norm, output: stands in the place of :class:`MLP`, of its arguments.
+    """Batch norm, a layer, inverted blocks, RMS norm, output; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` is the width as often as there are blocks, and once more for the first layer; ``output_gain`` and
-    ``layer_norm`` change nothing. Batch norms go by running statistics except within :func:`by_batch`.
+    ``hidden`` repeats the width once per block, plus once for the first layer; ``output_gain`` and ``layer_norm`` have
+    no effect. Batch norms use running statistics except within :func:`by_batch`.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class UnitMLP(MLP):
 
     @torch.no_grad()
     def to_sphere(self) -> None:
-        """Scales rows of weights to length 1, scales and shifts of n-wide norms, as one vector, to sqrt(n)."""
+        """Scale rows of weights to length 1, and scales and shifts of n-wide norms, as one vector, to sqrt(n)."""
         for layer in (*self.body.modules(), self.head):
             if isinstance(layer, nn.Linear):
                 layer.weight.div_(layer.weight.norm(dim=1, keepdim=True).clamp_min(1e-8))
@@ -102,7 +102,7 @@ def _of(module: nn.Module) -> list[UnitMLP]:
 
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
-    """Within it batch norms go by the statistics of what they are given, and take them into the running ones."""
+    """Let batch norms within the context use their input's statistics and merge these into the running ones."""
     network.train()
     yield
     network.eval()
@@ -110,7 +110,7 @@ def by_batch(network: nn.Module) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class FlashSACConfig(CategoricalConfig, MTSACConfig):
-    """Everything that can be set about FlashSAC; the defaults are the preset ``laptop``."""
+    """All options of FlashSAC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (128, 128, 128)
     """Width of the critics as often as there are blocks, and once more for the first layer; within a block four times
@@ -135,11 +135,11 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
 
 PRESETS: dict[str, FlashSACConfig] = {
     "laptop": FlashSACConfig(),
-    # The authors' code (github.com/Holiday-Robot/FlashSAC, 2026): configs/agent/flashSAC.yaml, and scripts/
-    # run_isaaclab.sh, whose hands are nearest to ours, for batch, updates, discount and steps, for 10,000,000
-    # transitions that are kept and 100,000 that come first; here as many at 4,096 environments instead of its 1,024.
-    # Log standard deviations (flash_rl/agents/flashSAC/layer.py) go from -10 to 2 and begin in the middle. No limit of
-    # the gradient (here a huge one), observations as they are.
+    # The values are from the authors' code (github.com/Holiday-Robot/FlashSAC, 2026): configs/agent/flashSAC.yaml, and
+    # for batch, updates, discount and steps scripts/run_isaaclab.sh, whose hands are most similar to ours. The script
+    # keeps 10,000,000 transitions after a warm-up of 100,000; the same numbers result here with 4,096 environments
+    # instead of its 1,024. Log standard deviations (flash_rl/agents/flashSAC/layer.py) range from -10 to 2 and start in
+    # the middle. The gradient has no limit (here a huge one), and observations are not normalised.
     "gpu": FlashSACConfig(
         hidden=(128, 128, 128), critic_hidden=(256, 256, 256), replay_steps=2442, replay_memory=21.0, warmup_steps=25,
         updates_per_step=2, policy_delay=2, batch_size=2048, gamma=0.99, n_steps=3, tau=0.01, learning_rate=3e-4,
@@ -166,12 +166,14 @@ class FlashSAC(Categorical, MTSAC):
         self.updates = 0
         self.of_actor = {name: torch.zeros((), device=self.device) for name in ("Loss/actor", "Policy/entropy")}
         self.noise = torch.zeros(world.num_envs, self.shape.actions, device=self.device)
-        self.repeats = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)  # steps it is still kept for
+        self.repeats = torch.zeros(
+            world.num_envs, dtype=torch.int64, device=self.device
+        )  # remaining steps of the noise
         self.shares = torch.arange(1.0, config.noise_repeats + 1, device=self.device) ** -2
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         critics = super()._make_critics(inputs, heads)
-        # Weights of length 1 could not outweigh the biases of a narrow start, of up to 50.
+        # Weights of length 1 could not outweigh the biases of a narrow initial distribution, which reach 50.
         for net in _of(critics):
             nn.init.zeros_(net.head.bias)
         return critics
@@ -215,7 +217,7 @@ class FlashSAC(Categorical, MTSAC):
 
     @torch.no_grad()
     def _share_statistics(self) -> None:
-        """Running statistics become the mean of all processes', of which each goes by its own batch."""
+        """Average the running statistics over processes, each of which uses its own batch."""
         if world_size() == 1:
             return
         buffers = [each for net in (self.policy.actor, self.critic, self.target_critic) for each in net.named_buffers()]

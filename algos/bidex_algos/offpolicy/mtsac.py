@@ -1,9 +1,10 @@
 """MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each.
 
-Q_i towards r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')); pi down on alpha_k log pi - min_i
-Q_i; log alpha_k down on -log alpha_k (log pi + H), the mean over task k alone: one temperature for all would be set by
-their mean entropy, though a task that is solved and one that still explores need different ones. The loss is linear in
-log alpha, so that its gradient is the gap in entropy whatever alpha is. Deviations: ``docs/learners/mtsac.md``.
+Q_i regresses to r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')). pi minimises alpha_k log pi -
+min_i Q_i. log alpha_k minimises -log alpha_k (log pi + H), averaged over task k only. A single temperature would be set
+by the mean entropy of all tasks, although a solved task and an exploring task need different temperatures. The loss is
+linear in log alpha, so its gradient is the entropy gap for any alpha. Deviations from the paper:
+``docs/learners/mtsac.md``.
 """
 
 import math
@@ -24,7 +25,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class MTSACConfig(OffPolicyConfig):
-    """Everything that can be set about MT-SAC; the defaults are the preset ``laptop``."""
+    """All options of MT-SAC; the defaults are the preset ``laptop``."""
 
     init_std: Positive = 0.5  # Standard deviation of the actions at the start, before the squashing.
     std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Its bounds.
@@ -43,7 +44,7 @@ class MTSACConfig(OffPolicyConfig):
             )
 
 
-# What the published settings have in common, with log standard deviations from -20 to 2.
+# The published settings share these values; log standard deviations range from -20 to 2.
 _PLAIN = MTSACConfig(
     value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
     critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
@@ -51,10 +52,10 @@ _PLAIN = MTSACConfig(
 )  # fmt: skip
 
 PRESETS: dict[str, MTSACConfig] = {
-    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC), with its entropy coefficient
-    # 0.2 where each temperature starts and its 4 mini-batches of 32 after every vector step, of each task. From Table
-    # 49 (SAC on Humanoid) 32 steps, here between two reports. Both are silent on non-linearity, bounds of the standard
-    # deviation, target entropy and warm-up, and learn no temperature.
+    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"); there is no table for MT-SAC. Its entropy coefficient
+    # 0.2 is the initial value of each temperature; its 4 mini-batches of 32 follow every vector step, for each task.
+    # The 32 steps between two reports are from Table 49 (SAC on Humanoid). Both tables omit non-linearity, bounds of
+    # the standard deviation, target entropy and warm-up, and learn no temperature.
     "paper": replace(
         _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
@@ -67,7 +68,7 @@ PRESETS: dict[str, MTSACConfig] = {
     ),
 }  # fmt: skip
 
-# Table 49; its 2 epochs of one mini-batch are made after every vector step; its replay of 40,000 counts vector steps.
+# Table 49: its 2 epochs of one mini-batch follow every vector step; its replay of 40,000 counts vector steps.
 _TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
@@ -139,7 +140,7 @@ class MTSAC(OffPolicy):
 class SAC(MTSAC):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
-    MT-SAC, whose presets are made of Table 43, SAC's own: it has the same numbers in all of its columns.
+    The class is MT-SAC with presets of Table 43, SAC's own, which has the same numbers in all columns.
     """
 
     task_presets = TASK_PRESETS

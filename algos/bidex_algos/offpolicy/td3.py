@@ -1,7 +1,7 @@
 """TD3: DDPG with three changes (Fujimoto et al. 2018; Bi-DexHands' appendix B.1.4), on all tasks of a world at once.
 
-Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and taken from the lower of two critics; the actor
-and all targets wait for the critics, and move at every second update.
+Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and use the lower of two critics. The actor and
+all target networks move only at every second update of the critics.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class TD3Config(DDPGConfig):
-    """Everything that can be set about TD3; the defaults are the preset ``laptop``."""
+    """All options of TD3; the defaults are the preset ``laptop``."""
 
     target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
     target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
@@ -23,11 +23,11 @@ class TD3Config(DDPGConfig):
     """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
 
 
-# Smoothing and delay of "paper" are those of Fujimoto et al. (2018, section 6.1), as are the defaults.
+# Smoothing and delay of "paper", like the defaults, are from Fujimoto et al. (2018, section 6.1).
 PRESETS: dict[str, TD3Config] = {
     "paper": TD3Config(**OF_PAPER),
     "laptop": TD3Config(),
-    # Meta-World's suites: discount, Polyak, layers, replay and batches are those of MT-SAC's preset of that name.
+    # For Meta-World's suites: discount, Polyak, layers, replay and batches are from MT-SAC's preset of this name.
     "metaworld": TD3Config(
         hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=500, steps_per_iteration=500, updates_per_step=1,
         batch_per_task=128, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,

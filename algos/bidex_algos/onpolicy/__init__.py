@@ -1,1 +1,1 @@
-"""Learners that learn from what the present policy has just played."""
+"""Learners that learn from the latest rollout of the present policy."""

@@ -1,4 +1,4 @@
-"""What the on-policy learners share: rollouts, made a :class:`Batch`, a critic per task, statistics, checkpoints."""
+"""The base of the on-policy learners: rollouts as a :class:`Batch`, a critic per task, statistics, checkpoints."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ class _ValueHeads(ArchitectureConfig):
 
 @dataclass(frozen=True)
 class OnPolicyConfig(NetworkConfig, _ValueHeads):
-    """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
+    """Options of networks, rollouts and statistics; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, of actor and critic alike.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
@@ -50,7 +50,7 @@ class OnPolicyConfig(NetworkConfig, _ValueHeads):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """As in the base."""
+        """Estimate the bytes of memory as in the base class."""
         return 4 * num_envs * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
 
 
@@ -63,7 +63,7 @@ TABLE_47: Options = {
 
 @dataclass
 class Batch:
-    """A rollout made ready for the update, steps and rows flattened into B samples."""
+    """A rollout prepared for the update, with steps and rows flattened into B samples."""
 
     obs: Tensor  # normalised observations (B, d), in the precision the hidden layers run in
     task_id: Tensor  # task of each sample (B,)
@@ -75,12 +75,12 @@ class Batch:
     weights: Tensor  # 1, or 0 for a transition where physics broke (B,)
 
     def select(self, index: Tensor) -> "Batch":
-        """The samples at ``index``."""
+        """Return the samples at ``index``."""
         return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 
 def check_samples(name: str, rollout_steps: int, num_envs: int, num_minibatches: int) -> None:
-    """Refuses a rollout of fewer samples than mini-batches."""
+    """Raise BidexError if a rollout has fewer samples than mini-batches."""
     samples = rollout_steps * num_envs
     if samples < num_minibatches:
         raise BidexError(
@@ -90,7 +90,7 @@ def check_samples(name: str, rollout_steps: int, num_envs: int, num_minibatches:
 
 
 class OnPolicy(Learner):
-    """A Gaussian policy, and a critic (``num_critics`` values of a state), that learn from what it has just done."""
+    """A Gaussian policy and a critic (``num_critics`` values of a state) that learn from the latest rollout."""
 
     config: OnPolicyConfig
     policy: GaussianPolicy
@@ -118,11 +118,11 @@ class OnPolicy(Learner):
 
     @abstractmethod
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """Learns from a batch; returns scalars to be logged."""
+        """Learn from a batch; return scalars to be logged."""
 
     @abstractmethod
     def _optimisers(self) -> Parts:
-        """The optimisers by their names in a checkpoint."""
+        """Return the optimisers by their names in a checkpoint."""
 
     def _iterate(self) -> dict[str, float]:
         with self._collecting():
@@ -138,13 +138,13 @@ class OnPolicy(Learner):
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.policy.distribution(obs)
         noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
-        # Not clamped: the world does that, and the density must be that of what was drawn.
+        # The action is not clamped: the world clamps it, and the density must be of the sampled action.
         return mean + log_std.exp() * noise, mean
 
     def _final_value(self, obs: Tensor, task_id: Tensor) -> Tensor:
         return self._in_reward_units(self._critic(self.policy.observations(obs), task_id), task_id)
 
-    # Values. The critic speaks in units of its task's running mean and deviation of returns.
+    # Values. The critic's unit is given by its task's running mean and standard deviation of returns.
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
@@ -178,7 +178,7 @@ class OnPolicy(Learner):
         if self.low_precision:
             obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
 
-        # Several critics make several columns of a row, each like a row of its own.
+        # Several critics make several columns per row, each treated as a separate row.
         def each(x: Tensor) -> Tensor:
             return x if self.num_critics == 1 else x.repeat_interleave(self.num_critics, 1)
 

@@ -1,4 +1,4 @@
-"""What teachers say, kept, and the steps that bring a policy there: all of DAgger's learning, and beside PPO's."""
+"""Teachers' labels and the updates that imitate them: all of DAgger's learning, and an addition to PPO's."""
 
 import math
 
@@ -13,15 +13,16 @@ from bidex_meta.training.distributed import pool_moments, sum_gradients, world_s
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import VectorWorld
 
-# Added to the deviation of an action of a class's labels: entries that a teacher hardly moves must not outweigh all
-# others. It is 1.5 % of an action's range, and of a finger joint about 0.02 rad.
+# Added to the standard deviation of an action among a class's labels, so that an action that a teacher hardly moves
+# does not outweigh all others. It is 1.5 % of an action's range, or about 0.02 rad of a finger joint.
 _FLOOR = 0.03
 
 
 class Lessons:
-    """Labelled observations of a world, and an optimiser of the mean of ``policy``; deviations stay as they are.
+    """Labelled observations of a world, and an optimiser of the mean of ``policy``; standard deviations do not change.
 
-    The error of an action counts in units of its variance among the labels of its class, and all classes alike.
+    The error of an action is measured in units of its variance among the labels of its class; all classes have equal
+    weight.
     """
 
     teachers: Teachers
@@ -34,7 +35,7 @@ class Lessons:
         self.label_stats = RunningStats((world.num_tasks, actions)).to(world.device)
 
     def begin(self, teachers: Teachers, samples: int, least_steps: int, batch_size: int) -> None:
-        """Takes who labels; keeps the newest ``samples``, and of each environment ``least_steps`` or more."""
+        """Set the teachers; keep the newest ``samples`` labels, and at least ``least_steps`` of each environment."""
         (actions,), (observations,) = self.world.single_action_space.shape, self.world.single_observation_space.shape
         rows = teachers.known.nonzero().squeeze(1)
         steps = max(least_steps, samples // len(rows))
@@ -44,7 +45,7 @@ class Lessons:
 
     @torch.no_grad()
     def label(self, obs: Tensor) -> Tensor:
-        """Asks for raw observations (N, d) of a step, and keeps what is said: actions (N, a)."""
+        """Label raw observations (N, d) of a step and store the labels: actions (N, a)."""
         assert self.data is not None
         labels = self.teachers.eval_action(obs)
         self.data.add(obs, labels)
@@ -52,7 +53,7 @@ class Lessons:
 
     @torch.no_grad()
     def take_moments(self, steps: int) -> None:
-        """Takes the labels of the last steps into the statistics of their classes."""
+        """Add the labels of the last steps to the statistics of their classes."""
         assert self.data is not None
         mean, var, count = self.label_stats.mean.new_zeros(3, *self.label_stats.mean.shape)
         for task, labels in zip(self.data.tasks.tolist(), self.data.of_last(steps), strict=True):
@@ -61,7 +62,7 @@ class Lessons:
         self.label_stats.merge(*pool_moments(mean, var, count))
 
     def learn(self, updates: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
-        """So many steps down the mean of the classes' losses, weighted (K,); these losses before the weights."""
+        """Take ``updates`` steps down the mean of the classes' losses, weighted (K,); return the unweighted losses."""
         assert self.data is not None
         data, device = self.data, generator.device
         tasks = data.tasks.repeat_interleave(self.batch_per_task)
@@ -78,7 +79,7 @@ class Lessons:
         return {"Loss/imitation": of_class.mean(), **dict(zip(names, of_class, strict=True))}
 
     def _descend(self, of_class: Tensor, weights: Tensor | None) -> Tensor:
-        """A step, summed over processes; the classes' losses (K,)."""
+        """Take a step on the losses summed over processes; return the classes' losses (K,)."""
         parameters = list(self.policy.actor.mean.parameters())
         self.adam.zero_grad()
         (of_class if weights is None else weights * of_class).mean().backward()

@@ -1,7 +1,7 @@
 """MT-PPO: proximal policy optimisation (Schulman et al. 2017) on all tasks of a world at once.
 
-One policy reads the task's one-hot in its observation. What is done differently from Bi-DexHands' MTPPO, and why,
-stands in ``docs/learners/mtppo.md``.
+One policy reads the task's one-hot in its observation. ``docs/learners/mtppo.md`` lists and explains the differences
+from Bi-DexHands' MTPPO.
 """
 
 import math
@@ -30,7 +30,7 @@ from bidex_meta.world.graphs import GraphCache, cuda_graph
 
 @dataclass(frozen=True)
 class MTPPOConfig(PPOConfig, OnPolicyConfig):
-    """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
+    """All options of MT-PPO; the defaults are the preset ``laptop``."""
 
     value_loss_weight: Finite = 2.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
@@ -71,18 +71,18 @@ PRESETS: dict[str, MTPPOConfig] = {
     "laptop": MTPPOConfig(),
     # Version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes.
     "v2": MTPPOConfig(gamma=0.96),
-    # Meta-World's multi-task suites: discount, trace and clip of its authors' MTPPO (metaworld-algorithms). Networks
-    # are small, rollouts 100 steps instead of 10,000: of 250 (ELU, 8 mini-batches) MT3 was at 24 % after 150 k steps,
-    # not 42.
+    # For Meta-World's multi-task suites: discount, trace and clip are from its authors' MTPPO (metaworld-algorithms).
+    # Networks are small, and rollouts have 100 steps instead of 10,000. With 250 steps (ELU, 8 mini-batches) success on
+    # MT3 was 24 % after 150 k steps instead of 42 %.
     "metaworld": MTPPOConfig(
         hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
         clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
     ),
 }  # fmt: skip
 
-# Table 42, column "Other Tasks". What it does not name is as in Table 47.
+# Table 42, column "Other Tasks". Other values are from Table 47.
 _SINGLE = replace(PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
-# Table 50. What it does not name is as in Table 47 (``paper``) or as for hands (``laptop``, of narrower layers).
+# Table 50. Other values are from Table 47 (``paper``) or those for hands (``laptop``, with narrower layers).
 _TABLE_50: Options = {
     "rollout_steps": 32, "epochs": 5, "num_minibatches": 4, "clip": 0.1, "learning_rate": 3e-4, "gamma": 0.99,
     "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01, "max_grad_norm": 1.0, "entropy_weight": 0.0,
@@ -99,17 +99,17 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 }
 
 
-# The first few episodes that end say little: until there are so many, the missing ones count as failures.
+# The first few episodes say little: up to this number, the missing episodes count as failures.
 _EPISODES = 20.0
 
 _DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
 
 
 class Demonstrations:
-    """Transitions to be imitated beside reinforcement; some tasks may have none.
+    """Transitions to be imitated in addition to reinforcement; some tasks may have none.
 
-    A term of behaviour cloning, which fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6), with
-    normalised advantages in the place of their weight by the largest one.
+    The loss gets a term of behaviour cloning that fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation
+    6). Normalised advantages replace DAPG's weighting by the largest advantage.
     """
 
     def __init__(self, data: Joined, config: MTPPOConfig, seed: int, device: torch.device):
@@ -123,20 +123,23 @@ class Demonstrations:
         self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
 
     def weight(self, env_steps: int) -> float:
-        """Weight of the term after so many environment steps: halved every ``demonstration_half_life``."""
+        """Return the weight of the term after ``env_steps``: it is halved every ``demonstration_half_life``."""
         return self._config.demonstration_weight * 0.5 ** (env_steps / self._config.demonstration_half_life)
 
     def draw(self) -> tuple[Tensor, Tensor]:
-        """Raw observations (B, d) and actions (B, a), each task that has some equally often on average."""
+        """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
         size, device = (self._config.demonstration_batch,), self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
-        # The remainder of a number this large favours none by more than 1 in 2^40 / transitions.
+        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
         place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
         chosen = self._of_task[self._first[task] + place]
         return self._obs[chosen], self._actions[chosen]
 
     def loss(self, policy: GaussianPolicy) -> Tensor:
-        """Mean of (a - mean)^2 / (2 std^2), summed over actions; deviations, which rewards alone move, get no slope."""
+        """Return the mean of (a - mean)^2 / (2 std^2), summed over actions.
+
+        Standard deviations get no gradient, because only rewards move them.
+        """
         raw, actions = self.draw()
         obs = policy.observations(raw)
         with autocast(raw.device, policy.low_precision):
@@ -144,7 +147,7 @@ class Demonstrations:
         return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
 
     def clone(self, policy: GaussianPolicy) -> None:
-        """Behaviour cloning before anything is played: statistics of observations, then steps of the mean alone."""
+        """Clone the behaviour before the first rollout: update statistics of observations, then train only the mean."""
         policy.observations.update(self._obs)
         weights = list(policy.actor.parameters())
         adam = torch.optim.Adam(weights, lr=1e-3)
@@ -157,7 +160,7 @@ class Demonstrations:
 
 
 def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-    """Half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
+    """Return half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
     return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()
 
 
@@ -196,9 +199,10 @@ class MTPPO(OnPolicy):
             self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
     def start_from(self, policy: State) -> None:
-        """As in the base; deviations begin within ``std_range``, an adaptive step size at its least.
+        """Start as in the base class, with standard deviations clamped to ``std_range``.
 
-        A KL is known after a step alone: the first update of a policy of DAgger's had one of 187 from 3e-4.
+        An adaptive step size starts at its minimum, because a KL is known only after a step: the first update of a
+        policy trained by DAgger had a KL of 187 with a step size of 3e-4.
         """
         super().start_from(policy)
         self._forget_graphs()
@@ -258,7 +262,7 @@ class MTPPO(OnPolicy):
         return reported | ({} if self.lessons is None else self._take(self.lessons))
 
     def _descend(self, first: bool, critic_alone: bool, *inputs: Tensor) -> Tensor:
-        """One step on a mini-batch's fields, the sum of its weights and the sampling policy's log deviations."""
+        """Take one step on a mini-batch's fields, the sum of its weights and the old log standard deviations."""
         *batch, count, old_log_std = inputs
         part = Batch(*batch)
         numbers = self._gradients(part, count, old_log_std)
@@ -271,7 +275,7 @@ class MTPPO(OnPolicy):
         return numbers
 
     def _take(self, lessons: Lessons) -> dict[str, Tensor]:
-        """Learns from teachers what the classes that fail need of it; nothing while the critic learns alone."""
+        """Learn from teachers in proportion to the failure of each class; do nothing while only the critic learns."""
         assert lessons.data is not None
         lessons.take_moments(self.config.rollout_steps)
         tasks, needs = lessons.data.tasks, self._needs()
@@ -282,7 +286,7 @@ class MTPPO(OnPolicy):
         return losses | weights
 
     def _needs(self) -> Tensor:
-        """How far each class is from ``teacher_success``, from 1 to 0: (num_tasks,)."""
+        """Return each class's relative distance from ``teacher_success``, from 1 to 0: (num_tasks,)."""
         _, _, successes, counts = all_sum(self.episodes.sums)
         return (1.0 - successes / counts.clamp_min(_EPISODES) / self.config.teacher_success).clamp_min(0.0)
 
@@ -316,7 +320,7 @@ class MTPPO(OnPolicy):
         )  # fmt: skip
 
     def _least(self, b: Batch, count: Tensor) -> Tensor:
-        """The least that each sample's surrogate loss can become (B,): no ratio earns more than the clip allows."""
+        """Return the minimum of each sample's surrogate loss (B,): no ratio earns more than the clip allows."""
         return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
@@ -333,12 +337,12 @@ class MTPPO(OnPolicy):
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
 
     def state_dict(self) -> State:
-        """As in the base; what teachers said makes its own copy, since two of it at once may not fit."""
+        """Return the state as in the base class; the labels copy themselves, because two copies at once may not fit."""
         data = None if self.lessons is None else self.lessons.data
         return super().state_dict() | ({} if data is None else {"data": data.state_dict()})
 
     def load_state_dict(self, state: State) -> None:
-        """As in the base; with teachers that follow an episode from its start new ones begin."""
+        """Restore the state as in the base class; begin new episodes if teachers follow an episode from its start."""
         super().load_state_dict(state)
         self._forget_graphs()
         if self.lessons is None or self.lessons.data is None:
@@ -364,7 +368,7 @@ class MTPPO(OnPolicy):
 class PPO(MTPPO):
     """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
 
-    The same learner with the presets of a single task (the appendix's B.1).
+    The class is MT-PPO with the presets of a single task (the appendix's B.1).
     """
 
     presets, task_presets = SINGLE_TASK_PRESETS, TASK_PRESETS

@@ -1,8 +1,8 @@
 """MT-TRPO: trust-region policy optimisation (Schulman et al. 2015) on all tasks of a world at once.
 
-An update goes along s = F^-1 g (conjugate gradients; g of the mean of ratio x advantage, F the Fisher matrix of means
-and deviations alike), sqrt(2 max_kl / s^T F s) s far, and back until surrogate and KL are what was asked for; then the
-critic learns in some epochs of mini-batches.
+An update moves by sqrt(2 max_kl / s^T F s) along s = F^-1 g, computed by conjugate gradients; g is the gradient of the
+mean of ratio x advantage, F the Fisher matrix of means and standard deviations. A line search then shortens the step
+until surrogate and KL satisfy their conditions. Finally the critic learns in some epochs of mini-batches.
 """
 
 import math
@@ -24,7 +24,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class MTTRPOConfig(OnPolicyConfig):
-    """Everything that can be set about MT-TRPO; the defaults are the preset ``laptop``."""
+    """All options of MT-TRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.1  # Mean KL of the new policy from the sampling one that an update may not exceed.
     damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal: shortens steps that samples tell nothing of.
@@ -57,7 +57,10 @@ def gaussian_step(
     parameters: list[nn.Parameter], distribution: Callable[[], tuple[Tensor, Tensor]], keep_bounds: Callable[[], None],
     b: Any, gain: Tensor, old_log_std: Tensor, own_kl: Tensor, config: Any, max_kl: float
 ) -> dict[str, Tensor]:  # fmt: skip
-    """A trust-region step of a Gaussian on samples ``b``, up the ratio times ``gain`` (B,); scalars to be logged."""
+    """Take a trust-region step of a Gaussian on samples ``b``, up the ratio times ``gain`` (B,).
+
+    Returns scalars to be logged.
+    """
     weight = b.weights / all_sum(b.weights.sum()).clamp_min(1.0)
 
     def surrogate_and_kl() -> tuple[Tensor, Tensor]:
@@ -67,7 +70,7 @@ def gaussian_step(
 
     @torch.no_grad()
     def measure() -> tuple[float, float]:
-        keep_bounds()  # part of the policy: what is measured is what will act
+        keep_bounds()  # the bounds are part of the policy that will act, so they hold when it is measured
         objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
         return objective, kl
 
@@ -78,9 +81,12 @@ def gaussian_step(
 def kl_from_itself(
     distribution: Callable[[Tensor], tuple[Tensor, Tensor]], weights: Tensor, rows: int, stride: int
 ) -> Tensor:
-    """The part of the mean KL that the Fisher matrix is made of, of every ``stride``-th sample: 0, with a curvature."""
+    """Return this process's part of the policy's mean KL from itself, over every ``stride``-th sample.
+
+    The value is 0; its curvature is the Fisher matrix.
+    """
     sample = torch.arange(len(weights), device=weights.device)
-    # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
+    # The samples are steps by rows. Each later step starts at a later row; otherwise some rows would never be taken.
     taken = (sample + sample // rows) % stride == 0
     mean, log_std = distribution(taken)
     kl, weight = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std), weights[taken]
@@ -144,7 +150,8 @@ class MTTRPO(OnPolicy):
 class TRPO(MTTRPO):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
-    MT-TRPO with the presets of a single task: networks of Table 42, the rest as there, since TRPO has no table.
+    The class is MT-TRPO with the presets of a single task: networks of Table 42, the rest as in MT-TRPO, because the
+    appendix has no table for TRPO.
     """
 
     presets = PRESETS | {"paper": replace(PRESETS["paper"], hidden=(1024, 1024, 512))}

@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 
 @dataclass(frozen=True)
 class PPOConfig(LearnerConfig):
-    """Passes, clip and step sizes. A config that is made of this and others puts its fields behind theirs."""
+    """Options of passes, clip and step sizes. A config that inherits others too lists these fields last."""
 
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
     epochs: Count = 4  # Passes over what was collected, per update.
@@ -36,10 +36,10 @@ def mini_batches(
     weights: Tensor, epochs: int, number: int, generator: torch.Generator,
     split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:  # fmt: skip
-    """Passes over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
+    """Iterate over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
-    Yields whether it is the very first, the samples int64 (b,), and the sum of their weights over all processes, at
-    least 1.
+    Yields whether the mini-batch is the very first, its samples int64 (b,), and the sum of their weights over all
+    processes, at least 1.
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -49,7 +49,7 @@ def mini_batches(
 
 
 class PolicyLoss(NamedTuple):
-    """Losses of a policy; scalars but for ``earned``. With weights that sum to 1 they are means."""
+    """Losses of a policy; all are scalars except ``earned``. With weights that sum to 1 the losses are means."""
 
     surrogate: Tensor  # minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)
     entropy: Tensor  # entropy of the policy
@@ -58,7 +58,7 @@ class PolicyLoss(NamedTuple):
     earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
     def numbers(self, value: Tensor) -> list[Tensor]:
-        """What :data:`NAMES` names, without gradients; ``value`` is the critic's loss."""
+        """Return the values named by :data:`NAMES`, without gradients; ``value`` is the critic's loss."""
         return [self.surrogate.detach(), value.detach(), self.kl, self.outside]
 
 
@@ -69,10 +69,10 @@ def policy_loss(
     actions: Tensor, means: Tensor, log_std: Tensor, old_means: Tensor, old_log_std: Tensor, old_log_probs: Tensor,
     advantages: Tensor, weights: Tensor, clip: float
 ) -> PolicyLoss:  # fmt: skip
-    """The loss of samples of any shape (...), summed with ``weights`` (...), 0 for those that teach nothing.
+    """Return the loss of samples of any shape (...), summed with ``weights`` (...); 0 for samples that teach nothing.
 
-    Actions and means are (..., a), logarithms of deviations (a,) or (..., a), log-densities and normalised advantages
-    (...); ``old`` is the sampling policy's. A ratio beyond ``clip`` of 1 earns nothing more.
+    Actions and means are (..., a), log standard deviations (a,) or (..., a), log-densities and normalised advantages
+    (...). ``old`` refers to the sampling policy. A ratio beyond ``clip`` from 1 earns nothing more.
     """
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
@@ -85,12 +85,12 @@ def policy_loss(
 
 
 def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
-    """What to multiply a step size by: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
+    """Return the factor of a step size: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
     return torch.where(kl < 0.5 * desired_kl, 1.5, torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0))
 
 
 class _Adam(torch.optim.Adam):
-    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser.
+    """Adam whose step size remains the given tensor, so that adapting the tensor also affects a loaded optimiser.
 
     On CUDA its steps can be recorded in a graph.
     """
@@ -106,10 +106,10 @@ class _Adam(torch.optim.Adam):
 
 
 class AdaptiveAdam:
-    """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
+    """Adam whose step size is divided by 1.5 above twice the desired KL and multiplied by 1.5 below half of it.
 
-    It is a tensor: no wait for the device. ``share``: the part of the config's ``desired_kl`` that is these
-    parameters'.
+    The step size is a tensor, so the host does not wait for the device. ``share`` is these parameters' part of the
+    config's ``desired_kl``.
     """
 
     def __init__(
@@ -122,27 +122,27 @@ class AdaptiveAdam:
         self.actor = _Adam(self.weights, self.rate, eps)
 
     def zero_grad(self) -> None:
-        """Forgets the gradients."""
+        """Reset the gradients."""
         self.actor.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
-        """One step along gradients of at most this norm, its size adapted to the last one's KL (None: none yet)."""
+        """Take one step along gradients clipped to this norm; its size follows the last step's KL (None: none yet)."""
         self.follow(kl)
         nn.utils.clip_grad_norm_(self.weights, max_grad_norm)
         self.actor.step()
 
     def follow(self, kl: Tensor | None) -> None:
-        """Adapts the step size to the KL of its last step, a scalar."""
+        """Adapt the step size to the KL of its last step, a scalar."""
         if kl is not None and self.desired_kl is not None:
             self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
     def parts(self) -> Parts:
-        """Optimiser and step size, by their names in a checkpoint."""
+        """Return optimiser and step size, by their names in a checkpoint."""
         return {"actor_adam": self.actor, "learning_rate": self.rate}
 
 
 class AdaptiveAdams(AdaptiveAdam):
-    """One for the actor, one for the critic: of ``critic_learning_rate``, fixed, or None, which follows the actor's."""
+    """Adam for the actor and for the critic; ``critic_learning_rate`` is fixed, or None to follow the actor's."""
 
     def __init__(
         self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: PPOConfig, device: torch.device
@@ -154,12 +154,12 @@ class AdaptiveAdams(AdaptiveAdam):
         self.critic = _Adam(self.critic_weights, self.critic_rate)
 
     def zero_grad(self) -> None:
-        """Forgets the gradients of both."""
+        """Reset the gradients of both."""
         super().zero_grad()
         self.critic.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
-        """One step of both; ``apart``: each has a norm of its own; ``critic_alone``: the actor stays as it is."""
+        """Take one step of both; ``apart``: clip each norm separately; ``critic_alone``: the actor does not change."""
         self.follow(None if critic_alone else kl)
         actor, critic = self.weights, self.critic_weights
         for weights in [actor, critic] if apart else [actor + critic]:
@@ -169,5 +169,5 @@ class AdaptiveAdams(AdaptiveAdam):
         self.critic.step()
 
     def parts(self) -> Parts:
-        """Both optimisers and the step size, by their names in a checkpoint."""
+        """Return both optimisers and the step size, by their names in a checkpoint."""
         return super().parts() | {"critic_adam": self.critic}
