@@ -27,7 +27,7 @@ MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of worlds there is what they are asked for."""
-    make = lambda slots, num, **options: SimpleNamespace(slots=slots, num_envs=num, options=options)  # noqa: E731
+    make = lambda slots, config: SimpleNamespace(slots=slots, num_envs=config.num_envs, config=config)  # noqa: E731
     monkeypatch.setattr(bidex_meta.benchmark, "World", make)
 
 
@@ -236,9 +236,9 @@ def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
 
 def test_evaluation_worlds_keep_their_tasks(asked: None) -> None:
     for mode in ("DISABLED", "Disabled", AutoresetMode.DISABLED):
-        options = Benchmark("MT4").make_world(autoreset_mode=mode).options
-        assert options["autoreset_mode"] is AutoresetMode.DISABLED and options["task_sampling"] == "fixed"
-    assert Benchmark("MT4").make_world(autoreset_mode="same-step").options["task_sampling"] == "uniform"
+        config = Benchmark("MT4").make_world(autoreset_mode=mode).config
+        assert config.autoreset_mode is AutoresetMode.DISABLED and config.task_sampling == "fixed"
+    assert Benchmark("MT4").make_world(autoreset_mode="same-step").config.task_sampling == "uniform"
 
 
 def test_discount_and_reward_scale_reach_slot_and_world(tmp_path: Path) -> None:
@@ -255,7 +255,7 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
     world = make_task_world("CatchAbreast", num_envs=3, device="cpu", seed=2)
     expected = [t.variation for t in Benchmark("MT4", seed=2).train_tasks if t.env_name == "CatchAbreast"]
     np.testing.assert_array_equal(world.slots[0].tasks, expected)
-    assert not {"observation", "pad_to"} & world.options.keys() and world.options["task_sampling"] == "uniform"
+    assert world.config.pad_to is None and world.config.task_sampling == "uniform"
 
 
 @pytest.mark.parametrize(

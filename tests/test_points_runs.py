@@ -102,7 +102,7 @@ def test_what_cannot_be_is_one_line(flags, told, tmp_path, capsys):
 
 def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     world = make_task_world("HandOver", 3, "cpu", autoreset_mode="DISABLED", threads=1)
-    black = lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8)  # noqa: E731
+    black = lambda self, env_id, width, height, camera: np.zeros((height, width, 3), np.uint8)  # noqa: E731
     monkeypatch.setattr(type(world), "render", black)
     looked = filming.CloudView(world, 200)
     looked.reset(seed=0)

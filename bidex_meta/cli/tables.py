@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -15,8 +15,10 @@ from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
-from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 from bidex_meta.utils.streams import output_width
+
+if TYPE_CHECKING:  # torch, which lists and help do without
+    from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 
 Json = dict[str, Any]  # an object of JSON
 NONE = "–"
@@ -238,7 +240,7 @@ def print_table(table: Sheet) -> None:
     sys.stdout.write(table.printed(output_width(180)))
 
 
-def print_evaluation(found: RunEvaluation, brief: bool = False) -> None:
+def print_evaluation(found: "RunEvaluation", brief: bool = False) -> None:
     """Print the tables of an evaluation; ``brief`` tables, which need a random policy's results, fit a terminal."""
     title = f"{found.algo} on {found.worlds.name}"
     if not brief:
@@ -252,14 +254,14 @@ def print_evaluation(found: RunEvaluation, brief: bool = False) -> None:
         _print_played(f"{found.algo} on {others.name}, other tasks (seed {others.seed})", found.others, brief)
 
 
-def _print_played(title: str, played: PlayedTasks, brief: bool) -> None:
+def _print_played(title: str, played: "PlayedTasks", brief: bool) -> None:
     if brief and played.random is not None:
         print_table(result_table(title, played.policy, played.random))
     else:
         print_table(evaluation_table(title, played.policy, played.random))
 
 
-def print_meta_test(found: RunMetaTest) -> None:
+def print_meta_test(found: "RunMetaTest") -> None:
     """Print, for each split, a table before adaptation and a table after adaptation with the gains."""
     for split, result in found.splits.items():
         subject = f"{found.algo} on {found.worlds.name}, {found.steps:,} steps, {split} tasks"

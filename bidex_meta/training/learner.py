@@ -53,7 +53,7 @@ class Sources:
     """Policies that label the states that the learner visits."""
 
     def check(self, learner: str, *taken: str, needed: str | None = None) -> None:
-        """Raise BidexError for a source that is not among those ``taken`` by name, or if the ``needed`` one is missing."""
+        """Raise BidexError for a source that is not ``taken``, or if the ``needed`` one is missing."""
         for name, value in vars(self).items():
             if value is not None and name not in taken:
                 raise BidexError(f"{learner}: learns from no {name}. Leave them out of its sources.")

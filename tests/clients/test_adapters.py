@@ -277,7 +277,7 @@ def test_sb3_seeds_options_and_attributes() -> None:
 def test_pictures_for_sb3_share_the_size_of_a_film(rows: int, size: tuple[int, int]) -> None:
     env = adapt("sb3", points())
     env.num_envs = rows
-    env.world.render = lambda row, width, height: (height, width)
+    env.world.render = lambda env_id, width, height: (height, width)
     assert env.get_images() == [size] * rows
 
 

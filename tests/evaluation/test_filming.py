@@ -16,7 +16,7 @@ def test_a_name_is_green_while_the_episode_counts_as_a_success(monkeypatch: pyte
     """Environment 0 holds the goal from step 5 to the end, environment 1 from step 2 to 17; an episode has 20 steps."""
     world: Any = Passing(4)
     world.success_at_end = at_end
-    world.render = lambda row, width, height: np.zeros((height, width, 3), np.uint8)
+    world.render = lambda env_id, width, height: np.zeros((height, width, 3), np.uint8)
     shown: list[list[bool]] = []
     monkeypatch.setattr(filming, "tiled", lambda pictures, names, done: shown.append(done))
     list(film_tiles(ZeroAgent(world.action_space), world, [0, 1], 25, seed=0, width=8, height=6))

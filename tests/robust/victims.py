@@ -57,7 +57,8 @@ FLAGS = {
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
-_LOADED += tuple(f"bidex_meta.cli.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
+_LOADED += ("bidex_meta.cli.run", "bidex_meta.cli.tables")
+_LOADED += tuple(f"bidex_meta.experiments.{name}" for name in ("evaluating", "training", "watching"))
 _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references"))
 """What each process would load by itself, for longer than it runs."""
 ADAPTS = ("promp", "maml", "rl2", "varibad", "icl", "pearl")

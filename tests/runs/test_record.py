@@ -20,7 +20,7 @@ from bidex_meta.runs.metrics import last_rows
 from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
 from bidex_meta.runs.video import check_suffix, write_animation, write_image, write_video
 
-CONFIG = RunConfig(suite="MT4", task=None, algo="mtppo", seed=3, learner={"hidden": [8]}, num_envs=8, steps=100)
+CONFIG = RunConfig(suite="MT4", algo="mtppo", seed=3, learner={"hidden": [8]}, num_envs=8, steps=100, threads=1)
 
 
 def board_points(folder, tag):
