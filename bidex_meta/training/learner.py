@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     import torch
 
     from bidex_meta.agents import Agent
-    from bidex_meta.data.joined import Joined
-    from bidex_meta.witness.teachers import Teachers
     from bidex_meta.world.contract import VectorWorld
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
@@ -45,12 +43,12 @@ class LearnerConfig(Checked):
 class Sources:
     """What a learner learns from beside its own experience; None: nothing of that kind."""
 
-    data: "Joined | None" = None
-    """Transitions of data sets, for offline learners."""
-    demonstrations: "Joined | None" = None
-    """Transitions to imitate while learning by playing."""
-    teachers: "Teachers | None" = None
-    """Policies that label the states that the learner visits."""
+    data: Any = None
+    """Transitions of data sets (``bidex_meta.data.joined.Joined``), for offline learners."""
+    demonstrations: Any = None
+    """Transitions to imitate (``Joined``) while learning by playing."""
+    teachers: Any = None
+    """Policies (``bidex_meta.witness.teachers.Teachers``) that label the states that the learner visits."""
 
     def check(self, learner: str, *taken: str, needed: str | None = None) -> None:
         """Raise BidexError for a source that is not ``taken``, or if the ``needed`` one is missing."""

@@ -55,7 +55,7 @@ class Case:
         mode = kind.make.autoreset_mode(self.config)
         return PointGoals(2 * rows, classes=classes, autoreset_mode=mode, **broken)
 
-    def make(self, seed: int = 0, world: Any = None) -> Any:
+    def make(self, seed: int = 0, world: Any = None, config: Any = None) -> Any:
         make = learner_kind(self.algo).make
         world = self.world() if world is None else world
         sources: dict[str, Any] = {}
@@ -65,7 +65,8 @@ class Case:
             sources["data"] = as_data(played(opposite_bandits(rows=4), still, 20))
         if make.taught:
             sources["teachers"] = still_teachers(world)
-        return make(world, self.config, seed, Sources(**sources)) if sources else make(world, self.config, seed)
+        config = self.config if config is None else config
+        return make(world, config, seed, Sources(**sources)) if sources else make(world, config, seed)
 
     def trained(self, world: Any = None) -> Any:
         learner = self.make(world=world)
@@ -226,7 +227,7 @@ def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str
     }  # fmt: skip
     for preset in kind.presets.values():
         config = replace(preset, **{name: value for name, value in small.items() if name in vars(preset)})
-        learner = kind.make(opposite_bandits(), config, seed=0)
+        learner = Case(algo, {}).make(world=opposite_bandits(), config=config)
         assert learner.offline or learner.taught or any(name.startswith("Loss/") for name in learner.iterate())
 
 

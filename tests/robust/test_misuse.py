@@ -293,7 +293,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     }),
     "RunFolder.finish": lambda s: (s.run.finish, {"step": (5, "None zero one")}),
     "RunFolder.change_config": lambda s: (s.run.change_config, {"config": (s.run.config(), "")}),
-    "load_policy": lambda s: (load_policy, {"run": (s.run, "word nowhere"), "device": ("cpu", ""), "which": ("last", "")}),
+    "load_policy": lambda s: (lambda **a: load_policy(s.run, **a), {"device": ("cpu", ""), "which": ("last", "")}),
     "Checkpoints": lambda s: (lambda **a: Checkpoints(**a).load(), {
         "folder": (s.run.path, "nowhere"), "keep": (3, "one zero"),
     }),
