@@ -25,7 +25,8 @@ class EpisodeStatistics:
 
     def update(self, info: Info) -> None:
         """Add the episodes that ended in this step according to ``info["episode_mask"]``."""
-        episode, ended = info["running"], info["episode_mask"]
+        episode = info["running"]
+        ended = info["episode_mask"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
         new = torch.zeros_like(self.sums).index_add_(1, self.task_id, values.masked_fill(~ended, 0.0))
         self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new

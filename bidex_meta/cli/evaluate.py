@@ -46,8 +46,8 @@ def main(arguments: Sequence[str]) -> None:
     where: dict[str, Any] = {"checkpoint": flags.checkpoint, "device": flags.device, "engine": flags.engine}
     if learner_kind(config.algo, config.task).make.adapts:
         _refuse_for_adapting(flags, config.algo)
-        options = Options(**{entry.name: getattr(flags, entry.name) for entry in fields(Options)})
-        found = meta_test(flags.run, split=flags.split, options=options, randomisation=flags.randomisation, **where)
+        size = {entry.name: getattr(flags, entry.name) for entry in fields(Options)}
+        found = meta_test(flags.run, split=flags.split, randomisation=flags.randomisation, **size, **where)
     else:
         _refuse_for_fixed(flags, config.algo)
         found = evaluate(

@@ -57,7 +57,8 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     worlds = Worlds.open(config)
-    slots, classes = slots_of(worlds), worlds.task_classes()  # raises BidexError for worlds that are not ours
+    slots = slots_of(worlds)
+    classes = worlds.task_classes()  # raises BidexError for worlds that are not ours
     if flags.actor not in ("zero", "random"):
         say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
     task = name_among(name_with_object(flags.task, flags.object), classes) if flags.task else slots[0]

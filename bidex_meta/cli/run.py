@@ -11,6 +11,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments.evaluating import evaluate, meta_test
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.metatest import splits_of
+from bidex_meta.experiments.run_config import check, check_resumed
 from bidex_meta.experiments.training import Stopped, train
 from bidex_meta.runs import RunFolder
 from bidex_meta.training import distributed
@@ -29,6 +30,7 @@ def main(arguments: Sequence[str]) -> None:
         distributed.init_from_environment()
         flags = together(lambda: _checked(run_flags(arguments)))
         if flags.print_config:
+            together(lambda: _check_printed(flags))
             if launch().rank == 0:
                 print(printed(flags.config))
             distributed.shut_down()
@@ -61,6 +63,13 @@ def _checked(flags: RunFlags) -> RunFlags:
     if adapts:
         splits_of(Worlds.open(config.to_json()), flags.split)
     return flags
+
+
+def _check_printed(flags: RunFlags) -> None:
+    """Refuse a config as ``train`` would, but for the memory of this machine."""
+    check(flags.config, with_memory=False)
+    if flags.resume is not None:
+        check_resumed(RunFolder.open(flags.resume), flags.config)
 
 
 def _evaluate(flags: RunFlags, folder: RunFolder) -> None:

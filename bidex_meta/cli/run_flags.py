@@ -9,7 +9,7 @@ import tyro
 
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.config import LearnerSettings, RunConfig
-from bidex_meta.experiments.run_config import check, check_resumed, resolve
+from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 from bidex_meta.utils.validation import Count, Few, Shots
 
@@ -30,21 +30,23 @@ class RunFlags(Generic[LearnerSettings]):
     count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
     evaluate: bool = True  # Evaluate at the end.
     episodes: Few | None = None
-    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
-    learners that adapt, as many as --rollouts."""
+    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
+    that adapt play --rollouts episodes."""
     other_tasks: Switch = False
-    """Evaluate on as many tasks that the run was not trained on, too; learners that adapt have --split others."""
+    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
+    others."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: train and test, on ML20
-    fifteen classes beside the five unseen ones; others: tasks of the train classes that the run was not trained on."""
-    shots: Shots | None = None  # There: adapt so often, one after the other. None: 1.
-    rollouts: Few | None = None  # There: episodes of each task in a shot. None: as in training, but 40 at most.
-    tasks: Count | None = None  # There: the first so many tasks of each class. None: 5.
+    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
+    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
+    on."""
+    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
+    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
+    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
     print_config: Switch = False  # Print the resolved config as JSON and stop.
 
 
 def run_flags(arguments: Sequence[str]) -> RunFlags:
-    """Return the flags with a resolved and checked config.
+    """Return the flags with a resolved config.
 
     The learner, its preset and the device decide the other flags and their defaults, so these three are read first.
     BidexError is raised for bad input.
@@ -65,16 +67,14 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
         algo=default.algo,
         preset=default.preset,
     )
-    config = resolve(config)
-    check(config, with_memory=not flags.print_config)
-    if folder is not None:
-        check_resumed(folder, config)
-    return replace(flags, config=config)
+    return replace(flags, config=resolve(config))
 
 
 def config_of_words(arguments: Sequence[str]) -> AnyConfig:
-    """Return the resolved config of a run by the words that follow ``bidex-meta run``."""
-    return run_flags(arguments).config
+    """Return the resolved and checked config of a run by the words that follow ``bidex-meta run``."""
+    config = run_flags(arguments).config
+    check(config)
+    return config
 
 
 def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:

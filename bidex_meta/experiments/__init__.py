@@ -1,1 +1,1 @@
-"""What a person does, as functions: train, evaluate, verify, meta-test, transfer, sweep, record."""
+"""Functions for what a person does with runs: train, evaluate, meta-test, verify, plot."""

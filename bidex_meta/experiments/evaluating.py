@@ -3,7 +3,6 @@
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
@@ -20,7 +19,9 @@ from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.training.launch import say
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
+from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
@@ -55,7 +56,7 @@ class PlayedTasks:
 
 @dataclass(frozen=True)
 class RunEvaluation:
-    """What :func:`evaluate` found."""
+    """The result of :func:`evaluate`."""
 
     run: RunFolder
     algo: str
@@ -82,7 +83,7 @@ class RunEvaluation:
 
 @dataclass(frozen=True)
 class RunMetaTest:
-    """What :func:`meta_test` found."""
+    """The result of :func:`meta_test`."""
 
     run: RunFolder
     algo: str
@@ -101,6 +102,7 @@ class RunMetaTest:
         return {**found, "splits": splits, **_closing(self.conditions, self.worlds)}
 
 
+@checked_arguments
 def evaluate(
     run: RunFolder | str | Path,
     *,
@@ -108,9 +110,9 @@ def evaluate(
     checkpoint: str = "last",
     random: bool = False,
     other_tasks: bool = False,
-    episodes: int | None = None,
-    num_envs: int | None = None,
-    seed: int = Options.seed,
+    episodes: Few | None = None,
+    num_envs: Environments | None = None,
+    seed: Seed = Options.seed,
     randomisation: str | Path | None = None,
     device: str = "auto",
     engine: str = "auto",
@@ -152,17 +154,23 @@ def evaluate(
     return found
 
 
+@checked_arguments
 def meta_test(
     run: RunFolder | str | Path,
     *,
     split: str = "auto",
     checkpoint: str = "last",
-    options: Options | None = None,
+    shots: Shots | None = None,
+    rollouts: Few | None = None,
+    episodes: Few | None = None,
+    tasks: Few | None = None,
+    trials: Few | None = None,
+    num_envs: Environments | None = None,
+    seed: Seed = Options.seed,
     randomisation: str | Path | None = None,
     device: str = "auto",
     engine: str = "auto",
     save: bool = False,
-    **size: Any,
 ) -> RunMetaTest:
     """Evaluate a run's learner before and after it adapts to tasks.
 
@@ -171,12 +179,17 @@ def meta_test(
         split: ``train``, ``test``, ``others`` (tasks of the train classes that the run was not trained on), or
             ``auto`` for train and test.
         checkpoint: ``last``, ``best`` or a file.
-        options: How much is played; None: the defaults of ``bidex_meta.experiments.metatest.Options``.
+        shots: Adaptation rounds, one after the other; None: 1.
+        rollouts: Episodes of each task in a shot; None: as in training, 40 at most, else 10.
+        episodes: Evaluation episodes of each task; None: the number of rollouts.
+        tasks: Tasks of each class, the first of its pool; None: 5.
+        trials: Adaptations to each task, each from the start and to other episodes; None: five or more per class.
+        num_envs: Most environments stepped together; None: 1024.
+        seed: Seed of the episodes' starts; training does not use the default.
         randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
         save: Whether the result is written to the run's ``evaluation.json``.
-        size: Fields of ``options`` to replace: ``shots``, ``rollouts``, ``episodes``, ``tasks``, ``trials``, ...
 
     Raises BidexError for a run without such a checkpoint or split, and for learners that do not adapt.
     """
@@ -186,7 +199,9 @@ def meta_test(
         raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
     metatest.check_worlds(worlds, config.algo)
     splits = metatest.splits_of(worlds, split)
-    options = replace(options or Options(), **size)
+    options = Options(
+        shots=shots, rollouts=rollouts, episodes=episodes, tasks=tasks, trials=trials, num_envs=num_envs, seed=seed
+    )
     state, steps = load_checkpoint(folder, checkpoint)
     load = partial(policy_of, folder, state, config.device)
     found = metatest.meta_test(worlds, config, load, options, splits)

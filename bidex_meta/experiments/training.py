@@ -26,6 +26,7 @@ from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, resume_command, say
 from bidex_meta.training.learner import NO_SOURCES, Sources
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
@@ -38,7 +39,7 @@ Checkpoint = tuple[Json, int]  # state and environment steps
 
 @dataclass(frozen=True)
 class Event:
-    """What :func:`train` calls back with, in process 0."""
+    """An event of a training, passed to the callback of :func:`train` in process 0."""
 
     kind: Literal["started", "iteration", "ended"]
     folder: RunFolder
@@ -58,6 +59,7 @@ class Stopped(KeyboardInterrupt):
         self.number = number
 
 
+@checked_arguments
 def train(
     config: AnyConfig | None = None,
     *,
@@ -107,7 +109,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Run:
-    """What trains in this process."""
+    """The parts of a training in this process."""
 
     folder: RunFolder
     kind: LearnerKind
@@ -126,10 +128,13 @@ def _opened(resume: RunFolder | str | Path, run_dir: object) -> RunFolder:
 def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
     if config is None and old is None:
         raise BidexError('Expected a config or a run to resume, got neither. Pass RunConfig(suite="MT4-v2").')
-    config = resolve(old.config() if config is None and old else config)  # pyright: ignore[reportArgumentType]
-    check(config)
-    if old is not None:
+    if old is None:
+        assert config is not None
+        config = resolve(config)
+    else:
+        config = resolve(old.config() if config is None else config, str(old.config_path))
         check_resumed(old, config)
+    check(config)
     return config
 
 

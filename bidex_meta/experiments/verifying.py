@@ -18,6 +18,7 @@ from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.provenance import differences
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.launch import say
+from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
 from bidex_meta.utils.validation import parse as parse_content
@@ -58,7 +59,7 @@ class _Conditions(TypedDict):
 
 
 class _Recorded(TypedDict):
-    """What ``evaluation.json`` must hold beyond :mod:`bidex_meta.runs.schemas` to be made again."""
+    """The entries that ``evaluation.json`` needs beyond :mod:`bidex_meta.runs.schemas` for a verification."""
 
     steps: Whole
     seed: Seed
@@ -69,7 +70,7 @@ class _Recorded(TypedDict):
 
 @dataclass(frozen=True)
 class Verification:
-    """What :func:`verify` found."""
+    """The result of :func:`verify`."""
 
     run: RunFolder
     title: str
@@ -95,6 +96,7 @@ class Verification:
         return report | {"classes": {each.name: each.to_json() for each in self.classes}}
 
 
+@checked_arguments
 def verify(
     run: RunFolder | str | Path,
     *,

@@ -154,3 +154,12 @@ def test_a_suite_file_that_was_changed_is_found(shown, toy_worlds, tmp_path: Pat
     suite.write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 49"))
     assert main(["evaluate", str(tmp_path / "r")]) == 0
     assert "was made with suite digest " in capsys.readouterr().err
+
+
+def test_a_resumed_run_says_other_packages_once(run: Path, capsys) -> None:
+    versions = json.loads((run / "versions.json").read_text())
+    versions["packages"]["torch"] = "1.0.0"
+    (run / "versions.json").write_text(json.dumps(versions))
+    capsys.readouterr()
+    assert main(["run", "--resume", str(run), "--steps", "120", "--no-evaluate"]) == 0
+    assert capsys.readouterr().err.count("was made with torch 1.0.0 then") == 1

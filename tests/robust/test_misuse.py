@@ -23,7 +23,11 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import compare
+from bidex_meta.experiments import evaluating
+from bidex_meta.experiments.plotting import plot
 from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.training import train
+from bidex_meta.experiments.verifying import verify
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
 from bidex_meta.runs import (
@@ -293,7 +297,17 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     }),
     "RunFolder.finish": lambda s: (s.run.finish, {"step": (5, "None zero one")}),
     "RunFolder.change_config": lambda s: (s.run.change_config, {"config": (s.run.config(), "")}),
-    "load_policy": lambda s: (lambda **a: load_policy(s.run, **a), {"device": ("cpu", ""), "which": ("last", "")}),
+    "load_policy": lambda s: (load_policy, {"run": (s.run, ""), "device": ("cpu", ""), "which": ("last", "")}),
+    "train": lambda s: (train, {"resume": (s.run, ""), "run_dir": ("r", ""), "on_event": (None, "")}),
+    "evaluating.evaluate": lambda s: (evaluating.evaluate, {
+        "run": (s.run, ""), "split": ("nowhere", ""), "checkpoint": ("last", ""), "episodes": (1, ""),
+        "num_envs": (4, ""), "seed": (0, ""), "device": ("cpu", ""), "engine": ("c", ""), "randomisation": (None, ""),
+    }),
+    "meta_test": lambda s: (evaluating.meta_test, {
+        "run": (s.run, ""), "shots": (1, ""), "tasks": (1, ""), "trials": (1, ""),
+    }),
+    "verify": lambda s: (verify, {"run": (s.run, ""), "device": ("cpu", ""), "num_envs": (4, "")}),
+    "plot": lambda s: (plot, {"runs": ([s.run], ""), "out": (s.folder / "curves.png", "")}),
     "Checkpoints": lambda s: (lambda **a: Checkpoints(**a).load(), {
         "folder": (s.run.path, "nowhere"), "keep": (3, "one zero"),
     }),
