@@ -266,7 +266,8 @@ class Benchmark:
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
         # By the class's name, so that all objects of a class have the same goals.
-        space, key = self._classes[entry.name].variation_space, entry.class_name
+        space = self._classes[entry.name].variation_space
+        key = entry.class_name
         if entry.tasks:
             variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.split == split]
         else:
@@ -275,7 +276,8 @@ class Benchmark:
         return [Task.from_variation(env_name, variation) for variation in variations]
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
-        moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
+        moving = True if self.suite.base == "moving" else None
+        hides = self.suite.observation == "masked"
         points = (self.suite.points, self.suite.point_kinds)
         classes = dict[str, type[SuiteEnv]]()
         for entry in self.suite.split_classes(split):

@@ -171,7 +171,8 @@ class RunConfig(Generic[LearnerSettings]):
     def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
         """Name, value here and value there of all entries that differ, but for those that a resumed run may change."""
         free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
-        here, there = self.flat(), other.flat()
+        here = self.flat()
+        there = other.flat()
         for name in sorted((here.keys() | there.keys()) - free - set(ignored)):
             if here.get(name) != there.get(name):
                 yield name, here.get(name), there.get(name)

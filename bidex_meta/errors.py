@@ -36,7 +36,8 @@ def known_name(kind: str, name: str, known: Iterable[str], meant: Mapping[str, s
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """The known name that was probably meant; of one with a prefix (``metaworld/MT10``) the rest alone will do."""
-    given, names = name.casefold(), list(known)
+    given = name.casefold()
+    names = list(known)
     for other in names:
         if other.rpartition("/")[2].casefold() == given:
             return other

@@ -74,7 +74,8 @@ class Rules:
         return self.starts == "jittered"
 
 
-V1, V2 = Rules(), Rules("v2", "wide", "at-end", "jittered")
+V1 = Rules()
+V2 = Rules("v2", "wide", "at-end", "jittered")
 _VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
 
 

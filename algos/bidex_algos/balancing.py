@@ -95,7 +95,9 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     best of several. No number is read on the host, so a GPU is never waited for. ``gram`` holds the inner products of
     the gradients (n, n), float64; ``even`` holds the weights e of the mean (n,), from which the method starts.
     """
-    weights, mean, square = even, gram @ even, reach.square()
+    weights = even
+    mean = gram @ even
+    square = reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
     mu = 0.1 * (even @ mean).clamp_min(1e-30)
     diagonal = torch.eye(len(even), dtype=gram.dtype, device=gram.device)

@@ -18,7 +18,9 @@ class Labelled:
     """
 
     def __init__(self, steps: int, rows: Tensor, task_id: Tensor, observations: int, actions: int):
-        self.steps, self.rows, self.added = steps, rows, 0
+        self.steps = steps
+        self.rows = rows
+        self.added = 0
         self.tasks, self._count = torch.unique_consecutive(task_id, return_counts=True)
         self._first = self._count.cumsum(0) - self._count
         half = {"dtype": torch.float16, "device": rows.device}
@@ -39,7 +41,8 @@ class Labelled:
 
     def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
         """Draw indices, uniform within each task: int64 (batches, K * per_task), task after task."""
-        shape, device = (batches, len(self.tasks), per_task), self.rows.device
+        shape = (batches, len(self.tasks), per_task)
+        device = self.rows.device
         step = torch.randint(self.filled, shape, generator=generator, device=device)
         # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=generator, device=device) % self._count[:, None]
@@ -61,7 +64,8 @@ class Labelled:
 
     def load_state_dict(self, state: State) -> None:
         """Restore the result of :meth:`state_dict`; raises BidexError if it has other environments or another size."""
-        here, there = (self.steps, self.rows.tolist()), (state["steps"], state["rows"].tolist())
+        here = (self.steps, self.rows.tolist())
+        there = (state["steps"], state["rows"].tolist())
         if here != there:
             raise BidexError(
                 f"The checkpoint's data set keeps {there[0]} steps of {len(there[1])} environments, this one {here[0]} "

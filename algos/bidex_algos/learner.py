@@ -59,7 +59,9 @@ class Learner(Contract):
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
         check_autoreset(world, self.name, self.autoreset_mode(config))
-        self.world, self.config, self.seed = world, config, seed
+        self.world = world
+        self.config = config
+        self.seed = seed
         self.device = torch.device(world.device)
         self.env_steps = 0
         self.shape = Shape.of(world)
@@ -106,7 +108,9 @@ class Learner(Contract):
 
     def iterate(self) -> dict[str, float]:
         """Collect experience, learn from it and return metrics; a FloatingPointError if a loss is not finite."""
-        started, steps, self._collected = time.perf_counter(), self.env_steps, 0.0
+        started = time.perf_counter()
+        steps = self.env_steps
+        self._collected = 0.0
         metrics = self._iterate()
         if not math.isfinite(sum(value for name, value in metrics.items() if name.startswith(("Loss/", "Policy/")))):
             steps = self.env_steps
@@ -115,7 +119,8 @@ class Learner(Contract):
                 world.check_formulas()  # a user's own class may have caused the non-finite numbers
             raise FloatingPointError(f"{self.name}: the loss is not finite after {steps} steps; {self.remedy}.")
         whole = time.perf_counter() - started
-        metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected
+        metrics["Perf/collection_time"] = self._collected
+        metrics["Perf/learning_time"] = whole - self._collected
         metrics["Perf/steps_per_second"] = (self.env_steps - steps) / whole
         return metrics
 
@@ -153,11 +158,14 @@ class Learner(Contract):
 
         Raises ValueError if the config describes other layers than the weights have, before the layers take memory.
         """
-        init, weights, sizes = torch.Generator().manual_seed(0), state["weights"], state["shape"]
+        init = torch.Generator().manual_seed(0)
+        weights = state["weights"]
+        sizes = state["shape"]
         total = sum(weight.numel() for weight in weights.values())
         if max(size for size in sizes.values() if isinstance(size, int)) > total:
             raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
-        config, shape = cls.config_type(**state["config"]), Shape.load(sizes)
+        config = cls.config_type(**state["config"])
+        shape = Shape.load(sizes)
         with torch.device("meta"):
             planned = cls._make_policy(config, shape, init, torch.device("meta")).state_dict()
         if _shapes(planned) != _shapes(weights):
@@ -171,7 +179,8 @@ class Learner(Contract):
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
-        network, weights = _network(self.policy.state_dict()), _network(policy["weights"])
+        network = _network(self.policy.state_dict())
+        weights = _network(policy["weights"])
         if _shapes(network) != _shapes(weights):
             raise BidexError(
                 "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and "

@@ -42,7 +42,11 @@ class Replay:
         cut_share: float = 1 / 16
     ):  # fmt: skip
         rows = len(task_id)
-        self.steps, self.rows, self.num_tasks, self.device, self.added = steps, rows, num_tasks, device, 0
+        self.steps = steps
+        self.rows = rows
+        self.num_tasks = num_tasks
+        self.device = device
+        self.added = 0
         self.slots = steps + 1  # one more than transitions, because the newest observation has none yet
         self.cuts_kept = _cuts_kept(steps, rows, cut_share)
 
@@ -92,7 +96,8 @@ class Replay:
         self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
         # A weight of 0 does not remove a reward that is NaN.
-        rewards, numbers = reward.masked_fill(~valid, 0.0), number.masked_fill(~cut, 0)
+        rewards = reward.masked_fill(~valid, 0.0)
+        numbers = number.masked_fill(~cut, 0)
         step = {"actions": actions, "rewards": rewards, "terminated": terminated, "valid": valid, "cut": numbers}
         for name, value in step.items():
             self._steps[name][self.added % self.slots] = value
@@ -152,7 +157,8 @@ class Replay:
 
     def load_state_dict(self, state: State) -> None:
         """Restore the result of :meth:`state_dict`; raises BidexError if it comes from a replay of another size."""
-        here, there = (self.steps, *self._obs.shape[1:]), (state["steps"], *state["obs"].shape[1:])
+        here = (self.steps, *self._obs.shape[1:])
+        there = (state["steps"], *state["obs"].shape[1:])
         if here != there:
             raise BidexError(
                 f"The checkpoint's replay had (steps, num_envs, observations) = {there}, this one has {here}. Resume "
@@ -187,12 +193,15 @@ class Stretches:
     """Up to ``n`` consecutive steps from each of ``places``, int64 (batches, B); ``last`` are the final indices."""
 
     def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
-        self.replay, self.first, self.last = replay, places, places
+        self.replay = replay
+        self.first = places
+        self.last = places
         self.rewards: Tensor | None = None
         if n == 1:
             return
         newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
-        self.rewards, self.steps = replay.at("rewards", self.first), torch.ones_like(self.first)
+        self.rewards = replay.at("rewards", self.first)
+        self.steps = torch.ones_like(self.first)
         going = replay.at("valid", self.first) & ~self._ended(self.first)
         for _ in range(1, n):
             following = replay.after(self.last)

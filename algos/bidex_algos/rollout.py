@@ -19,7 +19,9 @@ class EpisodeStatistics:
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
-        self.task_id, self.task_names, self.window = task_id, task_names, window
+        self.task_id = task_id
+        self.task_names = task_names
+        self.window = window
         # Rows: return, length, success, count.
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
@@ -95,13 +97,18 @@ def collect(
     """Fill ``rollout`` from ``world``, starting at observations ``obs``; return the observations to go on from."""
     for t in range(rollout.steps):
         action, mean = sample(obs)
-        rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
+        rollout.obs[t] = obs
+        rollout.actions[t] = action
+        rollout.means[t] = mean
         obs, reward, terminated, truncated, info = world.step(action)
         valid = ~info["unstable"]
         rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
-        rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
+        rollout.terminated[t] = terminated
+        rollout.ended[t] = terminated | truncated | ~valid
+        rollout.valid[t] = valid
         cut = truncated & ~terminated & valid
-        values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
+        values = rollout.final_values[t].zero_()
+        final_obs = info["final_obs"]
         if not maths.may_look(cut.device):
             # A forward pass of all environments is cheaper than waiting for the indices of the cut rows.
             there = cut.view(-1, *[1] * (values.dim() - 1))

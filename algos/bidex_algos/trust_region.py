@@ -29,7 +29,9 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
     After P iterations the solution is exact except for rounding. Once the squared residual is below ``tolerance`` of
     the first one, x no longer changes.
     """
-    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
+    x = torch.zeros_like(b)
+    residual = b.clone()
+    direction = b.clone()
     square = first = residual.dot(residual)
     for _ in range(iterations):
         along = product(direction)

@@ -95,7 +95,8 @@ def paired_steps(full: "World", bare: "World", steps: int, generator: "Generator
     full_time = bare_time = 0.0
     for _ in range(steps):
         action = 2.0 * torch.rand(full.num_envs, full.action_size, generator=generator) - 1.0
-        action, number = action.to(full.device), full.episodes.number.clone()
+        action = action.to(full.device)
+        number = full.episodes.number.clone()
         start = now()
         full.step(action)
         full_time += now() - start
@@ -106,7 +107,8 @@ def paired_steps(full: "World", bare: "World", steps: int, generator: "Generator
         bare_time += now() - start
         begun = full.episodes.number != number
         for part, source in zip(bare.parts, full.parts, strict=True):
-            mask, placement = part.group.take(begun), source.group.engine.placement()
+            mask = part.group.take(begun)
+            placement = source.group.engine.placement()
             if mask.any():
                 part.group.engine.reset(mask, placement if part.group.engine.masked else placement[mask])
     return full_time, bare_time

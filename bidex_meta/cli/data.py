@@ -55,7 +55,8 @@ def _list(flags: DataFlags) -> None:
         except BidexError as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue
-        about, sizes = dataset.metadata, {"transitions": dataset.num_steps, "episodes": dataset.num_episodes}
+        about = dataset.metadata
+        sizes = {"transitions": dataset.num_steps, "episodes": dataset.num_episodes}
         what = {"name": name, "kind": about.get("kind"), "source": about.get("suite") or about.get("task")}
         rows.append({**what, **sizes, "megabytes": dataset.content.get("dataset_size")})
     none = f"No data sets in {data_folder()}. Record one: bidex-meta record random --task CatchUnderarm"
@@ -66,7 +67,8 @@ def _info(flags: DataFlags) -> None:
     from bidex_meta.data.checking import coverage, summary
 
     dataset = open_dataset(flags.name)
-    classes, spread = summary(dataset), coverage(dataset)
+    classes = summary(dataset)
+    spread = coverage(dataset)
     about = {name: value for name, value in dataset.metadata.items() if name != "observation_groups"}
     sizes = {"observations": dataset.observation_size, "actions": dataset.action_size}
     if flags.json:
@@ -74,7 +76,8 @@ def _info(flags: DataFlags) -> None:
         content = {**totals, "classes": [asdict(each) for each in classes], "coverage": spread, **about}
         print(json.dumps(content, indent=2))
         return
-    policies, left_out = about.get("policies", []), about.get("left_out", {})
+    policies = about.get("policies", [])
+    left_out = about.get("left_out", {})
     acted = ", ".join(f"{policy.get('algo') or 'uniform'} ({policy.get('actions')} actions)" for policy in policies)
     left = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in left_out.items() if count)
     episodes = f"{dataset.num_steps:,} transitions, {dataset.num_episodes:,} episodes"

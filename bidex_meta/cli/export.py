@@ -142,7 +142,8 @@ def _observations(rows: int, shape: Json) -> Any:
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
     """Return the file's metadata: texts by name, lists and tables as JSON."""
-    worlds, versions = Worlds.open(config.to_json()), folder.versions()
+    worlds = Worlds.open(config.to_json())
+    versions = folder.versions()
     facts = {
         "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
         "classes": list(worlds.tasks("train")), "seed": config.seed, "steps": steps,

@@ -23,7 +23,8 @@ class FlagsFound(Exception):
     """Reports the flags of a command instead of parsing them; only ``flags_of`` requests this."""
 
     def __init__(self, options: type, default: object) -> None:
-        self.options, self.default = options, default
+        self.options = options
+        self.default = default
 
 
 _asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False)

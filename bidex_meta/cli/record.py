@@ -130,7 +130,8 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
     from bidex_meta.data.collect import bytes_held, resumed_writer
     from bidex_meta.experiments.run_data import dataset_metadata
 
-    plan, size = collection.plan, collection.plan["size"]
+    plan = collection.plan
+    size = collection.plan["size"]
     folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
     with contextlib.ExitStack() as stack:
         if not flags.estimate:
@@ -139,7 +140,8 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
         stack.callback(world.close)
         sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
         length = collection.episode_share * float(world.max_episode_steps.float().mean())
-        needed, memory = writer.estimated_bytes(size, *sizes, length), bytes_held(world)
+        needed = writer.estimated_bytes(size, *sizes, length)
+        memory = bytes_held(world)
         if memory > _MOST_HELD:
             raise BidexError(
                 f"The episodes of {plan['num_envs']:,} rows would take {memory / 1e9:.1f} GB while they run, and "
@@ -174,7 +176,8 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
     config["threads"] = flags.threads or before.get("threads") or usable_cores()
     set_up_torch(config["threads"])
-    actors, policies = [Actor(None)], [{"algo": None, "actions": "uniform"}]
+    actors = [Actor(None)]
+    policies = [{"algo": None, "actions": "uniform"}]
     if kind != "random":
         actors, policies = map(list, zip(*(_actor(flags, path, config["device"]) for path in flags.runs), strict=True))
     pools = source.tasks("train")
@@ -218,7 +221,8 @@ def _config(flags: RecordFlags) -> Json:
             configs.append({name: value for name, value in stored.to_json().items() if name in _OF_RUN})
             if stored.task_seed is not None:  # an offline learner plays the tasks of its data
                 configs[-1]["seed"] = stored.task_seed
-        config, last = configs[0], configs[-1]
+        config = configs[0]
+        last = configs[-1]
         if differ := [name for name in config if config[name] != last[name]]:
             raise BidexError(
                 f"The two runs differ in {differ[0]}: {config[differ[0]]} and {last[differ[0]]}. Name runs on the same "
@@ -261,7 +265,9 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
         )
     source = Worlds.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
-    name, size, rows = source.name, flags.size or SIZE["demonstrations"], flags.num_envs or _DEMONSTRATORS[flags.starts]
+    name = source.name
+    size = flags.size or SIZE["demonstrations"]
+    rows = flags.num_envs or _DEMONSTRATORS[flags.starts]
     if name not in source.task_classes() or ":" in name:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
     witness = {} if flags.script else {name: load_witness(name)}

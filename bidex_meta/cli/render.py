@@ -77,14 +77,14 @@ def main(arguments: Sequence[str]) -> None:
     look = {"width": width, "height": height, "camera": flags.camera}
     if flags.tiled:
         every = every if suffix != ".png" else max(steps, 1)
-        frames, count = (
-            film_tiles(agent, world, rows, steps, flags.seed, every, flags.large, **look),
-            steps // every + 1,
-        )
+        frames = film_tiles(agent, world, rows, steps, flags.seed, every, flags.large, **look)
+        count = steps // every + 1
     elif suffix == ".png":  # only the last frame
-        frames, count = film_row(agent, world, rows[0], steps, flags.seed, None, **look), 1
+        frames = film_row(agent, world, rows[0], steps, flags.seed, None, **look)
+        count = 1
     else:
-        frames, count = film_row(agent, world, rows[0], steps, flags.seed, every, **look), steps // every + 1
+        frames = film_row(agent, world, rows[0], steps, flags.seed, every, **look)
+        count = steps // every + 1
     frames = counted(frames, count, "frames")
     if suffix in video.FILMS:
         video.write_film(out, frames, CONTROL_RATE / every)

@@ -60,7 +60,8 @@ def render(runs: Sequence[Run]) -> str:
     histories = read_histories(runs)
     short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
     named = list(zip(short, histories, strict=True))
-    curves, names = [(name, history.curves) for name, history in named], _names(named)
+    curves = [(name, history.curves) for name, history in named]
+    names = _names(named)
     configs = [run.config() for run in runs]
     algos = ", ".join(dict.fromkeys(config.algo for config in configs))
     subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
@@ -103,7 +104,9 @@ def _names(histories: Sequence[tuple[str, History]]) -> dict[Path, str]:
 
 
 def _run(run: Run, name: str) -> Json:
-    config, rows, versions = run.config(), run.metrics(), run.versions()
+    config = run.config()
+    rows = run.metrics()
+    versions = run.versions()
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}

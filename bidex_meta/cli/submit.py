@@ -114,7 +114,8 @@ def _weights(folders: Sequence[RunFolder]) -> list[str]:
 
 def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
     """Return the hours of training, the device, and the commit that trained."""
-    versions, config = folder.versions(), folder.config()
+    versions = folder.versions()
+    config = folder.config()
     git = versions.get("git") or {}
     commit = git.get("commit") and git["commit"][:10] + "+" * bool(git.get("dirty"))
     gpus = set(versions.get("gpus") or []) if config.device.startswith("cuda") else set()

@@ -123,7 +123,8 @@ class State(NamedTuple):
 
 def state_of(run: PlannedRun) -> State:
     """Return the progress of a run whose config is known; raise BidexError if its folder holds another config's run."""
-    rows, evaluated = [], False
+    rows = []
+    evaluated = False
     if exists(run.folder.config_path):
         wanted = run.config if run.after is None else replace(run.config, start_from=str(run.after.resolve()))
         # Seeds share a config, and the machine may have changed, so seed, threads and device are ignored.
@@ -134,7 +135,8 @@ def state_of(run: PlannedRun) -> State:
             )
         rows = last_rows(run.folder.metrics_path) if is_file(run.folder.metrics_path) else []
         evaluated = run.folder.evaluated
-    last, why = rows[-1] if rows else {"step": 0}, _last_line(_beside(run, "failed"))
+    last = rows[-1] if rows else {"step": 0}
+    why = _last_line(_beside(run, "failed"))
     steps = run.config.goal(last)
     done = evaluated and run.folder.evaluation().get("steps", steps) >= steps
     state = "runs" if _locked(run) else "done" if done else "failed" if why else "left"
@@ -145,7 +147,9 @@ class Job:
     """A run as a callable, for a thread or for submitit."""
 
     def __init__(self, run: PlannedRun, command: Sequence[str]) -> None:
-        self.run, self.command, self.stopped = run, command, False
+        self.run = run
+        self.command = command
+        self.stopped = False
         self.process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> bool:
@@ -230,7 +234,9 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
     A failed run stops only the runs that start from it. A run that a signal stopped counts as failed. After Ctrl-C or
     SIGTERM of the sweep each run saves and stops.
     """
-    waiting, failed, free = list(runs), dict[Path | None, str](), list(cores)
+    waiting = list(runs)
+    failed = dict[Path | None, str]()
+    free = list(cores)
     note("")  # runs take hours; a line is printed at the start and end of each run
     own: dict[Future[bool], Job] = {}
     jobs: list[Job] = []
@@ -254,7 +260,8 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
                     jobs.append(Job(run, COMMAND))
                     own[pool.submit(jobs[-1])] = jobs[-1]
                 for future in wait(own, return_when=FIRST_COMPLETED).done:
-                    run, error = own.pop(future).run, future.exception()
+                    run = own.pop(future).run
+                    error = future.exception()
                     end = "done"
                     if error is not None:
                         failed[run.path] = "has failed"
@@ -281,7 +288,8 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
         import submitit
     except ImportError:
         raise BidexError("--submit needs submitit: pip install 'bidex-meta[slurm]'.") from None
-    folder, jobs = (out / "jobs").resolve(), {}
+    folder = (out / "jobs").resolve()
+    jobs = {}
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=where)
         executor.update_parameters(**{"timeout_min": 24 * 60, "cpus_per_task": 1, **parameters})
@@ -349,10 +357,13 @@ def _last_line(path: Path) -> str:
 
 def _print(states: Sequence[State]) -> None:
     """Print a line per run; the hours left follow from the run's speed, else the suite's mean, else the mean of all."""
-    speeds, rows, total = [(each.run.subject, each.speed) for each in states if each.speed], [], 0.0
+    speeds = [(each.run.subject, each.speed) for each in states if each.speed]
+    rows = []
+    total = 0.0
     for each in states:
         alike = [speed for subject, speed in speeds if subject == each.run.subject] or [speed for _, speed in speeds]
-        speed, minutes = each.speed or (mean(alike) if alike else math.nan), each.run.config.minutes
+        speed = each.speed or (mean(alike) if alike else math.nan)
+        minutes = each.run.config.minutes
         seconds = (each.goal - each.step) / speed if minutes is None else 60 * minutes - each.seconds
         hours = 0.0 if each.state == "done" else max(seconds / 3600, 0.0)
         total += hours

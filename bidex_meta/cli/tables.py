@@ -179,14 +179,16 @@ def evaluation_table(
         cells += [NONE if row[key] is None else percent(row[key]) for key in ("success_once", "success_at_end")]
         cells += [ranged(row["return"], row["return_interval"]), _score(row["score"])]
         if others is not None:
-            other, difference = others["classes"][name], differences[name]
+            other = others["classes"][name]
+            difference = differences[name]
             cells += [percent(other["success"]), ranged(other["return"], other["return_interval"])]
             cells += [ranged(difference.value, difference.interval, sign=True)]
         if gains is not None:
             cells += gained(gains.classes[name])
         table.add(*cells)
     for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
-        success, score = rows["aggregate"]["success"], rows["aggregate"]["score"]
+        success = rows["aggregate"]["success"]
+        score = rows["aggregate"]["score"]
         cells = [label, "", "", percent(success[key]), "", "", "", _score(score[key] if score else None)]
         if others is not None:
             cells += [percent(others["aggregate"]["success"][key])]
@@ -203,7 +205,8 @@ def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
     """Return a short form of ``evaluation_table``, with intervals if there is room."""
     headers = ["task", "success", "random", "return [95 %]", "random return"]
     table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks")
-    rows, others = policy.to_json(), random.to_json()
+    rows = policy.to_json()
+    others = random.to_json()
     for name, row in rows["classes"].items():
         other = others["classes"][name]
         cells = [percent(row["success"]), percent(other["success"]), ranged(row["return"], row["return_interval"])]

@@ -74,7 +74,8 @@ def main(arguments: Sequence[str]) -> None:
     worlds = Worlds.open(config.to_json())
     for path in flags.start_from:
         say_other_rules(RunFolder.open(path), worlds)
-    classes, cores = held_out(worlds, flags.classes), choose_cores(flags.cores, flags.workers)
+    classes = held_out(worlds, flags.classes)
+    cores = choose_cores(flags.cores, flags.workers)
     words = shared_words(flags.num_envs, arguments[at + 1 :])
     # Bad words after -- are refused before anything is written.
     planned = config_of_words([f"--suite={config.suite}", *words])
@@ -98,7 +99,8 @@ def _cells(
     steps: list[str]
 ) -> Iterator[Cell]:  # fmt: skip
     """Yield all runs, seeds outermost; write suite files, and record missing demonstrations."""
-    counts, most = sorted({*flags.demonstrations}), max(flags.demonstrations, default=0)
+    counts = sorted({*flags.demonstrations})
+    most = max(flags.demonstrations, default=0)
     for folder in ("suites", "data", "runs"):
         (flags.out / folder).mkdir(exist_ok=True)
     files = {name: suite_file(worlds, name, flags.out / "suites") for name in classes}
@@ -115,7 +117,8 @@ def _report(flags: TransferFlags, suite: str, cells: Sequence[Cell]) -> None:
     groups: dict[tuple[str, str, int | None], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.task, cell.arm, cell.demonstrations), []).append(cell)
-    steps, shots = list[Json](), list[Json]()
+    steps = list[Json]()
+    shots = list[Json]()
     for (task, arm, count), members in groups.items():
         done = [cell.run for cell in members if state_of(cell.run).state == "done"]
         row: Json = {"class": task, "from": arm, "seeds": [run.seed for run in done]}
@@ -146,7 +149,8 @@ def _steps_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[s
     cells = []
     for row in rows:
         measures = [*map(_text, (*row["at"].values(), row["success"])), _text(row["return"], 1.0), _text(row["area"])]
-        median, seeds = row["half"]["median"], row["half"]["of_seeds"]
+        median = row["half"]["median"]
+        seeds = row["half"]["of_seeds"]
         half = f"> {end:,}" if median is None else f"{median:,}"
         half += f" ({sum(each is not None for each in seeds)} of {len(seeds)})"
         cells.append(

@@ -31,7 +31,8 @@ _NETWORK = (
     "architecture", "modules", "hidden", "activation", "normalise_observations", "point_widths", "points_read",
 )  # fmt: skip
 """Fields of a learner's config that a policy to start from must share."""
-_ALGO, _PRESET = "ppo", "laptop"
+_ALGO = "ppo"
+_PRESET = "laptop"
 _USUAL = (f"--preset={_PRESET}", "--logger=none", "--learner.demonstration-cloning=5000")
 _EVALUATIONS = 100  # evaluations of a run by reinforcement, evenly spaced
 _LONG = 10**9  # steps in which only the critic learns, so that a run by demonstrations keeps the cloned policy

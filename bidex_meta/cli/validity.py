@@ -92,7 +92,8 @@ def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Jso
     results = _results(worlds, world, flags)
     rows: dict[str, Json] = {}
     for slot in world.slots:
-        found, hidden = results[slot.name], [name for part in slot.task_class.hides() for name in part.names]
+        found = results[slot.name]
+        hidden = [name for part in slot.task_class.hides() for name in part.names]
         known = {name: result.success for name, result in found.items() if name not in (*_NOTHING, "witness", "misled")}
         aligned = alignment(found)
         rows[slot.name] = {

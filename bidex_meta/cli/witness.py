@@ -62,7 +62,8 @@ def _replay(name: str, flags: WitnessFlags) -> Json:
     from bidex_meta.witness.replay import replay
 
     witness = load_witness(name, flags.file)
-    result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
+    result = replay(name, witness, flags.threads)
+    rival = witness.made.get("rival")
     return {
         "task": name, "found": result.found, "return": round(result.total, 3), "first_success": result.first_success,
         "shifted": result.succeeded, "steps": len(witness.actions), "deepest_mm": round(1000.0 * result.deepest, 1),

@@ -15,7 +15,8 @@ NAMESPACE = "bidex-meta"
 
 def suite_ids(suite: Suite) -> dict[str, str]:
     """Map the Gymnasium ids of a suite to the splits that they stand for, e.g. `{"bidex-meta/MT4-v1": "train"}`."""
-    name, version = suite.name.removesuffix("-v2"), f"v{suite.version}"
+    name = suite.name.removesuffix("-v2")
+    version = f"v{suite.version}"
     if suite.kind == "multi-task":
         return {f"{NAMESPACE}/{name}-{version}": "train"}
     return {f"{NAMESPACE}/{name}-{split}-{version}": split for split in suite.splits}

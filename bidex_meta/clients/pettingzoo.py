@@ -33,8 +33,10 @@ class HandsEnv(ParallelEnv):
         self, task: str, agents: Agents = "hands", render_mode: str | None = None, seed: int | None = None,
         device: str | torch.device = "cpu"
     ) -> None:  # fmt: skip
-        self._env, self.render_mode = TaskEnv(task, render_mode, seed, device), render_mode
-        whole, size = self._env.world.single_observation_space, self._env.world.single_action_space.shape[0]
+        self._env = TaskEnv(task, render_mode, seed, device)
+        self.render_mode = render_mode
+        whole = self._env.world.single_observation_space
+        size = self._env.world.single_action_space.shape[0]
         views = agent_views(self._env.world.observation_groups, size, agents)
         self.possible_agents = [view.name for view in views]
         self.agents: list[str] = []
@@ -85,7 +87,8 @@ class HandsEnv(ParallelEnv):
                 raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
             joint[self._actions[name]] = given
         self._state, reward, terminated, truncated, info = self._env.step(joint)
-        every, obs = self.agents, self._observations()
+        every = self.agents
+        obs = self._observations()
         if terminated or truncated:
             self.agents = []
         rewards, ends, cuts = (dict.fromkeys(every, value) for value in (reward, terminated, truncated))

@@ -31,8 +31,10 @@ class RslRlVecEnv(VecEnv):
     def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: object = None, stagger: bool = False) -> None:
         check_training(world, stagger)
         self.world: Any = world
-        self.num_envs, self.num_actions = world.num_envs, world.action_space.shape[1]
-        self.device, self.cfg = world.device, cfg or {}
+        self.num_envs = world.num_envs
+        self.num_actions = world.action_space.shape[1]
+        self.device = world.device
+        self.cfg = cfg or {}
         limits = world.max_episode_steps
         self.max_episode_length = int(limits[0]) if bool((limits == limits[0]).all()) else limits
         groups = {group.name: group for group in world.observation_groups}
@@ -64,7 +66,8 @@ class RslRlVecEnv(VecEnv):
     def reset(self, seed: int | None = None) -> tuple[TensorDict, Info]:
         """Start episodes of all environments."""
         with torch.inference_mode(False):
-            self._obs, self._log = self.world.reset(seed=seed)[0], EpisodeLog(self.world)
+            self._obs = self.world.reset(seed=seed)[0]
+            self._log = EpisodeLog(self.world)
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:
@@ -96,7 +99,9 @@ class EpisodeLog:
         sums over an episode, `Episode_Reward/<term>`. All episodes, also shortened ones, yield
         `Episode_Termination/terminated`, `time_out` and `unstable`.
         """
-        ended, episode_mask, world = info["_final_obs"], info["episode_mask"], self._world
+        ended = info["_final_obs"]
+        episode_mask = info["episode_mask"]
+        world = self._world
         for name, term in info.get("reward_terms", {}).items():
             self._terms[name] = self._terms.get(name, 0.0) + term
         if not bool(ended.any()):

@@ -33,7 +33,8 @@ class SkrlEnv(Wrapper):
     def __init__(self, world: VectorWorld, seed: Seed | None = None, stagger: bool = False) -> None:
         check_training(world, stagger, AutoresetMode.NEXT_STEP)
         super().__init__(world)
-        self.world, self._seed = world, seed
+        self.world = world
+        self._seed = seed
         self._obs: Tensor | None = None
         self._ended: Tensor | None = None
 

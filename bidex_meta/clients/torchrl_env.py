@@ -27,10 +27,13 @@ class TorchRLEnv(envs.EnvBase):
     @checked_arguments
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         check_training(world, stagger)
-        rows, device = world.num_envs, world.device
+        rows = world.num_envs
+        device = world.device
         super().__init__(device=device, batch_size=torch.Size([rows]))
-        self.world, self._world_seed = world, None
-        low, high = torch.as_tensor(world.observation_space.low), torch.as_tensor(world.observation_space.high)
+        self.world = world
+        self._world_seed = None
+        low = torch.as_tensor(world.observation_space.low)
+        high = torch.as_tensor(world.observation_space.high)
         bounded = bool(low.isfinite().all() and high.isfinite().all())
         seen = data.Bounded(low, high, device=device) if bounded else data.Unbounded(low.shape, device=device)
         column = torch.Size([rows, 1])

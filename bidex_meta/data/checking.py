@@ -58,7 +58,8 @@ class _ShownState(TaskState):
 
     def __init__(self, shown: _Shown, observations: Tensor, frozen: dict[str, Tensor]) -> None:
         super().__init__(observations, {}, frozen)
-        self._shown, self.clipped = shown, torch.zeros(len(observations), dtype=torch.bool)
+        self._shown = shown
+        self.clipped = torch.zeros(len(observations), dtype=torch.bool)
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._shown:
@@ -75,7 +76,8 @@ class _ShownState(TaskState):
 
 def verify(dataset: Dataset, most: int | None = None) -> Findings:
     """Check all digests, and ``most`` evenly spread episodes (None: all); raise BidexError if a file is damaged."""
-    findings, formulas = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
+    findings = Findings(unsealed=dataset.check_digests())
+    formulas = _Formulas(dataset)
     table = dataset.table
     for number, episode in _spread_episodes(dataset, most):
         findings.episodes += 1
@@ -122,7 +124,8 @@ class _Formulas:
     """The reward formulas of a data set's classes."""
 
     def __init__(self, dataset: Dataset) -> None:
-        self._dataset, about = dataset, dataset.metadata
+        self._dataset = dataset
+        about = dataset.metadata
         self._scales = about.get("reward_scales", {})
         self._rules = Rules(**about.get("rules", {}))
         # The suite's file says whether bases move. If that file is gone, the number of actions shows whether they do.
@@ -169,7 +172,8 @@ class _Formulas:
 
     def _class(self, name: str) -> TaskClass:
         """Return the class whose bases, fixed or moving, match the data's number of actions."""
-        classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
+        classes = [registry.get(name, base) for base in self._bases]
+        actions = self._dataset.action_size
         for task in classes:
             if task.action_size == actions:
                 task.adopt(self._rules)
@@ -221,12 +225,14 @@ class ClassSummary:
 
 def summary(dataset: Dataset) -> list[ClassSummary]:
     """Summarise each slot that has episodes; read only the tables."""
-    table, summaries = dataset.table, []
+    table = dataset.table
+    summaries = []
     for number, name in enumerate(dataset.metadata["tasks"]):
         own = table["task"] == number
         if not own.any():
             continue
-        returns, steps = table["return_unscaled"][own], table["steps"][own]
+        returns = table["return_unscaled"][own]
+        steps = table["steps"][own]
         scores = None
         if known := dataset.metadata.get("references", {}).get(name.partition("/")[0]):
             scores = Reference(known["random"], known.get("expert"), known.get("zero")).scores(returns)
@@ -253,20 +259,28 @@ def coverage(dataset: Dataset, most: int = 2000) -> Json:
     averaged over the group's entries; ``constant`` is the share of the group's entries that never change.
     ``action_std`` is the standard deviation averaged over actions; ``action_at_bounds`` is the share at ±1.
     """
-    d, a = dataset.observation_size, dataset.action_size
-    count, taken = 0, 0
-    sums, squares = np.zeros(d + a), np.zeros(d + a)
-    low, high, bounds = np.full(d, np.inf), np.full(d, -np.inf), 0
+    d = dataset.observation_size
+    a = dataset.action_size
+    count = 0
+    taken = 0
+    sums = np.zeros(d + a)
+    squares = np.zeros(d + a)
+    low = np.full(d, np.inf)
+    high = np.full(d, -np.inf)
+    bounds = 0
     first = np.zeros(0)
     for _, episode in _spread_episodes(dataset, most):
         values = np.concatenate([episode.observations[:-1], episode.actions], 1).astype(np.float64)
         if len(first) == 0:
             first = values[0].copy()
         values -= first  # sums of squares lose fewer digits
-        sums, squares, count = sums + values.sum(0), squares + (values**2).sum(0), count + len(values)
+        sums = sums + values.sum(0)
+        squares = squares + (values**2).sum(0)
+        count = count + len(values)
         low = np.minimum(low, values[:, :d].min(0))
         high = np.maximum(high, values[:, :d].max(0))
-        bounds, taken = bounds + int((np.abs(episode.actions) >= 1.0).sum()), taken + episode.actions.size
+        bounds = bounds + int((np.abs(episode.actions) >= 1.0).sum())
+        taken = taken + episode.actions.size
     std = np.sqrt(np.maximum(squares / count - (sums / count) ** 2, 0.0))
     groups = dataset.metadata.get("observation_groups", [["state", [[0, d]]]])
     where = {name: np.concatenate([np.arange(*part) for part in parts]) for name, parts in groups}

@@ -114,7 +114,8 @@ def collect(
     receives the progress and the seconds since the call. BidexError is raised if a part is damaged, or if no transition
     can be recorded.
     """
-    began, share = time.monotonic(), math.ceil(size / len(actors))
+    began = time.monotonic()
+    share = math.ceil(size / len(actors))
     now = progress(writer, len(actors))
     collector = EpisodeCollector(world, writer.add)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     while min(now.steps) < share:
@@ -122,7 +123,8 @@ def collect(
         which = int(np.argmin(now.steps))
         rows, repeats = _plan(world, share - now.steps[which], now, which)
         number = np.random.SeedSequence((seed, writer.parts)).generate_state(1, np.uint64)[0]
-        collector.policy, collector.active = which, rows
+        collector.policy = which
+        collector.active = rows
         _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
             what = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
@@ -187,7 +189,8 @@ def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writ
     seeds = np.random.SeedSequence((seed, writer.parts)).generate_state(2, np.uint32).tolist()
     collector = EpisodeCollector(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     obs, _ = collector.reset(seed=seeds[0])
-    agent, over = agent_of(seeds[1]), torch.zeros(world.num_envs, dtype=torch.bool)
+    agent = agent_of(seeds[1])
+    over = torch.zeros(world.num_envs, dtype=torch.bool)
     agent.reset(~over)
     while not bool(over.all()):
         obs, *_, info = collector.step(agent.eval_action(obs))

@@ -44,7 +44,9 @@ class EpisodeCollector(PooledWorldWrapper):
         if len(set(chosen)) != len(chosen) or not all(0 <= row < world.num_envs for row in chosen):
             most = world.num_envs - 1
             raise BidexError(f"Expected different rows of 0 to {most} to record, got {list(chosen)[:10]}.")
-        self.rows, self.policy, self._sink = list(chosen), 0, sink
+        self.rows = list(chosen)
+        self.policy = 0
+        self._sink = sink
         self.left_out: Counter[str] = Counter()
         self.active = np.ones(len(self.rows), bool)
         self._where = torch.tensor(self.rows, dtype=torch.int64, device=world.device)
@@ -54,7 +56,8 @@ class EpisodeCollector(PooledWorldWrapper):
 
     def _forget(self) -> None:
         """Drop all running episodes."""
-        num, room = len(self.rows), _FIRST_ROOM
+        num = len(self.rows)
+        room = _FIRST_ROOM
         if isinstance(self.world, TaskWorld) and num:
             # The system allocates no memory for pages that no episode reaches.
             room = int(self.world.max_episode_steps[self._where].max())
@@ -63,7 +66,8 @@ class EpisodeCollector(PooledWorldWrapper):
         self._actions = np.zeros((num, room, a), np.float32)
         self._rewards = np.zeros((2, num, room), np.float32)  # as given, and unscaled
         self._running = np.zeros(num, bool)
-        self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
+        self._length = np.zeros(num, np.int64)
+        self._task = np.zeros(num, np.int64)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Start episodes; leave out the running episodes of the environments that are reset."""
@@ -124,7 +128,9 @@ class EpisodeCollector(PooledWorldWrapper):
 
     def _end(self, row: int, terminated: bool, unstable: bool, episode_mask: bool, success: bool) -> None:
         """Pass an episode to the sink, unless the episode was shortened or has no good transition."""
-        length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
+        length = int(self._length[row])
+        slot = self._slots[row]
+        task = int(self._task[row])
         if not episode_mask:
             self.left_out[SHORTENED] += 1
         if not episode_mask or length == 0:
@@ -155,7 +161,8 @@ class EpisodeCollector(PooledWorldWrapper):
         if steps <= room:
             return
         more = [(0, 0), (0, room), (0, 0)]
-        self._observations, self._actions = np.pad(self._observations, more), np.pad(self._actions, more)
+        self._observations = np.pad(self._observations, more)
+        self._actions = np.pad(self._actions, more)
         self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
 
     def load_state_dict(self, state: State) -> None:
@@ -181,10 +188,12 @@ class EpisodeCollector(PooledWorldWrapper):
         most = given["actions"].shape[1]
         while self._actions.shape[1] < most:
             self._make_room(self._actions.shape[1] + 1)
-        self._observations[:, : most + 1], self._actions[:, :most] = given["observations"], given["actions"]
+        self._observations[:, : most + 1] = given["observations"]
+        self._actions[:, :most] = given["actions"]
         self._rewards[:, :, :most] = given["rewards"]
         self._running = given["running"].copy()
-        self._length, self._task = given["length"].copy(), given["task"].copy()
+        self._length = given["length"].copy()
+        self._task = given["task"].copy()
         self._read_pools()
 
     def _read_pools(self) -> None:
@@ -202,7 +211,8 @@ class RunCollector(EpisodeCollector):
     folder: Path
 
     def __init__(self, world: VectorWorld, rows: Sequence[int], process: int = 0) -> None:
-        self.process, self._writer = process, None
+        self.process = process
+        self._writer = None
         super().__init__(world, lambda episode: self.writer.add(episode), rows)
 
     @property

@@ -118,7 +118,8 @@ class Dataset:
     """
 
     def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
-        self.folder, self.content = folder, content
+        self.folder = folder
+        self.content = content
         self.num_episodes: int = content["total_episodes"]
         self.num_steps: int = content["total_steps"]
         self.name: str = content.get("dataset_id", folder.parent.name)
@@ -151,7 +152,8 @@ class Dataset:
     def table(self) -> dict[str, np.ndarray]:
         """Columns of ``part_files.TABLE`` and ``variation``, one row per episode; raises BidexError for damage."""
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
-        episodes, steps = len(columns["steps"]), int(columns["steps"].sum())
+        episodes = len(columns["steps"])
+        steps = int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
             what = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
             raise BidexError(f"{self.folder}: {what}. Parts are missing: record it again, or bring them back.")
@@ -195,7 +197,8 @@ class Dataset:
     def episodes(self) -> Iterator[Episode]:
         """Read all episodes one by one; raise BidexError for damaged files, or observations or actions not flat."""
         other_formats.check_spaces(self.content, self.name)
-        number, sizes = 0, None
+        number = 0
+        sizes = None
         for path, table in zip(self._paths, self._tables, strict=True):
             if "bidex" in self.content:
                 self._check_digest(path)
@@ -239,7 +242,9 @@ class Dataset:
         """
         import torch
 
-        n, d, a = self.num_steps, self.observation_size, self.action_size
+        n = self.num_steps
+        d = self.observation_size
+        a = self.action_size
         check_memory(self.transition_bytes(), f"The {n:,} transitions of {self.name}", "Record fewer, or free memory.")
         tensors = {
             "observations": torch.zeros(n, d),
@@ -253,8 +258,10 @@ class Dataset:
         start = 0
         for episode in self.episodes():
             where = slice(start, start + len(episode))
-            now, after = episode.observations[:-1], episode.observations[1:]
-            views["observations"][where], views["next_observations"][where] = now, after
+            now = episode.observations[:-1]
+            after = episode.observations[1:]
+            views["observations"][where] = now
+            views["next_observations"][where] = after
             for name in ("actions", "rewards", "terminated", "task"):
                 views[name][where] = getattr(episode, name)
             start = where.stop

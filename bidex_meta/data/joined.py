@@ -50,9 +50,11 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     have another form, actions from elsewhere have no bounds, classes do not match, or memory is too small.
     """
     ids = world.num_id_columns
-    plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
+    plain = world.single_observation_space.shape[0] - ids
+    actions = world.single_action_space.shape[0]
     forms = [_Form(dataset, world, plain, actions) for dataset in datasets]
-    steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
+    steps = sum(dataset.num_steps for dataset in datasets)
+    episodes = sum(dataset.num_episodes for dataset in datasets)
     slots = {form.slots[task] for form in forms for task in np.unique(form.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
@@ -71,18 +73,22 @@ def gathered(
 
     Raises BidexError if the episodes have fewer than ``steps`` transitions.
     """
-    states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
+    states = torch.zeros(steps + count, observations)
+    acts = torch.zeros(steps, actions)
+    rewards = torch.zeros(steps)
     at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
     ends = torch.zeros(steps, dtype=torch.bool)
     start = 0
     for number, (episode, slot, seen) in enumerate(episodes):
-        length, first = len(episode), start + number
+        length = len(episode)
+        first = start + number
         where = slice(start, start + length)
         states[first : first + length + 1] = torch.from_numpy(seen)
         for own, given in ((acts, episode.actions), (rewards, episode.rewards), (ends, episode.terminated)):
             own[where] = torch.from_numpy(given)
         at[where] = torch.arange(first, first + length)
-        left[where], task[where] = torch.arange(length - 1, -1, -1), slot
+        left[where] = torch.arange(length - 1, -1, -1)
+        task[where] = slot
         start += length
     if start != steps:
         raise BidexError(f"Expected {steps:,} transitions, got {start:,}. Check the data sets: bidex-meta data check.")
@@ -112,7 +118,8 @@ class _Form:
     """Converts a data set's episodes to a world's form; ``slots`` are the world's, ``plain`` excludes the one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
-        self.dataset, about = dataset, dataset.metadata
+        self.dataset = dataset
+        about = dataset.metadata
         names: list[str] = about["tasks"]
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
@@ -120,7 +127,8 @@ class _Form:
             raise BidexError(f"{what}. Record it with the same bases (--base), or learn for what it was recorded of.")
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for name, parts in shown if name == "task_id" for start, stop in parts)
-        self._width, self._own = plain, _Columns.of(shown, dataset.observation_size - ids)
+        self._width = plain
+        self._own = _Columns.of(shown, dataset.observation_size - ids)
         seen = ((group.name, [(part.start, part.stop) for part in group.where]) for group in world.observation_groups)
         self._theirs = _Columns.of(seen, plain)
         self._bounds = dataset.action_bounds
@@ -128,7 +136,8 @@ class _Form:
         slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
-        own, theirs = about.get("reward_scales", {}), {slot.name: slot.reward_scale for slot in slots}
+        own = about.get("reward_scales", {})
+        theirs = {slot.name: slot.reward_scale for slot in slots}
         self._factors = [
             theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0) if own and theirs else 1.0
             for name, slot in zip(names, self.slots, strict=True)
@@ -136,19 +145,24 @@ class _Form:
 
     def _check_observations(self, may_pad: bool) -> None:
         """Raise BidexError for other clouds or state sizes; with ``may_pad`` the world's states may be wider."""
-        name, own, theirs = self.dataset.name, self._own, self._theirs
+        name = self.dataset.name
+        own = self._own
+        theirs = self._theirs
         if own.label != theirs.label:
             mend = "Learn with the points that it was recorded with (--points, or [points] in the suite's file)"
             raise BidexError(f"{name} has point clouds: {own.label}, the world: {theirs.label}. {mend}.")
-        here, there = len(own.state), len(theirs.state)
+        here = len(own.state)
+        there = len(theirs.state)
         if here > there or (here < there and not may_pad):
             what = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
             raise BidexError(f"{what}. Learn for what it was recorded of.")
 
     def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         """Return an episode, its slot, and its observations in the world's form."""
-        slot, factor = self.slots[episode.task], self._factors[episode.task]
-        own, theirs = self._own, self._theirs
+        slot = self.slots[episode.task]
+        factor = self._factors[episode.task]
+        own = self._own
+        theirs = self._theirs
         seen = np.zeros((len(episode) + 1, self._width + ids), np.float32)
         seen[:, theirs.state[: len(own.state)]] = episode.observations[:, own.state]
         seen[:, theirs.cloud] = episode.observations[:, own.cloud]

@@ -15,7 +15,8 @@ def check_spaces(content: Json, name: str) -> None:
     """Raise BidexError if the spaces in ``metadata.json`` say that observations or actions are not flat."""
     for what, entry in _SPACES.items():
         space = _space(content, entry)
-        kind, shape = space.get("type", "Box"), space.get("shape", [0])
+        kind = space.get("type", "Box")
+        shape = space.get("shape", [0])
         if kind != "Box" or not isinstance(shape, list) or len(shape) != 1:
             raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
 
@@ -24,7 +25,8 @@ def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.n
     """Read an episode's array ``what`` (Minari's name); raise BidexError for a wrong shape, type or ``length``."""
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
-    shape, kind = stored.shape or (), stored.dtype
+    shape = stored.shape or ()
+    kind = stored.dtype
     if len(shape) != 1 + (what in _SPACES) or kind.kind not in "biuf":
         raise _not_flat(name, what, f"an array of shape {shape} and type {kind}")
     if length not in (None, len(stored)):

@@ -32,7 +32,9 @@ from bidex_meta.utils.files import is_file
 H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no types
 Json = dict[str, Any]
 
-MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
+MAIN = "main_data.hdf5"
+METADATA = "metadata.json"
+RECORDING = "recording.json"
 FORMAT = 1  # increased when older code can no longer read the files
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
 EPISODE_BYTES = 3800  # overhead of an episode in HDF5, bytes: measured 3,675 with five attributes
@@ -134,7 +136,8 @@ class SealedFile:
     """An HDF5 file that is being written; ``commit`` adds its digest, forces the file to the disk and renames it."""
 
     def __init__(self, path: Path) -> None:
-        h5, self._path = hdf5(), path
+        h5 = hdf5()
+        self._path = path
         self._temporary = path.with_name(f".{path.name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._disk = _Disk(self._temporary, "w+")
@@ -218,7 +221,9 @@ class PartWriter:
 
 def write_main(folder: Path, parts: Iterable[Path]) -> None:
     """Write Minari's file: a link to every episode of the parts, in the order of the parts."""
-    main, number, h5 = SealedFile(folder / MAIN), 0, hdf5()
+    main = SealedFile(folder / MAIN)
+    number = 0
+    h5 = hdf5()
     try:
         with main.writing() as file:
             for path in parts:

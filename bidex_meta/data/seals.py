@@ -23,7 +23,8 @@ _MARK = "sealed"  # second entry in the metadata: one flipped bit cannot remove 
 
 def block(file: IO[bytes]) -> bytes:
     """Compute the user block for the content of an open file."""
-    length, digest = file.seek(0, 2), 0
+    length = file.seek(0, 2)
+    digest = 0
     file.seek(BLOCK)
     while piece := file.read(_PIECE):
         digest = zlib.crc32(piece, digest)

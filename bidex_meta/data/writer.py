@@ -49,7 +49,8 @@ def default_name(subject: str, kind: str) -> str:
 
 def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
     """Return folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
-    root, usual = data_folder(), default_name(subject, kind)
+    root = data_folder()
+    usual = default_name(subject, kind)
     if out is None:
         return root / usual, usual
     folder = expanded(out)
@@ -85,7 +86,9 @@ class DatasetWriter:
     """
 
     def __init__(self, folder: Path, process: int = 0, keep: int = 0) -> None:
-        self.folder, self.process, self.parts = folder / "data", process, keep
+        self.folder = folder / "data"
+        self.process = process
+        self.parts = keep
         self.left_out: Counter[str] = Counter()
         part_files.hdf5()
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -106,7 +109,9 @@ class DatasetWriter:
         if self._part is None and not self.left_out:
             return
         self._open().commit(dict(self.left_out))
-        self._part, self.parts, self.left_out = None, self.parts + 1, Counter()
+        self._part = None
+        self.parts = self.parts + 1
+        self.left_out = Counter()
 
     def _open(self) -> part_files.PartWriter:
         if self._part is None:

@@ -66,7 +66,8 @@ class CpuEngine(Engine):
             columns.append(self._column("mocap_quat") + np.arange(4 * models[0].nmocap))
         self._quaternions = torch.from_numpy(np.concatenate(columns))
         """Columns of ``_numbers`` that hold quaternions, four for each, shape (4 k,)."""
-        self._models, self._model_of = list(models), list(rows)
+        self._models = list(models)
+        self._model_of = list(rows)
         self._probe: mujoco.MjData | None = None
         self._poses: tuple[Tensor, Tensor] | None = None
 
@@ -131,7 +132,8 @@ class CpuEngine(Engine):
         """Reset rows; a row whose start is out of bounds stands at the reference pose and is unstable."""
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
+        start = start.to(self.qpos.dtype)
+        nq = self.qpos.shape[1]
         good = (start.abs() <= LARGEST).all(dim=1)
         self._failed[mask] = ~good
         if not good.all():
@@ -139,7 +141,8 @@ class CpuEngine(Engine):
         self.qpos[mask] = start[:, :nq]
         if self._mocap:
             position, quaternion = start[:, nq:].unflatten(1, (-1, 7)).split((3, 4), dim=2)
-            self._mocap[0][mask], self._mocap[1][mask] = position, quaternion
+            self._mocap[0][mask] = position
+            self._mocap[1][mask] = quaternion
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -155,7 +158,8 @@ class CpuEngine(Engine):
         # A batch has either models or fields per simulation: fields in which the models differ become per-row fields.
         self.batch.set_models(None)
         differing = {name for model in self._models for name in differing_fields(self._models[0], model)}
-        wanted, found = set(names), {}
+        wanted = set(names)
+        found = {}
         for name in sorted(wanted | differing & mujoco.batch.MODEL_FIELDS):
             field = self.batch.expand(name)
             field[:] = np.stack([getattr(model, name)[: field.shape[1]] for model in self._models])[self._model_of]

@@ -12,7 +12,9 @@ from bidex_meta.errors import BidexError
 LARGEST = 1e6
 """Bound of positions (m, rad) and velocities (m/s, rad/s), far above the values of healthy rows (hands/README.md).
 Forces, accelerations, controls and time are bounded by MuJoCo's own 1e10."""
-SHORTEST, LONGEST = 1e-3, 1e3  # bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
+# bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
+SHORTEST = 1e-3
+LONGEST = 1e3
 STATE = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),
@@ -23,7 +25,8 @@ STATE = (
 def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
     """Return the columns of ``qpos`` that hold a quaternion, four for each free and ball joint, shape (4 k,)."""
     kinds = np.asarray(model.jnt_type)
-    free, ball = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+    free = mujoco.mjtJoint.mjJNT_FREE
+    ball = mujoco.mjtJoint.mjJNT_BALL
     first = np.concatenate((model.jnt_qposadr[kinds == free] + 3, model.jnt_qposadr[kinds == ball]))
     return (np.sort(first)[:, None] + np.arange(4)).ravel()
 

@@ -173,7 +173,8 @@ class Guard:
     def examine(self, d: mjw.Data) -> None:
         """Mark and disarm, before a control step, worlds broken by hand in numbers that no substep checks."""
         applied = [d.ctrl, d.qfrc_applied, d.xfrc_applied]
-        width, fixtures = max(array.shape[1] for array in applied), d.mocap_pos.shape[1]
+        width = max(array.shape[1] for array in applied)
+        fixtures = d.mocap_pos.shape[1]
         limit = float(mujoco.mjMAXVAL)
         self._launch(examine, (d.nworld, width), [d.time, d.qacc_warmstart, *applied, limit], [self.failed])
         poses = [d.qpos, self._quaternions, d.mocap_pos, d.mocap_quat, LARGEST, SHORTEST, LONGEST]

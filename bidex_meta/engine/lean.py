@@ -60,7 +60,10 @@ def lean(m: mjw.Model) -> Lean:
     """Make lean copies of a model, whose arrays must not gain a feature later that they lack now."""
     implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
     none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
-    early, last, integration, refresh = "early", "last", "integration", "refresh"
+    early = "early"
+    last = "last"
+    integration = "integration"
+    refresh = "refresh"
     everywhere = (early, last, integration, refresh)
     # Each entry: the parts, the counts set to zero, and whether that changes nothing.
     table: list[tuple[tuple[str, ...], dict[str, Any], bool]] = [

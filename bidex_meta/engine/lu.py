@@ -72,7 +72,8 @@ class ImplicitSolver:
         starts, diagonal, columns = (a.numpy().astype(np.int32) for a in (m.D_rowadr, m.D_diag, m.D_colind))
         rows = np.append(starts, len(columns)).astype(np.int32)
         place = {(i, int(columns[k])): k for i in range(m.nv) for k in range(rows[i], rows[i + 1])}
-        updates, first = [], [0]
+        updates = []
+        first = [0]
         for i in range(m.nv):
             ancestors = columns[rows[i] : rows[i] + diagonal[i]].tolist()
             updates += [(place[j, i], place[i, k], place[j, k]) for j in ancestors for k in ancestors]

@@ -59,8 +59,10 @@ class WarpEngine(Engine):
     ) -> None:  # fmt: skip
         """Put the distinct models on the device and compile the kernels; ``rows``: each simulation's model."""
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
-        self.num, self.device = len(rows), torch.device(device)
-        self._models, self._rows = list(models), list(rows)
+        self.num = len(rows)
+        self.device = torch.device(device)
+        self._models = list(models)
+        self._rows = list(rows)
         self._device = wp.get_device(str(self.device))
         # torch makes the stream: CUDA's legacy stream, torch's default, waits for streams that Warp makes.
         priority = -1 if _is_slow(models[0]) else 0
@@ -70,7 +72,8 @@ class WarpEngine(Engine):
         with self._on_device():
             self._put(capacity)
             self._bind()
-            self._substeps, self._scratch = 1, Scratch(self._device)
+            self._substeps = 1
+            self._scratch = Scratch(self._device)
             with self._from_scratch():
                 self._advance()  # compiles all kernels and allocates memory, which a capture must not do
                 self._begin()
@@ -103,11 +106,14 @@ class WarpEngine(Engine):
         views = {name: wp.to_torch(array) for name, array in arrays.items() if 0 not in array.shape}
         self._state = {name: views[name] for name in STATE if name in views}
         self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
-        self.xfrc_applied, self.sensordata = views["xfrc_applied"], views["sensordata"]
-        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._guard.failed)
+        self.xfrc_applied = views["xfrc_applied"]
+        self.sensordata = views["sensordata"]
+        self._overflow = views["overflow"]
+        self._failed_view = wp.to_torch(self._guard.failed)
         self._stepped = [views[name] for name in _STEPPED if name in views] + [self._failed_view]
         self._mocap = [views[name] for name in ("mocap_pos", "mocap_quat") if name in views]
-        self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
+        self._mask_view = wp.to_torch(self._mask)
+        self._start_view = wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Step all simulations; simulations outside the mask take the same time but keep their state."""
@@ -198,7 +204,8 @@ class WarpEngine(Engine):
 
     def _advance(self) -> None:
         """Run the substeps of a control step, then refresh position and velocity sensors."""
-        m, d = self._m, self._d
+        m = self._m
+        d = self._d
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
@@ -208,7 +215,8 @@ class WarpEngine(Engine):
 
     def _refresh(self) -> None:
         """Compute position and velocity sensors of the present state; force sensors do not change."""
-        m, d = self._lean.refresh, self._d
+        m = self._lean.refresh
+        d = self._d
         mjw.fwd_kinematics(m, d)
         mjw.com_vel(m, d)
         mjw.sensor_pos(m, d)
@@ -217,7 +225,8 @@ class WarpEngine(Engine):
     def _begin(self) -> None:
         d = self._d
         mjw.reset_data(self._m, d, reset=self._mask)
-        inputs, outputs = [self._mask, self._start, LARGEST], [d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed]
+        inputs = [self._mask, self._start, LARGEST]
+        outputs = [d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed]
         wp.launch(kernels.place, dim=self.num, inputs=inputs, outputs=outputs, device=self._device)
         self._refresh()
 

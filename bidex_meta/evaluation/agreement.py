@@ -9,7 +9,9 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import MANY_TASKS
 from bidex_meta.runs.atomic import Json
 
-EQUAL, WITHIN, DIFFERS = "equal", "within", "differs"
+EQUAL = "equal"
+WITHIN = "within"
+DIFFERS = "differs"
 _BITS = ("success", "return", "length", "episodes", "tasks", "unstable")
 _MEASURES = ("success", "return")
 

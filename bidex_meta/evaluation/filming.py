@@ -89,7 +89,8 @@ class CloudView:
     """
 
     def __init__(self, world: World, count: int) -> None:
-        self._world, self._count = world, count
+        self._world = world
+        self._count = count
         self._clouds: dict[int, Cloud] = {}
         for part in world.parts:
             part.group.engine.body_poses()  # from now on the engine gives them

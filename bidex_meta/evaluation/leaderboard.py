@@ -128,7 +128,8 @@ def check_apart(entries: Mapping[Path, Entry]) -> None:
 
 def _faults(entry: Entry, path: Path) -> Iterator[str]:
     """Yield what an entry says that cannot be."""
-    runs, stated = len(entry.weights), entry.stated
+    runs = len(entry.weights)
+    stated = entry.stated
     if path.name != entry_name(entry.suite, entry.name):
         yield f"expected a file named {entry_name(entry.suite, entry.name)}"
     for name, values in (("steps", entry.steps), *vars(stated).items()):

@@ -105,7 +105,8 @@ def meta_evaluate(
         shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
         max_adapt_steps=max_adapt_steps, seed=seed
     )  # fmt: skip
-    shots, seed = protocol.shots, protocol.seed
+    shots = protocol.shots
+    seed = protocol.seed
     worlds = [world] if adapt_world is None else [world, adapt_world]
     _check(agent, worlds, shots)
     found = {s: list[dict[str, np.ndarray]]() for s in range(shots + 1) if evaluated is None or s in evaluated}
@@ -162,13 +163,16 @@ def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgen
 def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps: int, seed: int) -> int:
     """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``; returns its valid transitions."""
     obs, _ = world.reset(seed=seed)
-    remaining, first, steps = quota(world, rollouts), True, 0
+    remaining = quota(world, rollouts)
+    first = True
+    steps = 0
     while bool((playing := remaining > 0).any()):
         if not first:
             obs, _ = world.reset(options={"reset_mask": playing})
         agent.reset(playing)
         steps += _explore(agent, world, obs, playing, max_steps)
-        remaining, first = remaining - playing.long(), False
+        remaining = remaining - playing.long()
+        first = False
     note("Adapting")
     with torch.enable_grad():  # whatever the caller is in: to adapt is to learn
         agent.adapt()
@@ -179,7 +183,8 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
 def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: Tensor, max_steps: int) -> int:
     """One exploring episode in each environment of ``playing``, given to the agent; returns its valid transitions."""
     limit = world.max_episode_steps.clamp(max=max_steps)
-    running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
+    running = playing.clone()
+    steps = torch.zeros((), dtype=torch.int64, device=playing.device)
     longest = int(limit[playing].max())
     for step in range(1, longest + 1):
         note("Playing episodes to adapt to", f"step {step} of {longest}")

@@ -113,7 +113,8 @@ def rescored(classes: Json, config: AnyConfig) -> Json:
     """
     if config.base != "moving" and all(row["score"] is None for row in classes.values()):
         return classes
-    known, rows = references(), dict(classes)
+    known = references()
+    rows = dict(classes)
     for name in known.keys() & classes.keys():
         scores = known[name].scores(np.array([classes[name]["return"]]))
         rows[name] = {**classes[name], "score": None if scores is None else float(scores[0])}

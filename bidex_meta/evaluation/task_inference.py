@@ -22,7 +22,9 @@ from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import conjugate, multiply, random_orientation, rotation_angle
 from bidex_meta.world import World
 
-_CANDIDATES, _STARTS, _ROUNDS = 512, 24, 25
+_CANDIDATES = 512
+_STARTS = 24
+_ROUNDS = 25
 _MOST_CENTRES = 1000
 """Final states among which a blind policy chooses."""
 _SCORING = 25
@@ -54,7 +56,8 @@ def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
     returns, solved = (
         np.concatenate([getattr(result, name) for result in results.values()]) for name in ("returns", "successes")
     )
-    good, failing = returns[solved > 0.0], [each for each in results.values() if not each.successes.any()]
+    good = returns[solved > 0.0]
+    failing = [each for each in results.values() if not each.successes.any()]
     if not len(good) or not failing:
         return None
     pairs = len(good) * (len(returns) - len(good))
@@ -71,7 +74,8 @@ def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
     """
     space = task.variation_space
     values = torch.from_numpy(space.sample(np.random.default_rng(seed), (1 + _SCORING) * draws))
-    choosing, scoring = values[:draws], values[draws:]
+    choosing = values[:draws]
+    scoring = values[draws:]
     share = 1.0
     for part in task.hides():
         columns = [space.names.index(name) for name in part.names]
@@ -131,8 +135,12 @@ def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, T
     obs, _ = world.reset(seed=seed)
     if explorer is not None:
         explorer.reset(torch.ones(world.num_envs, dtype=torch.bool))
-    generator, engine = torch.Generator().manual_seed(seed), world.parts[0].group.engine
-    sensors, rewards, alive, running = [], [], [], torch.ones(world.num_envs, dtype=torch.bool)
+    generator = torch.Generator().manual_seed(seed)
+    engine = world.parts[0].group.engine
+    sensors = []
+    rewards = []
+    alive = []
+    running = torch.ones(world.num_envs, dtype=torch.bool)
     action = rough = torch.zeros(world.num_envs, world.action_size)
     for step in range(int(world.max_episode_steps.max())):
         if step % _HOLD == 0:
@@ -162,7 +170,8 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
 
     Least squares by Levenberg-Marquardt from the best of many random starts, derivatives by differences.
     """
-    task, space = scene.task, scene.task.variation_space
+    task = scene.task
+    space = scene.task.variation_space
     parts = [(part, [space.names.index(name) for name in part.names]) for part in task.hides()]
     columns = [i for _, where in parts for i in where]
     low, high = (torch.tensor(ends, dtype=torch.float64)[columns] for ends in (space.low, space.high))
@@ -178,7 +187,8 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
     generator = torch.Generator().manual_seed(seed)
     tried = low + (high - low) * torch.rand(_CANDIDATES, len(columns), generator=generator, dtype=torch.float64)
     x = tried[residuals(tried).square().sum(dim=1).argsort()[:_STARTS]]
-    off, damping = residuals(x), torch.ones(_STARTS, 1, 1, dtype=torch.float64)
+    off = residuals(x)
+    damping = torch.ones(_STARTS, 1, 1, dtype=torch.float64)
     step = 1e-4 * torch.diag(high - low)
     for _ in range(_ROUNDS):
         moved = residuals((x[:, None] + step).flatten(0, 1)).unflatten(0, (_STARTS, -1))
@@ -189,7 +199,8 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
         new = (x - change).clamp(low, high)
         new_off = residuals(new)
         better = new_off.square().sum(dim=1) < off.square().sum(dim=1)
-        x, off = torch.where(better[:, None], new, x), torch.where(better[:, None], new_off, off)
+        x = torch.where(better[:, None], new, x)
+        off = torch.where(better[:, None], new_off, off)
         damping = torch.where(better[:, None, None], 0.3 * damping, 5.0 * damping).clamp(1e-6, 1e6)
     found = truth.clone()
     found[columns] = x[off.square().sum(dim=1).argmin()]

@@ -12,7 +12,8 @@ from bidex_meta.utils.files import portable
 
 def run_card(folder: RunFolder, name: str) -> str:
     """The card of a run's policy: the hub's header in YAML, then facts and results."""
-    config, versions = folder.config(), folder.versions()
+    config = folder.config()
+    versions = folder.versions()
     subject = portable(config.suite or str(config.task))
     classes = _classes(folder)
     mean = sum(row["success"] for row in classes.values()) / max(len(classes), 1)
@@ -55,7 +56,8 @@ def data_card(dataset: Dataset, name: str) -> str:
 
 
 def _made(versions: Json) -> Json:
-    packages, git = versions.get("packages") or {}, versions.get("git") or {}
+    packages = versions.get("packages") or {}
+    git = versions.get("git") or {}
     made = {"commit": git.get("commit")}
     made |= {each: packages.get(each) for each in ("bidex-meta", "mujoco", "torch")}
     return {key: value for key, value in made.items() if value}

@@ -16,7 +16,9 @@ from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
-_ROLLOUTS, _MOST_ROLLOUTS = 10, 40  # episodes of a task in a shot where the config has none; the most taken from it
+# episodes of a task in a shot where the config has none; the most taken from it
+_ROLLOUTS = 10
+_MOST_ROLLOUTS = 40
 _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
 
 
@@ -96,7 +98,8 @@ def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int)
     no second one in a shot: then there are fewer.
     """
     if asked is None:
-        asked, of_batch = _ROLLOUTS, config.learner_values.get("tasks_per_class")
+        asked = _ROLLOUTS
+        of_batch = config.learner_values.get("tasks_per_class")
         if of_batch is not None:
             counts = [len(pool) for pool in worlds.tasks("train").values()]
             of_class = config.num_envs // len(counts)

@@ -32,7 +32,8 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     ({class: {random, zero, expert}}, unscaled returns), ``versions``, ``commit``, and ``gymnasium_id`` of the same
     environment, None of a suite or an altered class.
     """
-    alone, versions = source.class_name, collect_versions()
+    alone = source.class_name
+    versions = collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
     references = {name: known for name, known in source.references().items() if name in names}
     altered = source.object or source.points or source.moving_base is not None
@@ -139,7 +140,8 @@ def _check_goals(dataset: Dataset, source: Worlds) -> None:
 def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
     """Open data sets, after a line of what they are for and one for each that was recorded by other rules."""
     datasets = open_datasets(names)
-    steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
+    steps = sum(dataset.num_steps for dataset in datasets)
+    episodes = sum(dataset.num_episodes for dataset in datasets)
     say(f"{what} {steps:,} transitions of {episodes:,} episodes.")
     for dataset in datasets:
         recorded = dataset.metadata.get("rules")

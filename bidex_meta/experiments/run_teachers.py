@@ -80,7 +80,8 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     if learner_kind(config.algo).make.adapts:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
     other = Worlds.open(config.to_json())
-    own, theirs = source.task_classes(), other.task_classes()
+    own = source.task_classes()
+    theirs = other.task_classes()
     if other.class_name is None:
         same = slots_of(source) == slots_of(other) and not (source.hides_goals or other.hides_goals)
         agree = same and all(_alike(own[task], theirs[task]) for task in own)
@@ -106,7 +107,9 @@ def _alike(one: object, other: object) -> bool:
 def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teachers:
     """The teachers of a run in its world, after a line of who teaches what."""
     assigned = teacher_of_class(config.teacher, source)
-    classes, slots, device = source.task_classes(), slots_of(source), launch().own_device(config.device)
+    classes = source.task_classes()
+    slots = slots_of(source)
+    device = launch().own_device(config.device)
     tutors = []
     for name in config.teacher:
         learn = [task for task, teacher in assigned.items() if teacher == name]

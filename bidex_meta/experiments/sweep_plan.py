@@ -137,9 +137,11 @@ def _runs(path: Path, file: _File, arms: Sequence[_Arm], out: Path) -> Iterator[
             subjects = [("suite", suite) for suite in on.suites or ()] + [("task", task) for task in on.tasks or ()]
             for (values, flags), (kind, subject) in itertools.product(_combinations(file, arm), subjects):
                 given = absolute(path.parent / expanded(subject)) if subject.endswith(".toml") else subject
-                called, label = Path(short_name(subject)).stem, arm.name + values
+                called = Path(short_name(subject)).stem
+                label = arm.name + values
                 words = (f"--{kind}={given}", f"--algo={arm.algo}", *(w.replace("{subject}", called) for w in flags))
-                folder, after = out / f"{called}-{label}-seed{seed}".replace(" ", "-"), None
+                folder = out / f"{called}-{label}-seed{seed}".replace(" ", "-")
+                after = None
                 if arm.start_from is not None:
                     same = [(v, run) for name, v, run in above if (name, run.subject) == (arm.start_from, subject)]
                     found = [run for v, run in same if v == values] or [run for _, run in same]
@@ -156,7 +158,8 @@ def _runs(path: Path, file: _File, arms: Sequence[_Arm], out: Path) -> Iterator[
 
 def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, list[str]]]:
     """Every combination of the grid for an arm, without what the arm sets itself: for the name, and as all flags."""
-    shared, own = flat(file.overrides), flat(arm.overrides)
+    shared = flat(file.overrides)
+    own = flat(arm.overrides)
     fixed = {flag.replace("-", "_") for flag in own}
     grid = {flag: values for flag, values in flat(file.grid).items() if flag.replace("-", "_") not in fixed}
     for values in itertools.product(*grid.values()):

@@ -187,7 +187,8 @@ def _again(
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
-        split, episodes = recorded.get("split", "train"), recorded.get("policy", recorded)["episodes_per_task"]
+        split = recorded.get("split", "train")
+        episodes = recorded.get("policy", recorded)["episodes_per_task"]
         world = worlds.world(split, num_envs)
         found = worlds.judge(load(), world, worlds.protocol(split, episodes, recorded["seed"]))
         world.close()

@@ -31,7 +31,8 @@ from bidex_meta.worlds import Worlds
 TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
 _LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
 _FILM = {"width": 240, "height": 180}
-_FILM_EVERY, _MOST_FILM_STEPS = 2, 300
+_FILM_EVERY = 2
+_MOST_FILM_STEPS = 300
 
 
 def check(config: AnyConfig, worlds: Worlds) -> None:
@@ -102,12 +103,14 @@ class Watch:
             if isinstance(world, PooledWorld):
                 first = zip(world.task_names, world.pools, strict=True)
                 world.set_tasks({name: pool[:tasks] for name, pool in first})
-        world, policy = self._worlds["evaluation"], self._policy(self._device)
+        world = self._worlds["evaluation"]
+        policy = self._policy(self._device)
         return evaluate(policy, world, episodes, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
-        load, options = partial(self._policy, self._device), metatest.Options()
+        load = partial(self._policy, self._device)
+        options = metatest.Options()
         found = metatest.meta_test(self._source, self._config, load, options, ["train"])["train"]
         before = _metrics(found.before)["Eval/success_rate"]
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
@@ -120,7 +123,8 @@ class Watch:
                 self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
-            rows, seed = range(world.num_envs), self._config.seed
+            rows = range(world.num_envs)
+            seed = self._config.seed
             frames = film_tiles(self._policy("cpu"), world, rows, steps, seed, _FILM_EVERY, large=False, **_FILM)
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:
@@ -136,7 +140,8 @@ def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
 @contextmanager
 def undisturbed(device: torch.device) -> Iterator[None]:
     """Whatever is drawn inside, the random numbers outside go on as if it had not been."""
-    python, legacy = random.getstate(), np.random.get_state()
+    python = random.getstate()
+    legacy = np.random.get_state()
     with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
         yield
     random.setstate(python)
@@ -154,7 +159,8 @@ def _metrics(found: Evaluation) -> dict[str, float]:
     if len(scores) == len(classes):
         metrics["Eval/score"] = float(np.mean(scores))
     for name, result in classes.items():
-        metrics[f"Eval/success/{name}"], metrics[f"Eval/return/{name}"] = result.success, result.mean_return
+        metrics[f"Eval/success/{name}"] = result.success
+        metrics[f"Eval/return/{name}"] = result.mean_return
     return metrics
 
 

@@ -78,7 +78,8 @@ def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
     for geom in geoms:
         if geom.contype:  # others are visual only
             own = INNER if geom.contype == INNER else kind
-            geom.contype, geom.conaffinity = own, _COLLIDES[own]
+            geom.contype = own
+            geom.conaffinity = _COLLIDES[own]
 
 
 def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool) -> None:
@@ -91,7 +92,8 @@ def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: boo
         part.material("tip").rgba = _TIP_COLOUR[side]
         set_contact_bits(part.geoms, bit)
         base = part.body("base")
-        base.pos, base.quat = base_position(pose), pose.quaternion
+        base.pos = base_position(pose)
+        base.quat = pose.quaternion
         if moving:
             base.add_freejoint(name="free")
         scene.attach(part, prefix=f"{side}/", frame=scene.worldbody.add_frame())

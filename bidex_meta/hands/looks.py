@@ -62,7 +62,8 @@ def _smooth(given: np.ndarray, z: np.ndarray) -> np.ndarray:
 def _triangles(rings: int) -> np.ndarray:
     """Return the triangles between neighbouring rings, and across the first and the last ring."""
     first = np.arange(_AROUND)
-    a, b = first, (first + 1) % _AROUND
+    a = first
+    b = (first + 1) % _AROUND
     sides = [np.stack((a, b, b + _AROUND, a, b + _AROUND, a + _AROUND), axis=1).reshape(-1, 3) + _AROUND * r
              for r in range(rings - 1)]  # fmt: skip
     fan = np.stack((np.zeros(_AROUND - 2, int), first[1:-1], first[2:]), axis=1)
@@ -116,7 +117,8 @@ class _Tailor:
     """Attaches skins to one hand's bodies."""
 
     def __init__(self, scene: mujoco.MjSpec, side: str) -> None:
-        self._scene, self._side = scene, side
+        self._scene = scene
+        self._side = side
 
     def _add(self, body: str, material: str, **shape: object) -> None:
         # Skins have no mass and no contacts, because bodies state their inertia.

@@ -190,7 +190,10 @@ def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
 
 
 def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    sa, ca, sb, cb = joints[:, 0].sin(), joints[:, 0].cos(), joints[:, 1].sin(), joints[:, 1].cos()
+    sa = joints[:, 0].sin()
+    ca = joints[:, 0].cos()
+    sb = joints[:, 1].sin()
+    cb = joints[:, 1].cos()
     zero = torch.zeros_like(sa)
     return (
         torch.stack((ca, zero, -sa), dim=1),
@@ -206,7 +209,8 @@ def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)
     bend[:, -1, 0] += _CUP_TILT * joints[:, where.cup]
     bend = bend.cumsum(dim=2)
-    sin, cos = bend.sin(), bend.cos()
+    sin = bend.sin()
+    cos = bend.cos()
     along = torch.stack((side.sin()[..., None] * cos, -sin, side.cos()[..., None] * cos), dim=3)
     length = constant(_LENGTHS, joints)
     ends = (along * length[:, None]).cumsum(dim=2)

@@ -115,7 +115,8 @@ class FromMetaWorld:
 
     def reset(self, env_mask: Tensor) -> None:
         """Start new episodes in a bool mask (num_envs,); only evaluation resets reach the agent."""
-        self._begun, self._over = env_mask, ~env_mask
+        self._begun = env_mask
+        self._over = ~env_mask
 
     def init(self) -> None:
         """Reset the agent to its meta-learned state."""
@@ -153,10 +154,13 @@ class MetaWorldEnvs(VectorEnv):
     def __init__(self, world: PooledWorld):
         if world.metadata["autoreset_mode"] != AutoresetMode.DISABLED:
             raise BidexError("Expected a world that does not reset by itself. Make it with autoreset_mode='DISABLED'.")
-        self.world, self.num_envs = world, world.num_envs
+        self.world = world
+        self.num_envs = world.num_envs
         self.metadata = {**world.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
-        self.single_action_space, self.action_space = world.single_action_space, world.action_space
+        self.single_observation_space = world.single_observation_space
+        self.observation_space = world.observation_space
+        self.single_action_space = world.single_action_space
+        self.action_space = world.action_space
         self.terminate_on_success = False
         self.task_name = [world.task_names[slot] for slot in world.task_id.tolist()]
         self._pools = world.pools

@@ -50,7 +50,8 @@ class MetaWorldWorld(ForeignWorld):
         self.suite = suite
         sizes = Sizes(OBSERVATION_SIZE, ACTION_SIZE, EPISODE_STEPS)
         super().__init__(metaworld_classes(suite), num_envs, sizes, seed, autoreset_mode, stagger)
-        self._task_seed, self._tasks = seed, make_tasks(suite, seed)
+        self._task_seed = seed
+        self._tasks = make_tasks(suite, seed)
         self._singles = [Single(self.task_names[i]) for i in self.task_id.tolist()]
         self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)  # of the running episodes, for checkpoints
         self._pools: dict[str, list[int]] = {}
@@ -87,7 +88,10 @@ class MetaWorldWorld(ForeignWorld):
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
         action = self._action
         self._actions[active, self.episodes.length[active]] = action[active]
-        obs, reward, success, unstable = self._obs.clone(), torch.zeros(self.num_envs), self._success & ~active, broken
+        obs = self._obs.clone()
+        reward = torch.zeros(self.num_envs)
+        success = self._success & ~active
+        unstable = broken
         numbers = action.numpy()
         for row in (active & ~broken).nonzero().squeeze(1).tolist():
             new, gained, reached, fell = self._singles[row].step(numbers[row])
@@ -95,7 +99,8 @@ class MetaWorldWorld(ForeignWorld):
                 unstable[row] = True  # its last finite observation stays
                 continue
             obs[row, :OBSERVATION_SIZE] = torch.from_numpy(new)
-            reward[row], success[row] = gained, reached
+            reward[row] = gained
+            success[row] = reached
         return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
 
     def state_dict(self) -> State:

@@ -55,7 +55,10 @@ def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     MT10's tasks come from ``metaworld.MT10(seed)``, other suites' from ``metaworld.MT1(name, seed)``. Raises BidexError
     for an unknown suite, or if Meta-World is not installed.
     """
-    names, library, seed = metaworld_classes(suite), _library(), seed % 2**32  # the range of NumPy's old generator
+    # the range of NumPy's old generator
+    names = metaworld_classes(suite)
+    library = _library()
+    seed = seed % 2**32
     whole = suite == "metaworld/MT10"
     benchmarks = [library.MT10(seed=seed)] if whole else [library.MT1(name, seed=seed) for name in names]
     tasks = [task for benchmark in benchmarks for task in benchmark.train_tasks]

@@ -184,7 +184,8 @@ class RunFolder:
 
 def _runs_below(path: Path) -> Iterator[Path]:
     """Return run folders up to three levels below, as in runs/SUITE/ALGO/RUN, without walking a whole disk."""
-    waiting, looked_at = deque([(path, 0)]), 0
+    waiting = deque([(path, 0)])
+    looked_at = 0
     while waiting:
         folder, depth = waiting.popleft()
         with contextlib.suppress(OSError, ValueError), os.scandir(folder) as entries:
@@ -225,7 +226,8 @@ def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:
 def _new_folder(config: AnyConfig, root: Path) -> Path:
     base = new_folder_name(config, root)
     base.parent.mkdir(parents=True, exist_ok=True)
-    path, count = base, 1
+    path = base
+    count = 1
     while True:
         try:
             path.mkdir()  # fails if it exists, so two runs started in one second never share a folder

@@ -70,7 +70,8 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
 
 def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
     """Draw metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
-    figure, labels = _figure(5.2 * len(tags), 3.0), [label for label, _ in groups]
+    figure = _figure(5.2 * len(tags), 3.0)
+    labels = [label for label, _ in groups]
     for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
         _draw_groups(axis, groups, tag, range(len(groups)))
         axis.set_ylabel(title)
@@ -170,7 +171,8 @@ def _task_panels(blocks: Sequence[Sequence[str]]) -> tuple[Figure, list[list[tup
     axes = figure.subplots(2 * sum(heights), max(columns), squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    first, panels = 0, []
+    first = 0
+    panels = []
     for names, width, height in zip(blocks, columns, heights, strict=True):
         spots = [(2 * (first + number // width), number % width) for number in range(len(names))]
         panels.append([(axes[row, column], axes[row + 1, column]) for row, column in spots])
@@ -204,7 +206,8 @@ def svg(figure: Figure) -> bytes:
 def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style: str, one: float = 1e6) -> None:
     if curve is None:
         return
-    steps, colour = curve.steps / one, _colour(number)
+    steps = curve.steps / one
+    colour = _colour(number)
     marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:

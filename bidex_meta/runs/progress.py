@@ -45,7 +45,8 @@ class Progress:
         self, total_steps: int, total_seconds: float = math.inf, start_step: int = 0, stream: TextIO | None = None
     ):
         self._console = PlainConsole(file=stream or sys.stderr)
-        self._total, self._total_seconds = total_steps, total_seconds
+        self._total = total_steps
+        self._total_seconds = total_seconds
         self._start_step = start_step
         self._start_time = time.monotonic()
         self._last_line = -math.inf
@@ -105,7 +106,8 @@ class Progress:
         for column in ("success", "return"):
             table.add_column(column, justify="right")
         for name in self._tasks():
-            success, mean_return = self._shown.get(_SUCCESS + name), self._shown.get(_RETURN + name)
+            success = self._shown.get(_SUCCESS + name)
+            mean_return = self._shown.get(_RETURN + name)
             table.add_row(escape(name), _percent(success), _number(mean_return))
         return Group(heading, table)
 
@@ -114,7 +116,8 @@ class Progress:
 
     def _seconds_left(self, step: int) -> float:
         """Return the seconds until the steps are done or the time is up, whichever comes first."""
-        steps, rate = self._total - step, self._rate(step)
+        steps = self._total - step
+        rate = self._rate(step)
         by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
         return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
 
@@ -126,7 +129,8 @@ class Progress:
             spent = self._shown.get("Perf/training_time", 0.0)
             done = [f"{_duration(spent)} of {_duration(self._total_seconds)}", f"{step:,} steps"]
         speed = [*done, f"{self._rate(step):,.0f} steps/s", f"{left} left"]
-        mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
+        mean_return = self._shown.get("Train/mean_return")
+        success = self._shown.get("Train/success_rate")
         teacher = self._shown.get("Policy/teacher_share", 0.0)
         plays = [f"teacher plays {_percent(teacher)}"] if teacher else []
         return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]

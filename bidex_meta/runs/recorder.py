@@ -34,7 +34,8 @@ class Recorder:
         self, folder: RunFolder, total_steps: Annotated[int, Meta(ge=0, le=10**15)], total_seconds: Seconds = math.inf,
         resume_step: Whole | None = None, logger: str = "tensorboard", show_progress: bool = True
     ):  # fmt: skip
-        self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
+        self._checkpoints = folder.checkpoints
+        self._videos = folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:
             self._metrics.writer.config(portable(folder.config().to_json()))
@@ -55,7 +56,8 @@ class Recorder:
 
     def film(self, name: str, frames: Iterable[np.ndarray], fps: float, step: int) -> Path:
         """Write ``videos/<name>_<step>.mp4`` and log it; frames ``(height, width, 3)``, uint8, both even."""
-        path, kept = self._videos / f"{name}_{step}.mp4", list(frames)
+        path = self._videos / f"{name}_{step}.mp4"
+        kept = list(frames)
         write_video(path, kept, fps)
         self._metrics.writer.film(f"Film/{name}", path, kept, fps, step)
         return path

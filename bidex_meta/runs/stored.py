@@ -85,7 +85,8 @@ class StoredRun:
     @property
     def goal(self) -> int:
         """Return the steps that the run trained for; only finished runs are collected, so all its steps count."""
-        config, steps = self.config(), self.content["steps"]
+        config = self.config()
+        steps = self.content["steps"]
         return steps if config.minutes is not None else min(steps, config.steps)
 
     def versions(self) -> Json:

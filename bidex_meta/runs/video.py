@@ -17,7 +17,9 @@ FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
 SUFFIXES = (".png", *FILMS)
 LABEL = 20
 """Height of a name under a tile, pixels."""
-_BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
+_BACK = (24, 26, 30)
+_INK = (215, 218, 224)
+_DONE = (110, 220, 130)
 
 
 def check_suffix(path: Path) -> str:
@@ -50,7 +52,8 @@ def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
     """Encode frames ``(height, width, 3)``, uint8, in a Pillow format with its options; several form an animation."""
     from PIL import Image
 
-    out, pictures = io.BytesIO(), (Image.fromarray(frame) for frame in frames)
+    out = io.BytesIO()
+    pictures = (Image.fromarray(frame) for frame in frames)
     animation = {} if kind == "PNG" else {"save_all": True, "append_images": pictures, "loop": 0}
     next(pictures).save(out, kind, **animation, **options)
     return out.getvalue()
@@ -79,7 +82,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     import imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial, count = path.with_name(f".{path.name}.part.mp4"), 0
+    partial = path.with_name(f".{path.name}.part.mp4")
+    count = 0
     # macro_block_size is 2, because the default of 16 would silently resize 1000x750.
     try:
         with imageio.get_writer(partial, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2) as writer:  # type: ignore[arg-type]
@@ -97,10 +101,13 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 def _whole(path: Path) -> bool:
     """Return whether an MP4 ends in its frame table, which is written last: imageio does not report ffmpeg's exit."""
     with path.open("rb") as file:
-        end, offset, kind = file.seek(0, 2), 0, b""
+        end = file.seek(0, 2)
+        offset = 0
+        kind = b""
         while offset < end:
             file.seek(offset)
-            size, kind = int.from_bytes(file.read(4)), file.read(4)
+            size = int.from_bytes(file.read(4))
+            kind = file.read(4)
             size = int.from_bytes(file.read(8)) if size == 1 else size  # 1: a length of eight bytes follows
             if size < 8:
                 return False
@@ -124,7 +131,8 @@ def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[b
     whole = np.empty((rows * (height + LABEL), columns * width, 3), np.uint8)
     whole[:] = _BACK
     for number, picture in enumerate(pictures):
-        top, left = number // columns * (height + LABEL), number % columns * width
+        top = number // columns * (height + LABEL)
+        left = number % columns * width
         whole[top : top + height, left : left + width] = picture
         whole[top + height : top + height + LABEL, left : left + width] = _label(names[number], width, done[number])
     return whole

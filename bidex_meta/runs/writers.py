@@ -99,7 +99,8 @@ class WandbWriter(Writer):
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:
-        self._wandb, file = _wandb(), folder / "wandb-id"
+        self._wandb = _wandb()
+        file = folder / "wandb-id"
         if not file.exists():
             file.write_text(uuid.uuid4().hex)
         project = os.environ.get("WANDB_PROJECT", "bidex-meta")

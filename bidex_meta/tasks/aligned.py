@@ -57,7 +57,8 @@ def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> 
     0.65; with reach 0.2, far 0.2 and near 0.5.
     """
     off = torch.stack([error.value / error.tolerance for error in errors])
-    far, near = (1.0 - torch.tanh(off / 16.0)).mean(dim=0), torch.exp(-0.3 * off).mean(dim=0)
+    far = (1.0 - torch.tanh(off / 16.0)).mean(dim=0)
+    near = torch.exp(-0.3 * off).mean(dim=0)
     if guides:
         reach = (1.0 - torch.tanh(3.0 * torch.stack(guides))).mean(dim=0)
         terms = {"reach": 0.2 * reach, "far": 0.2 * far, "near": 0.5 * near}

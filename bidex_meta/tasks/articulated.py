@@ -230,7 +230,8 @@ class Switch(ReachTask):
     )
     points = ("switch1/button_position", "switch2/button_position")
     constant = 2.0
-    camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
+    camera_target = (0.08, 0.0, 0.70)
+    camera_distance = 1.1
     camera_angle = (20.0, -42.0)
     variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
     wide_space = join(
@@ -283,7 +284,8 @@ class Switch(ReachTask):
             return []
         found = []
         for i, missing in enumerate((state.frozen["angles"] - _rockers(state)).split(1, dim=1), start=1):
-            hinge, rocker = state[f"switch{i}/position"], state.quaternion(f"switch{i}/quaternion")
+            hinge = state[f"switch{i}/position"]
+            rocker = state.quaternion(f"switch{i}/quaternion")
             half = 0.5 * missing
             turn = multiply(
                 rocker, torch.cat((torch.zeros_like(half), half.sin(), torch.zeros_like(half), half.cos()), 1)

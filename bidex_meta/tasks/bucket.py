@@ -74,7 +74,8 @@ class GraspAndPlace(ReachTask):
     points = ("block/position", "bucket/position")
     exponential = True
     terms = ("left", "right", "target")
-    camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
+    camera_target = (0.1, 0.0, 0.68)
+    camera_distance = 1.7
     camera_angle = (20.0, -42.0)
     variation_space = join(placed("bucket"), placed("block"))
     wide_space = join(
@@ -110,7 +111,8 @@ class GraspAndPlace(ReachTask):
         return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
 
     def success(self, state: TaskState) -> Tensor:
-        block, turn = state["block/position"][:, None], state.quaternion("bucket/quaternion")
+        block = state["block/position"][:, None]
+        turn = state.quaternion("bucket/quaternion")
         inside = inside_bucket(block, state["bucket/position"], turn)[:, 0] & stands(turn)
         return inside & within(_bucket_error(state)) if self.rules.wide else inside
 
@@ -188,7 +190,8 @@ class PourWater(ReachTask):
     points = ("bucket/position", "kettle/handle_position")
     constant = 1.0
     terms = ("constant", "left", "right", "target")
-    camera_target, camera_distance = (0.1, -0.05, 0.5), 1.4
+    camera_target = (0.1, -0.05, 0.5)
+    camera_distance = 1.4
     camera_angle = (20.0, -42.0)
     variation_space = join(placed("kettle"), placed("bucket"))
     wide_space = join(variation_space, *(component(f"goal_{axis}", -0.12, 0.12) for axis in "xy"))
@@ -241,7 +244,8 @@ class PourWater(ReachTask):
         """Return the positions of the drops in the kettle's frame, metres, (water, 3)."""
         i = torch.arange(self.water, device=like.device)
         middle = 0.5 * (_SIDE - 1)
-        x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
+        x = (i % _SIDE - middle) * _SPACING
+        y = (i // _SIDE % _SIDE - middle) * _SPACING
         z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest drops start 0.5 mm above the floor
         return torch.stack((x, y, z), dim=1).to(like.dtype)
 

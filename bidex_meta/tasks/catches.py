@@ -22,10 +22,12 @@ class CatchUnderarm(EggTask):
     wide_steps = 225  # hands move at 17 cm/s at most, and an egg must be held at its goal: 75 steps are too few
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale, orientation_scale = 0.05, 0.5
+    transition_scale = 0.05
+    orientation_scale = 0.5
     starts = ((0.0, -0.39, 0.54),)
     goals = ((0.0, -0.79, 0.54),)
-    position_noise, joint_noise = 0.01, 0.2
+    position_noise = 0.01
+    joint_noise = 0.2
     floor = 0.1
 
 
@@ -83,15 +85,18 @@ class CatchOver2Underarm(EggTask):
     wide_steps = 150
     right = HandPose((0.0, 0.0, 0.5), (1.67, math.pi, 0.0))
     left = HandPose((0.0, -0.8, 0.5), PALM_UP_BACK)
-    transition_scale, orientation_scale = 0.1, 2.0
+    transition_scale = 0.1
+    orientation_scale = 2.0
     starts = ((0.0, 0.05, 1.03),)
     goals = ((0.0, -0.40, 0.55),)
-    position_noise, joint_noise = 0.0, 0.0
+    position_noise = 0.0
+    joint_noise = 0.0
     lies_on_hand = False
     alpha = 20.0
     floor = 0.3
     anchors: ClassVar = {"right/mount_position": right.position, "left/mount_position": left.position}
-    camera_target, camera_distance = (0.0, -0.3, 0.7), 1.6
+    camera_target = (0.0, -0.3, 0.7)
+    camera_distance = 1.6
 
 
 class CatchAbreast(EggTask):
@@ -106,10 +111,13 @@ class CatchAbreast(EggTask):
     episode_steps = 150
     right = HandPose((0.0, -0.55, 0.5), (0.0, 0.3925, -0.5 * math.pi))
     left = HandPose((0.0, -1.15, 0.5), (0.0, -0.3925, -0.5 * math.pi))
-    transition_scale, orientation_scale = 0.5, 1.0
+    transition_scale = 0.5
+    orientation_scale = 1.0
     starts = ((-0.39, -0.55, 0.54),)
     goals = ((-0.39, -1.15, 0.54),)
-    position_noise, joint_noise = 0.0, 0.0
+    position_noise = 0.0
+    joint_noise = 0.0
     floor = 0.2
     anchors: ClassVar = {"right/palm_position": (-0.3, -0.55, 0.5), "left/palm_position": (-0.3, -1.15, 0.5)}
-    camera_target, camera_distance = (-0.25, -0.85, 0.5), 1.4
+    camera_target = (-0.25, -0.85, 0.5)
+    camera_distance = 1.4

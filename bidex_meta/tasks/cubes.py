@@ -95,8 +95,11 @@ class PushBlock(_TwoBlocks):
     solver = FAST
     table = Table((1.0, 1.0, 0.6), (0.0, 0.0, 0.3), friction=0.75, priority=1)
     objects = _cubes("block", (0.0, -0.2, 0.625), (0.0, 0.2, 0.625))
-    constant, weight, widest = 2.0, 5.0, 0.8
-    camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
+    constant = 2.0
+    weight = 5.0
+    widest = 0.8
+    camera_target = (0.1, 0.0, 0.68)
+    camera_distance = 1.7
     camera_angle = (20.0, -42.0)
     variation_space = join(placed("block1"), placed("block2"))
     wide_space = join(
@@ -112,7 +115,8 @@ class PushBlock(_TwoBlocks):
         goals = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
         first, second = (variation.new_tensor(goal).expand(len(variation), 3) for goal in goals)
         if self.rules.wide:
-            first, second = first + pad(variation[:, 6:8], (0, 1)), second + pad(variation[:, 8:], (0, 1))
+            first = first + pad(variation[:, 6:8], (0, 1))
+            second = second + pad(variation[:, 8:], (0, 1))
         return super().freeze(variation) | {"goal1": first, "goal2": second}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -157,12 +161,16 @@ class StackBlock(_TwoBlocks):
     episode_steps = 250
     right = HandPose((0.0, 0.6, 0.7), PALM_DOWN_AWAY)
     left = HandPose((0.0, -0.6, 0.7), PALM_DOWN_BACK)
-    transition_scale, orientation_scale = 0.2, 0.02
+    transition_scale = 0.2
+    orientation_scale = 0.02
     solver = FIRM
     table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3), friction=0.225, priority=2)
     objects = _cubes("block", (0.0, -0.1, 0.625), (0.0, 0.1, 0.625))
-    constant, weight, widest = 1.5, 2.0, 0.24
-    camera_target, camera_distance = (0.0, 0.0, 0.66), 1.5
+    constant = 1.5
+    weight = 2.0
+    widest = 0.24
+    camera_target = (0.0, 0.0, 0.66)
+    camera_distance = 1.5
     variation_space = join(
         placed("block1"), placed("block2"), *(component(f"target_{axis}", -0.03, 0.03) for axis in "xy")
     )
@@ -179,7 +187,8 @@ class StackBlock(_TwoBlocks):
         super().add_objects(scene)
         for block in self.objects:
             cube = scene.geom(f"{block.name}/cube")
-            cube.friction[0], cube.priority = 0.375, 1
+            cube.friction[0] = 0.375
+            cube.priority = 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``block1``, ``block2``: shifts, turns (n, 3); targets (n, 3); ``goal``: top block's pose (n, 7)."""
@@ -190,7 +199,8 @@ class StackBlock(_TwoBlocks):
         if not self.rules.wide:
             return frozen | {"goal1": top, "goal2": bottom, "goal": _unturned(top)}
         upper = 1.0 - 2.0 * (variation[:, 8:] < 0.0).to(variation.dtype)
-        first, second = torch.where(upper > 0.0, top, bottom), torch.where(upper > 0.0, bottom, top)
+        first = torch.where(upper > 0.0, top, bottom)
+        second = torch.where(upper > 0.0, bottom, top)
         return frozen | {"goal1": first, "goal2": second, "upper": upper}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -241,7 +251,8 @@ class ReOrientation(TaskClass):
     episode_steps = 600
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale, orientation_scale = 0.05, 0.5
+    transition_scale = 0.05
+    orientation_scale = 0.5
     start_draws = eggs.JOINT_DRAWS + 5
     solver = FIRM
     objects = _cubes("object", (0.0, -0.76, 0.60), (0.0, -0.39, 0.60))

@@ -55,14 +55,16 @@ class _Door(ReachTask):
     episode_steps = 250
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
-    transition_scale, orientation_scale = 0.5, 0.5
+    transition_scale = 0.5
+    orientation_scale = 0.5
     start_draws = 0
     jittered_fixtures = ("object",)
     wide_solved = "each leaf within 0.15 rad of its angle"
     solver = FAST
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
-    camera_target, camera_distance = (0.05, 0.0, 0.68), 2.0
+    camera_target = (0.05, 0.0, 0.68)
+    camera_distance = 2.0
     camera_angle = (125.0, -25.0)
     blocks = (
         *object_blocks("object"),
@@ -101,7 +103,8 @@ class _Door(ReachTask):
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         if not self.rules.wide:
             return super().observe(state)
-        leaves, missing = state.frozen["leaves"], _hinges(state) - state.frozen["leaves"]
+        leaves = state.frozen["leaves"]
+        missing = _hinges(state) - state.frozen["leaves"]
         return {"goal_pose": pad(leaves, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
 
     def hides(self) -> tuple[Hidden, ...]:
@@ -116,7 +119,8 @@ class _Door(ReachTask):
         """Return the goals of the handles, with wide variation."""
         if not self.rules.wide:
             return []
-        base, angles = posed(state["object/position"], state.quaternion("object/quaternion")), state.frozen["leaves"]
+        base = posed(state["object/position"], state.quaternion("object/quaternion"))
+        angles = state.frozen["leaves"]
         handles = enumerate(self._handles)
         return [Ghost(_on_leaf(base, i, angles[:, i : i + 1], handle), _POLE) for i, handle in handles]
 
@@ -221,7 +225,8 @@ class DoorCloseInward(_Close):
     inward = True
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
-    camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
+    camera_target = (0.3, 0.0, 0.65)
+    camera_distance = 2.3
     wide_space = _closed_to(0.05)  # with larger angles the leaves would start in the hands
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:

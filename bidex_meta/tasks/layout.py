@@ -87,7 +87,8 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
         sensors = tuple(f"{side}/{part}_{kind}" for part in parts for kind in kinds.split())
         return Block(f"{side}_{name}", size, sensors, scale, description=description)
 
-    joints, tips = hand().joints, [f"{finger}distal" for finger in FINGERS]
+    joints = hand().joints
+    tips = [f"{finger}distal" for finger in FINGERS]
     mapped = "joint angles, mapped from the joint's range to [-1, 1]"
     force = "actuator force at the joint, 10 N m; 0 for the coupled distal joints"
     blocks = [
@@ -109,7 +110,8 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
 @checked_arguments
 def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
     """Return pose and velocities of a free object (13 entries), ``<name>_...``, read from ``<sensors>/...``."""
-    name, spin = name or sensors, f"{sensors}/angular_velocity"
+    name = name or sensors
+    spin = f"{sensors}/angular_velocity"
     return (
         Block(f"{name}_pose", 7, (f"{sensors}/position", f"{sensors}/quaternion"), description=_POSE),
         Block(f"{name}_linear_velocity", 3, (f"{sensors}/linear_velocity",), description="world frame, m/s"),

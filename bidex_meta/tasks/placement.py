@@ -34,7 +34,8 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
     Vectorised sines and the scalar sines at the end of an array may differ in the last bit of double precision, and a
     row's start must not depend on its place in a batch.
     """
-    half, zero = 0.5 * yaw, torch.zeros_like(yaw)
+    half = 0.5 * yaw
+    zero = torch.zeros_like(yaw)
     return torch.stack((zero, zero, half.sin(), half.cos()), dim=-1).float().to(yaw.dtype)
 
 

@@ -44,7 +44,8 @@ class ReachTask(TaskClass):
 
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale, orientation_scale = 0.5, 0.1
+    transition_scale = 0.5
+    orientation_scale = 0.1
     table: ClassVar[Table]
     objects: tuple[SceneObject, ...]
     points: ClassVar[tuple[str, str]]

@@ -59,7 +59,8 @@ class SceneObject:
         if self.colour is not None:
             for material in part.materials:
                 material.rgba = self.colour
-        part.body("object").pos, part.body("object").quat = self.position, self.quaternion
+        part.body("object").pos = self.position
+        part.body("object").quat = self.quaternion
         scene.attach(part, prefix=f"{self.name}/", frame=scene.worldbody.add_frame())
 
 
@@ -172,9 +173,12 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     """Build the editable scene of a task class: floor, hands, objects. Only objects have weight, as in the original."""
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
-    spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
-    spec.option.integrator, spec.option.timestep = task.solver.integrator, task.solver.time_step
-    spec.option.cone, spec.option.impratio = task.solver.cone, task.solver.impratio
+    spec.option.iterations = task.solver.iterations
+    spec.option.ls_iterations = task.solver.line_search
+    spec.option.integrator = task.solver.integrator
+    spec.option.timestep = task.solver.time_step
+    spec.option.cone = task.solver.cone
+    spec.option.impratio = task.solver.impratio
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)

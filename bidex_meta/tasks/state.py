@@ -24,7 +24,9 @@ class TaskState:
     """
 
     def __init__(self, sensors: Tensor, addresses: dict[str, slice], frozen: dict[str, Tensor]) -> None:
-        self._sensors, self._addresses, self._known = sensors, addresses, {}
+        self._sensors = sensors
+        self._addresses = addresses
+        self._known = {}
         self.frozen = frozen
 
     def __getitem__(self, name: str) -> Tensor:

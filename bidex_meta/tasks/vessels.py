@@ -44,7 +44,8 @@ class LiftUnderarm(OwnObjectClass):
     episode_steps = 500
     right = HandPose((0.0, 0.05, 0.45), PALM_UP_AWAY)
     left = HandPose((0.0, -1.25, 0.45), PALM_UP_BACK)
-    transition_scale, orientation_scale = 0.25, 1.0
+    transition_scale = 0.25
+    orientation_scale = 1.0
     start_draws = DRAWS
     solver = FAST
     table = Table((0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
@@ -52,7 +53,8 @@ class LiftUnderarm(OwnObjectClass):
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
     ghost = (0.12, 0.12, 0.06)
-    camera_target, camera_distance = (0.0, -0.6, 0.55), 1.5
+    camera_target = (0.0, -0.6, 0.55)
+    camera_distance = 1.5
     _goal = (*(component(f"goal_{axis}", -0.05, 0.05) for axis in "xy"), component("goal_height", 0.25, 0.45))
     variation_space = join(placed("object"), *_goal)
     wide_space = join(
@@ -127,7 +129,8 @@ class BottleCap(OwnObjectClass):
     episode_steps = 125
     right = HandPose((0.0, -0.25, 0.45), (0.0, _TILT, 0.0))
     left = HandPose((0.0, -1.05, 0.5), (0.5, math.pi, math.pi))
-    transition_scale, orientation_scale = 0.1, 0.1
+    transition_scale = 0.1
+    orientation_scale = 0.1
     start_draws = DRAWS
     solver = FIRM
     table = Table((0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
@@ -180,7 +183,8 @@ class BottleCap(OwnObjectClass):
             joints = qpos[f"{side}/joints"]
             joints[:, indices(hand().index(*_THUMB), joints)] = constant(tuple(_THUMB.values()), joints)
         bottle = qpos["bottle"]
-        nominal, normal = bottle[:, :3].clone(), constant(_PALM_NORMAL, bottle)
+        nominal = bottle[:, :3].clone()
+        normal = constant(_PALM_NORMAL, bottle)
         place(bottle, frozen["bottle"], draws)
         bottle[:, :3] -= dot(bottle[:, :3] - nominal, normal)[:, None] * normal
 
@@ -220,7 +224,8 @@ class SwingCup(OwnObjectClass):
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
     left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
-    transition_scale, orientation_scale = 0.1, 0.1
+    transition_scale = 0.1
+    orientation_scale = 0.1
     start_draws = DRAWS
     solver = FIRM
     table = Table((0.3, 0.3, 0.6), (0.0, 0.0, 0.3))

@@ -31,7 +31,9 @@ class Attendance(threading.Thread):
     def __init__(self, store: Any, rank: int, count: int):
         super().__init__(name="attendance", daemon=True)
         # A connection of its own: operations of one wait for each other.
-        self._store, self._rank, self._count = store.clone(), rank, count
+        self._store = store.clone()
+        self._rank = rank
+        self._count = count
         self._closed = threading.Event()
         self.on_loss: Callable[[], None] = lambda: None
         self._signals, sent = os.pipe()

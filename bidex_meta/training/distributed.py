@@ -139,7 +139,9 @@ def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tens
     """Mean, biased variance and count of all processes' samples from those of each; three tensors of one shape."""
     if world_size() == 1:
         return mean, var, count
-    n, m, v = count.double(), mean.double(), var.double()
+    n = count.double()
+    m = mean.double()
+    v = var.double()
     total, weighted = all_sum(torch.stack([n, n * m]))
     pooled = weighted / total.clamp_min(1.0)
     spread = all_sum(n * (v + (m - pooled).square())) / total.clamp_min(1.0)
@@ -202,7 +204,8 @@ def gather(state: State) -> list[State] | None:
 
 def together(function: Callable[[], Value]) -> Value:
     """``function()``; with BidexError in any process, the first of these raises it and all others SystemExit."""
-    error, value = None, None
+    error = None
+    value = None
     try:
         value = function()
     except BidexError as caught:

@@ -71,8 +71,10 @@ def train(
         return 0  # it was stopped between its last iteration and the end of its evaluation
     # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
     saved_at = time.monotonic() if world_size() == 1 else -math.inf
-    saved_step, pause = learner.env_steps, checkpoint_seconds
-    began_at, stopped = time.monotonic() - spent_seconds, False
+    saved_step = learner.env_steps
+    pause = checkpoint_seconds
+    began_at = time.monotonic() - spent_seconds
+    stopped = False
 
     def over() -> bool:
         if learner.env_steps == 0 or total_seconds == math.inf:
@@ -105,7 +107,8 @@ def train(
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
                 began = time.monotonic()
                 _save(learner, world, record)
-                saved_at, saved_step = time.monotonic(), learner.env_steps
+                saved_at = time.monotonic()
+                saved_step = learner.env_steps
                 if checkpoint_seconds > 0.0:
                     pause = max(checkpoint_seconds, (saved_at - began) / _SAVING_SHARE)
         if learner.env_steps != saved_step:

@@ -93,7 +93,8 @@ def check_argument(name: str, value: object, hint: object) -> None:
 
 
 def _fits(value: object, hint: object) -> bool:
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if hint in (Any, object) or isinstance(hint, TypeVar):
         return True
     if origin is Annotated:
@@ -174,7 +175,8 @@ def _members(protocol: type) -> list[str]:
 
 def _expected(hint: Any) -> str:
     """An annotation in words."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin is Annotated:
         return f"{_expected(parts[0])}{''.join(_bounds(part) for part in parts[1:] if isinstance(part, Meta))}"
     if origin in (Union, types.UnionType):

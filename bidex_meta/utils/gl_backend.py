@@ -80,7 +80,8 @@ def _reason(attempt: Callable[[], None]) -> str | None:
 
 def _load(backend: str, gl_context: Any) -> None:
     """Makes a backend MuJoCo's, and tries it; what a failed one imported is forgotten, or it would spoil the next."""
-    before, platform = set(sys.modules), os.environ.get("PYOPENGL_PLATFORM")
+    before = set(sys.modules)
+    platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
         context = import_module(f"mujoco.{backend}").GLContext
         _try(context)

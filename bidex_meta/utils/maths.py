@@ -88,7 +88,8 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """The vector v, shape (..., 3), turned by the unit quaternion q (x, y, z, w), shape (..., 4)."""
-    axis, w = q[..., :3], q[..., 3:]
+    axis = q[..., :3]
+    w = q[..., 3:]
     axis, v = torch.broadcast_tensors(axis, v)
     t = 2.0 * torch.linalg.cross(axis, v)
     return v + w * t + torch.linalg.cross(axis, t)
@@ -128,8 +129,12 @@ def random_orientation(u0: Tensor, u1: Tensor) -> Tensor:
     Returns quaternions (x, y, z, w), (n, 4), rounded to single precision: sines of a vector unit and of its scalar tail
     may differ in the last bit of double precision, and a start must not depend on its place in a batch.
     """
-    a, b = 0.5 * math.pi * u0, 0.5 * math.pi * u1
-    sa, ca, sb, cb = a.sin(), a.cos(), b.sin(), b.cos()
+    a = 0.5 * math.pi * u0
+    b = 0.5 * math.pi * u1
+    sa = a.sin()
+    ca = a.cos()
+    sb = b.sin()
+    cb = b.cos()
     return torch.stack((sa * cb, ca * sb, sa * sb, ca * cb), dim=-1).float().to(u0.dtype)
 
 

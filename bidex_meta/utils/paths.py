@@ -18,7 +18,8 @@ def assets_dir() -> Path:
 
 
 def _room(name: str) -> Path:
-    packed, beside = _PACKAGE / name, _PACKAGE.parent / name
+    packed = _PACKAGE / name
+    beside = _PACKAGE.parent / name
     for folder in (packed, beside):
         if folder.is_dir():
             return folder

@@ -20,8 +20,11 @@ class _Watch:
 
     def __init__(self, what: str, clock: Callable[[], float]):
         self.clock = clock
-        self.what, self.detail, self.since = what, "", clock()
-        self.told_at, self.patience = clock(), _FIRST_SECONDS
+        self.what = what
+        self.detail = ""
+        self.since = clock()
+        self.told_at = clock()
+        self.patience = _FIRST_SECONDS
 
     def look(self) -> None:
         """Print a line if the last one is too old."""
@@ -39,14 +42,16 @@ def note(what: str, detail: str = "") -> None:
     if _watch is None:
         return
     if what != _watch.what:
-        _watch.what, _watch.since = what, _watch.clock()
+        _watch.what = what
+        _watch.since = _watch.clock()
     _watch.detail = detail
 
 
 def told() -> None:
     """Report that something was printed elsewhere."""
     if _watch is not None:
-        _watch.told_at, _watch.patience = _watch.clock(), _SECONDS
+        _watch.told_at = _watch.clock()
+        _watch.patience = _SECONDS
 
 
 def tell(text: str) -> None:
@@ -59,7 +64,8 @@ def tell(text: str) -> None:
 def watched(what: str) -> Iterator[None]:
     """Print signs of life while the block runs, at first of ``what``."""
     global _watch
-    outer, _watch = _watch, _Watch(what, time.monotonic)
+    outer = _watch
+    _watch = _Watch(what, time.monotonic)
     ended = threading.Event()
     thread = threading.Thread(target=_look, args=(_watch, ended), name="signs of life", daemon=True)
     thread.start()

@@ -36,10 +36,12 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom; BidexError for height fields."""
     make = import_module("trimesh.creation")  # of viser's packages
-    kind, size = model.geom_type[geom], model.geom_size[geom]
+    kind = model.geom_type[geom]
+    size = model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:
         index = int(model.geom_dataid[geom])
-        points, faces = model.mesh_vertadr[index], model.mesh_faceadr[index]
+        points = model.mesh_vertadr[index]
+        faces = model.mesh_faceadr[index]
         return (
             model.mesh_vert[points : points + model.mesh_vertnum[index]].astype(float),
             model.mesh_face[faces : faces + model.mesh_facenum[index]].astype(int),
@@ -69,7 +71,8 @@ class Browser:
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
         viser = import_module("viser")
-        self.paused, self.speed = False, speed
+        self.paused = False
+        self.speed = speed
         self._asked: list[str] = []
         self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
@@ -97,7 +100,9 @@ class Browser:
 
     def obey(self, stage: Stage) -> None:
         """The controls."""
-        self.paused, self.speed, stage.tour = bool(self._pause.value), float(self._pace.value), bool(self._tour.value)
+        self.paused = bool(self._pause.value)
+        self.speed = float(self._pace.value)
+        stage.tour = bool(self._tour.value)
         if self._class.value != self._chosen:
             stage.row = stage.names.index(self._class.value)
             stage.tour = False  # the chosen class stays
@@ -107,11 +112,13 @@ class Browser:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
-        scene, self._model = self._server.scene, stage.model()
+        scene = self._server.scene
+        self._model = stage.model()
         self._chosen = self._class.value = stage.names[stage.row]
         for handle in (*self._shapes.values(), *self._ghosts):
             handle.remove()
-        self._shapes, self._ghosts = {}, []
+        self._shapes = {}
+        self._ghosts = []
         scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0, plane_opacity=0.3)
         for geom in visible(self._model):
             points, faces = shape(self._model, geom)
@@ -124,19 +131,24 @@ class Browser:
         away = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         camera = self._server.initial_camera
         position = np.array(target) - 1.35 * distance * away  # farther than in pictures: the controls hide a part
-        camera.position, camera.look_at, camera.fov = position, np.array(target), 0.7
+        camera.position = position
+        camera.look_at = np.array(target)
+        camera.fov = 0.7
         for client in self._server.get_clients().values():
-            client.camera.position, client.camera.look_at = camera.position, camera.look_at
+            client.camera.position = camera.position
+            client.camera.look_at = camera.look_at
 
     def show(self, stage: Stage) -> None:
         """Poses of all shapes and goals, and the status."""
         if stage.names[stage.row] != self._chosen:
             self._set_the_scene(stage)
-        data, turned = stage.data(), np.empty(4)
+        data = stage.data()
+        turned = np.empty(4)
         with self._server.atomic():
             for geom, handle in self._shapes.items():
                 mujoco.mju_mat2Quat(turned, data.geom_xmat[geom])
-                handle.position, handle.wxyz = data.geom_xpos[geom], turned.copy()
+                handle.position = data.geom_xpos[geom]
+                handle.wxyz = turned.copy()
             self._show_ghosts(stage)
         self._text.content = "\n".join(["| | |", "|-|-|", *(f"| {k} | {v} |" for k, v in stage.status().items())])
         self._server.flush()
@@ -151,7 +163,8 @@ class Browser:
                 for i, ghost in enumerate(ghosts)
             ]
         for handle, ghost in zip(self._ghosts, ghosts, strict=True):
-            handle.position, handle.wxyz = ghost.position, ghost.quaternion
+            handle.position = ghost.position
+            handle.wxyz = ghost.quaternion
 
     def close(self) -> None:
         """Stops the server."""

@@ -8,7 +8,11 @@ from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import add_ghosts
 
-_SPACE, _RIGHT, _ENTER, _MINUS, _EQUAL = 32, 262, 257, 45, 61
+_SPACE = 32
+_RIGHT = 262
+_ENTER = 257
+_MINUS = 45
+_EQUAL = 61
 KEYS = "Space pauses, Enter begins another episode, Right goes to the next task, - and = change the speed."
 
 
@@ -17,7 +21,8 @@ class Desktop:
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
         """Opens the window, or raises BidexError."""
-        self.paused, self.speed = False, speed
+        self.paused = False
+        self.speed = speed
         self._asked: list[int] = []
         self._open(stage)
 
@@ -37,7 +42,8 @@ class Desktop:
         target, distance, angle = stage.camera()
         with self._viewer.lock():
             camera = self._viewer.cam
-            camera.lookat[:], camera.distance = target, distance
+            camera.lookat[:] = target
+            camera.distance = distance
             camera.azimuth, camera.elevation = angle
 
     def is_open(self) -> bool:

@@ -21,10 +21,15 @@ class Stage:
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0, tour: bool = False) -> None:
         self.names: list[str] = [world.task_names[int(slot)] for slot in world.task_id]
-        self.row, self.tour, self._world, self._agent, self._seed = row, tour, world, agent, seed
+        self.row = row
+        self.tour = tour
+        self._world = world
+        self._agent = agent
+        self._seed = seed
         size = len(self.names)
         self._episodes, self._solved, self._steps = np.zeros((3, size), int)
-        self._returns, self._success = np.zeros(size), np.zeros(size, bool)
+        self._returns = np.zeros(size)
+        self._success = np.zeros(size, bool)
         self._begin()
 
     def _begin(self) -> None:
@@ -34,7 +39,9 @@ class Stage:
     def _start(self, mask: torch.Tensor) -> None:
         self._agent.reset(mask)
         where = mask.cpu().numpy()
-        self._steps[where], self._returns[where], self._success[where] = 0, 0.0, False
+        self._steps[where] = 0
+        self._returns[where] = 0.0
+        self._success[where] = False
 
     @torch.no_grad()
     def step(self) -> None:

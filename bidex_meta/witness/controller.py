@@ -19,7 +19,8 @@ from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_fro
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
-_KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
+_KNUCKLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2")
+_MIDDLES = ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
 _Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
@@ -65,8 +66,10 @@ class HandController:
     """
 
     def __init__(self, task: TaskClass, sensor: Callable[[str], Tensor], frozen: Callable[[str], Tensor]):
-        self.where, self.frozen = sensor, frozen
-        self.episode_steps, self.taken = task.episode_steps, 0
+        self.where = sensor
+        self.frozen = frozen
+        self.episode_steps = task.episode_steps
+        self.taken = 0
         self.wide = task.rules.wide  # whether a task asks for more than version 1's
         self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
         self._first = {side: _numbers(xyzw(self.where(f"{side}/mount_quaternion"))) for side in SIDES}
@@ -109,7 +112,8 @@ class HandController:
         a, b = SIDES
         for _ in range(min(steps, self.steps_left)):
             self.taken += 1
-            fingers, held = (self._fingers[a], self._fingers[b]), (self._held[a], self._held[b])
+            fingers = (self._fingers[a], self._fingers[b])
+            held = (self._held[a], self._held[b])
             yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
@@ -131,7 +135,8 @@ class HandActions:
             torch.stack([sensor(f"{side}/{name}") for side in SIDES], 1)
             for name in ("hand_point_position", "mount_quaternion")
         )
-        goals, held = at.new_tensor([lead.points for lead in leads]), at.new_tensor([lead.held for lead in leads])
+        goals = at.new_tensor([lead.points for lead in leads])
+        held = at.new_tensor([lead.held for lead in leads])
         speed = at.new_tensor([lead.speed for lead in leads])[:, None, None]
         way = GAIN * (goals - at)
         way *= (speed / (way.norm(dim=-1, keepdim=True) + 1e-9)).clamp_max(1.0)
@@ -155,7 +160,8 @@ def _numbers(quaternion: Tensor) -> _Quaternion:
 
 def _product(a: _Quaternion, b: _Quaternion) -> _Quaternion:
     """As ``multiply``, of plain numbers: an operation on a tensor takes fifty times as long."""
-    (ax, ay, az, aw), (bx, by, bz, bw) = a, b
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
     return (
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,

@@ -21,7 +21,9 @@ class ActionSequences:
     """Plays ``sequences`` (n, steps, action), ``which`` of them in each environment, and repeats the last action."""
 
     def __init__(self, sequences: Tensor, which: Tensor):
-        self._sequences, self._which, self._step = sequences, which, torch.zeros_like(which)
+        self._sequences = sequences
+        self._which = which
+        self._step = torch.zeros_like(which)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """The next actions (num_envs, action)."""
@@ -55,7 +57,8 @@ class OpenLoopReplay(ActionSequences):
         for slot, name in enumerate(task_names):
             if name in witnesses:
                 self._store(slot, torch.from_numpy(witnesses[name].actions))
-        self._noise, self._generator = noise, torch.Generator(task_id.device).manual_seed(seed)
+        self._noise = noise
+        self._generator = torch.Generator(task_id.device).manual_seed(seed)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """The next actions (num_envs, action)."""
@@ -79,7 +82,9 @@ class Scripted:
         self, world: World, noise: float = 0.0, seed: int = 0, names: Collection[str] | None = None,
         misled: bool = False
     ):  # fmt: skip
-        self._world, self._noise, self._generator = world, noise, torch.Generator().manual_seed(seed)
+        self._world = world
+        self._noise = noise
+        self._generator = torch.Generator().manual_seed(seed)
         names = world.task_names if names is None else names
         self._classes = [
             _Class(world, part, k, member, int(misled))
@@ -109,9 +114,15 @@ class _Class:
 
     def __init__(self, world: World, part: Part, number: int, member: Member, ahead: int):
         task = world.slots[member.slot].task_class
-        self._tasks, self._ahead = len(world.slots[member.slot].tasks), ahead
-        self._world, self._part, self._number, self._member, self._task = world, part, number, member, task
-        self._script, self._hand_actions = script_of(task), HandActions(task)
+        self._tasks = len(world.slots[member.slot].tasks)
+        self._ahead = ahead
+        self._world = world
+        self._part = part
+        self._number = number
+        self._member = member
+        self._task = task
+        self._script = script_of(task)
+        self._hand_actions = HandActions(task)
         self._playing: dict[int, Actions] = {}  # by row among the class's
         self._sensors = part.group.engine.sensordata[member.engine_rows]
 
@@ -157,7 +168,8 @@ class ShiftedStarts(PooledWorldWrapper):
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)
         (part,) = self.world.parts
-        engine, rows = part.group.engine, self.num_envs
+        engine = part.group.engine
+        rows = self.num_envs
         starts = engine.placement()[0].expand(rows, -1).clone()
         generator = torch.Generator().manual_seed(SEED if seed is None else seed)
         for name, where in part.group.members[0].scene.qpos.items():

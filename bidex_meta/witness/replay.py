@@ -15,7 +15,9 @@ from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.world.part import judge
 
-SUITE, SEED = "MT20", 0  # witnesses are about task 0 of each class of this suite and seed
+# witnesses are about task 0 of each class of this suite and seed
+SUITE = "MT20"
+SEED = 0
 SHIFT = 1e-4  # how far the objects' start is shifted to see whether a witness succeeds by more than luck, metres
 SHIFTED = 10  # shifted starts of a replay
 
@@ -50,8 +52,10 @@ class Simulator:
 
     def __init__(self, name: str, num: int, threads: int | None = None):
         slot = task_slot(name)
-        self.num, self.task = num, slot.task_class
-        self.action_size, self.episode_steps = self.task.action_size, self.task.episode_steps
+        self.num = num
+        self.task = slot.task_class
+        self.action_size = self.task.action_size
+        self.episode_steps = self.task.episode_steps
         self._world = World([slot], WorldConfig(num, autoreset_mode="DISABLED", seed=SEED, threads=threads))
         self._world.reset(seed=SEED)
         self._part = self._world.parts[0]
@@ -88,7 +92,9 @@ class Simulator:
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
         """Plays actions (T, N, action_size) in [-1, 1] from the present state, with a callback after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
-        rewards, least, success = [], [], []
+        rewards = []
+        least = []
+        success = []
         for action in actions:
             self._part.step(action, None)
             (_, _, state), *_ = self._part.states(self._world.task_index)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 LEVELS = 127  # actions are whole multiples of 1/127, so that a byte holds one exactly
-_MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
+_MOST_BYTES = 50_000_000
+_MOST_STEPS = 100_000
 _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "rival": Finite | None}, total=False)
 
 
@@ -52,7 +53,8 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
         return _read(path)
     if not path.is_file():
         raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
-    witness, size = _read(path), registry.get(name, moving_base=True).action_size
+    witness = _read(path)
+    size = registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
         what = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
         raise BidexError(f"{path}: {what}. Give a witness of {name}, or leave --file out.")
@@ -76,7 +78,8 @@ def _read(path: Path) -> Witness:
                 raise ValueError("it unpacks to too much")
         content.seek(0)
         with np.load(content, allow_pickle=False) as stored:
-            levels, made = stored["actions"], bounded(json.loads(str(stored["made"])))
+            levels = stored["actions"]
+            made = bounded(json.loads(str(stored["made"])))
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
         reason = one_line(error)[:150].rstrip(".")
         raise BidexError(f"Expected a witness at {path}, but {reason}. Copy the file again.") from None

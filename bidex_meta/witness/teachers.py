@@ -39,7 +39,8 @@ class Teachers:
         privileged: PrivilegedWorld | None = None,
     ) -> None:
         self.privileged = privileged
-        self._tutors, self._scripted = tutors, scripted
+        self._tutors = tutors
+        self._scripted = scripted
         self._shape = world.action_space.shape
         self.known = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
         if scripted_rows is not None:

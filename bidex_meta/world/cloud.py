@@ -94,16 +94,19 @@ class Cloud:
             return torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
 
         self.shape = (count, 4 if kinds else 3)
-        self.camera, self.sharpness = camera, sharpness or Sharpness()
+        self.camera = camera
+        self.sharpness = sharpness or Sharpness()
         self._bodies = torch.as_tensor(surfaces.bodies, device=device).long()
-        points, normals = surfaces.points.T, surfaces.normals.T
+        points = surfaces.points.T
+        normals = surfaces.normals.T
         ones = np.ones_like(points[:1])
         starts = [0, *surfaces.ends[:-1]]
         self._parts = [slice(int(a), int(b)) for a, b in zip(starts, surfaces.ends, strict=True)]
         self._places = [tensor(np.concatenate((points, ones))[:, part]) for part in self._parts]
         along = (points * normals).sum(axis=0, keepdims=True)
         self._faces = [tensor(np.concatenate((normals, -along))[:, part]) for part in self._parts]
-        self._axes, self._eye = tensor(camera.axes), tensor(np.array(camera.eye))
+        self._axes = tensor(camera.axes)
+        self._eye = tensor(np.array(camera.eye))
         self._kinds = tensor(surfaces.kinds) if kinds else None
         self._slots = torch.arange(count, device=device)
         self._size = len(surfaces.points)
@@ -148,17 +151,20 @@ class Cloud:
         # The eye in the body's frame; n . (eye - p) is positive where a surface faces it.
         eye = torch.cat((-(offset[:, :, None] @ turn)[:, :, 0], torch.ones_like(offset[..., :1])), dim=2)
         n = len(offset)
-        places, facing = offset.new_empty(n, 3, self._size), offset.new_empty(n, self._size)
+        places = offset.new_empty(n, 3, self._size)
+        facing = offset.new_empty(n, self._size)
         for i, part in enumerate(self._parts):
             places[:, :, part] = poses[:, i] @ self._places[i]
             facing[:, part] = eye[:, i] @ self._faces[i]
         return places[:, 0], places[:, 1], places[:, 2], facing
 
     def _seen(self, x: Tensor, y: Tensor, depth: Tensor, facing: Tensor) -> Tensor:
-        s, camera = self.sharpness, self.camera
+        s = self.sharpness
+        camera = self.camera
         focal = camera.focal * s.pixels
         scale = focal / depth
-        column, row = x * scale + 0.5 * s.pixels, y * scale + 0.5 * s.pixels
+        column = x * scale + 0.5 * s.pixels
+        row = y * scale + 0.5 * s.pixels
         # False for NaN, where physics broke.
         inside = (column >= 0) & (column < s.pixels) & (row >= 0) & (row < s.pixels)
         candidate = inside & (depth > camera.near) & (depth < camera.far) & (facing > 0)
@@ -207,17 +213,21 @@ def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarr
     picture = np.full((height, width, 3), _BACK, np.uint8)
     seen = (cloud[:, :3] - camera.eye) @ camera.axes.T
     kept = (seen[:, 2] > camera.near) & np.isfinite(seen).all(axis=1)
-    seen, kinds = seen[kept], cloud[kept, 3]
+    seen = seen[kept]
+    kinds = cloud[kept, 3]
     if not len(seen):
         return picture
     scale = camera.focal * min(width, height) / seen[:, 2]
-    columns, rows = seen[:, 0] * scale + 0.5 * width, seen[:, 1] * scale + 0.5 * height
-    near, far = seen[:, 2].min(), seen[:, 2].max()
+    columns = seen[:, 0] * scale + 0.5 * width
+    rows = seen[:, 1] * scale + 0.5 * height
+    near = seen[:, 2].min()
+    far = seen[:, 2].max()
     light = 1.0 - 0.55 * (seen[:, 2] - near) / max(far - near, 1e-6)
     down, across = np.mgrid[:height, :width]
     for i in np.argsort(-seen[:, 2]):
         size = max(_DOT * scale[i], 0.8)
-        top, left = max(int(rows[i] - size), 0), max(int(columns[i] - size), 0)
+        top = max(int(rows[i] - size), 0)
+        left = max(int(columns[i] - size), 0)
         part = (slice(top, int(rows[i] + size) + 2), slice(left, int(columns[i] + size) + 2))
         dot = (down[part] - rows[i]) ** 2 + (across[part] - columns[i]) ** 2 <= size * size
         picture[part][dot] = (light[i] * np.array(_COLOURS[float(kinds[i])])).astype(np.uint8)

@@ -72,7 +72,8 @@ def privileged_columns(scene: Scene) -> list[int]:
 
     Every sensor that is not a hand's is replaced by NaN; entries that become NaN depend on one.
     """
-    task, layout = scene.task, scene.task.layout
+    task = scene.task
+    layout = scene.task.layout
     found = {
         i
         for block, where in layout

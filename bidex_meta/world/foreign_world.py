@@ -17,7 +17,9 @@ from bidex_meta.world.base import BatchedWorld, Outcome, Slots, Transition
 from bidex_meta.world.contract import State, plain_groups
 from bidex_meta.world.random import uniform
 
-_TASK_DRAW, _ELAPSED_DRAW, OWN_DRAWS = 0, 1, 2
+_TASK_DRAW = 0
+_ELAPSED_DRAW = 1
+OWN_DRAWS = 2
 
 
 class Sizes(NamedTuple):

@@ -44,7 +44,9 @@ class GraphCache:
         self, get: Callable[[], dict[str, Tensor]], put: Callable[[dict[str, Tensor]], None], record: Record
     ) -> None:
         """``get`` and ``put`` read and bind the state's tensors by name; ``record`` is e.g. ``cuda_graph``."""
-        self._get, self._put, self._record = get, put, record
+        self._get = get
+        self._put = put
+        self._record = record
         self.forget()
 
     def forget(self) -> None:

@@ -35,9 +35,11 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
 
 def heights(scene: Scene) -> dict[int, float]:
     """How far free objects without joints reach below their origin at the start, metres, by qpos column of z."""
-    model, data = scene.model, mujoco.MjData(scene.model)
+    model = scene.model
+    data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
-    centre, half = model.geom_aabb[:, :3, None], model.geom_aabb[:, 3:, None]
+    centre = model.geom_aabb[:, :3, None]
+    half = model.geom_aabb[:, 3:, None]
     turned = data.geom_xmat.reshape(-1, 3, 3)
     lowest = (data.geom_xpos[:, :, None] + turned @ centre - np.abs(turned) @ half)[:, 2, 0]
     found = {}
@@ -65,8 +67,10 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
     """Factor, field and exponents (n, 1) or (n, k): sizes leave masses, inverse inertias follow both."""
-    objects, free = object_bodies(model), _free(model)
-    of_object, of_free = objects[model.dof_bodyid], free[model.dof_bodyid]
+    objects = object_bodies(model)
+    free = _free(model)
+    of_object = objects[model.dof_bodyid]
+    of_free = free[model.dof_bodyid]
     turning = of_free & (np.arange(model.nv) - model.jnt_dofadr[model.dof_jntid] >= 3)
     hinge = model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_HINGE
     yield "friction", "geom_friction", np.ones((model.ngeom, 1))

@@ -33,7 +33,8 @@ class Observer:
         the observation with padding and task id.
         """
         self.layout: Layout = scene.task.layout
-        device, sensors = start_mounts.device, scene.model.nsensordata
+        device = start_mounts.device
+        sensors = scene.model.nsensordata
         actions = sensors + scene.task.action_size
         turns = 3 * len(SIDES) if scene.task.moving_base else 0
         # Columns: sensors, actions, rotations. Fresh memory for every step would cost more than what is written to it.

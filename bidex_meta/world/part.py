@@ -27,11 +27,15 @@ class Controls:
     """
 
     def __init__(self, group: Group) -> None:
-        engine, scene = group.engine, group.members[0].scene
-        self._engine, self._moving = engine, scene.task.moving_base
+        engine = group.engine
+        scene = group.members[0].scene
+        self._engine = engine
+        self._moving = scene.task.moving_base
         low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
-        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
-        self._joints, self._bodies = len(low), scene.base_bodies
+        self._middle = 0.5 * (high + low)
+        self._half = 0.5 * (high - low)
+        self._joints = len(low)
+        self._bodies = scene.base_bodies
         self._wrench = engine.ctrl.new_empty(engine.num, 6)
         for member in group.members:
             task = member.scene.task

@@ -46,7 +46,8 @@ def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
 def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
     """Return standard normal numbers, float32 (n, draws), of the same keys, episodes and draws as ``uniform``."""
     pairs = uniform(keys, episode, draws + draws % 2).float().unflatten(1, (-1, 2))
-    radius, angle = (-2.0 * torch.log1p(-pairs[..., 0])).sqrt(), 2.0 * math.pi * pairs[..., 1]
+    radius = (-2.0 * torch.log1p(-pairs[..., 0])).sqrt()
+    angle = 2.0 * math.pi * pairs[..., 1]
     return torch.stack((radius * angle.cos(), radius * angle.sin()), dim=2).flatten(1)[:, :draws]
 
 

@@ -29,8 +29,11 @@ class Randomiser:
 
         Raises BidexError where an object's size shall vary that is a mesh.
         """
-        self._rule, self._parts, self._action_size = rule, parts, action_size
-        self._deviation, device = deviation, deviation.device
+        self._rule = rule
+        self._parts = parts
+        self._action_size = action_size
+        self._deviation = deviation
+        device = deviation.device
         self._varied = [name for name in FACTORS if getattr(rule, name) != (1.0, 1.0)]
         num = len(deviation)
         self.drawn = {name: torch.ones(num, dtype=torch.float64, device=device) for name in self._varied}
@@ -114,7 +117,8 @@ class _Models:
     """The models of a part's environments."""
 
     def __init__(self, part: Part, varied: Sequence[str]) -> None:
-        engine, members = part.group.engine, part.group.members
+        engine = part.group.engine
+        members = part.group.members
         self._part = part
         rules = [exponents(member.scene, varied, engine.device) for member in members]
         self._fields = engine.expand(rules[0]) if rules[0] else {}
@@ -153,7 +157,8 @@ class _Models:
         acceleration = self._part.group.take(acceleration)
         masses = self._fields.get("body_mass")
         for member, first, nominal in zip(self._part.group.members, self._first, self._masses, strict=True):
-            rows, force = member.engine_rows, self._part.group.engine.xfrc_applied
+            rows = member.engine_rows
+            force = self._part.group.engine.xfrc_applied
             mass = nominal[:, None] if masses is None else masses[rows, first:]
             force[rows, first:, :3] = (acceleration[rows, None] * mass).to(force.dtype)
 

@@ -143,7 +143,8 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
     numbers = placement.double().cpu().numpy()
     data.qpos[:] = numbers[: model.nq]
     mocap = numbers[model.nq :].reshape(-1, 7)
-    data.mocap_pos[:], data.mocap_quat[:] = mocap[:, :3], mocap[:, 3:]
+    data.mocap_pos[:] = mocap[:, :3]
+    data.mocap_quat[:] = mocap[:, 3:]
     for part in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
         part(model, data)
 

@@ -126,7 +126,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             )
         self.render_mode = render_mode
         self._picture = (width, height, _camera(camera_name, camera_id))
-        recipe, space = self.recipe, self.task_class.variation_space
+        recipe = self.recipe
+        space = self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
         config = WorldConfig(
             num_envs=1,
@@ -175,7 +176,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             raise BidexError(
                 f"Expected a task of {name}, got one of {task.env_name}. Take tasks and classes of one benchmark."
             )
-        space, variation = self.task_class.variation_space, task.variation
+        space = self.task_class.variation_space
+        variation = task.variation
         if variation.shape != (space.size,):
             raise BidexError(f"Expected a task of {space.size} numbers, got {variation.shape}.")
         if not self.recipe.listed and not space.contains(variation):
@@ -195,7 +197,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         super().reset(seed=seed)
         if self._given is not None:
             self._world.set_tasks({self.recipe.name: self._given.variation[None]})
-            self._task, self._given = self._given, None
+            self._task = self._given
+            self._given = None
         if self._task is None:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) before reset().")
         obs, _ = self._world.reset(seed=int(self.np_random.integers(_FAR)))

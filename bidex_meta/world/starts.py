@@ -15,7 +15,9 @@ from bidex_meta.world.part import Part
 from bidex_meta.world.random import uniform
 
 # Draws of an episode that are the world's own: the task, and the elapsed time of a training world's first episode.
-_TASK_DRAW, _ELAPSED_DRAW, _OWN_DRAWS = 0, 1, 2
+_TASK_DRAW = 0
+_ELAPSED_DRAW = 1
+_OWN_DRAWS = 2
 _AHEAD = 8
 """Episodes drawn ahead per environment: some classes fail within ten steps, so one would run out at almost every step.
 """

@@ -17,8 +17,12 @@ Surface = tuple[np.ndarray, np.ndarray]
 _PLASTIC = 1.32471795724474602596
 _STEP = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
 _Kind = mujoco.mjtGeom
-_SPHERE, _ELLIPSOID, _CAPSULE = int(_Kind.mjGEOM_SPHERE), int(_Kind.mjGEOM_ELLIPSOID), int(_Kind.mjGEOM_CAPSULE)
-_CYLINDER, _BOX, _MESH = int(_Kind.mjGEOM_CYLINDER), int(_Kind.mjGEOM_BOX), int(_Kind.mjGEOM_MESH)
+_SPHERE = int(_Kind.mjGEOM_SPHERE)
+_ELLIPSOID = int(_Kind.mjGEOM_ELLIPSOID)
+_CAPSULE = int(_Kind.mjGEOM_CAPSULE)
+_CYLINDER = int(_Kind.mjGEOM_CYLINDER)
+_BOX = int(_Kind.mjGEOM_BOX)
+_MESH = int(_Kind.mjGEOM_MESH)
 DRAWN = frozenset((_SPHERE, _ELLIPSOID, _CAPSULE, _CYLINDER, _BOX, _MESH))
 """Types of geoms that have a surface here: all but planes and height fields."""
 
@@ -30,7 +34,9 @@ def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
 
 def area(model: mujoco.MjModel, geom: int) -> float:
     """Area of a geom's surface, m²; that of an ellipsoid to 1.1 % (Thomsen's formula)."""
-    (a, b, c), p, kind = (float(x) for x in model.geom_size[geom]), 1.6075, int(model.geom_type[geom])
+    a, b, c = (float(x) for x in model.geom_size[geom])
+    p = 1.6075
+    kind = int(model.geom_type[geom])
     if kind == _MESH:
         return float(_faces(model, geom)[1].sum())
     return {
@@ -47,7 +53,8 @@ def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) ->
 
     ``offset``, (2,) in [0, 1), is where the even numbers begin.
     """
-    size, kind = np.asarray(model.geom_size[geom], dtype=np.float64), int(model.geom_type[geom])
+    size = np.asarray(model.geom_size[geom], dtype=np.float64)
+    kind = int(model.geom_type[geom])
     if kind == _SPHERE:
         size = np.repeat(size[:1], 3)
     if kind in (_SPHERE, _ELLIPSOID):
@@ -64,7 +71,8 @@ def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) 
         return np.asarray(np.linalg.norm(points, axis=1) < size[0] - margin)
     if kind == _ELLIPSOID:
         return np.asarray(np.linalg.norm(points / (size - margin), axis=1) < 1.0)
-    across, along = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
+    across = np.linalg.norm(points[:, :2], axis=1)
+    along = np.abs(points[:, 2])
     if kind == _CAPSULE:
         return np.hypot(across, np.maximum(along - size[1], 0.0)) < size[0] - margin
     if kind == _CYLINDER:
@@ -75,7 +83,8 @@ def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) 
 
 
 def _sphere(u: np.ndarray) -> np.ndarray:
-    z, turn = 2.0 * u[:, 0] - 1.0, 2.0 * np.pi * u[:, 1]
+    z = 2.0 * u[:, 0] - 1.0
+    turn = 2.0 * np.pi * u[:, 1]
     across = np.sqrt(1.0 - z * z)
     return np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
 
@@ -95,10 +104,12 @@ def _ellipsoid(size: np.ndarray, count: int, offset: np.ndarray) -> Surface:
 
 def _capsule(size: np.ndarray, u: np.ndarray) -> Surface:
     # Archimedes: the caps' area is that of the cylinder around them, so height is uniform over the whole length.
-    radius, half = size[0], size[1]
+    radius = size[0]
+    half = size[1]
     height = (2.0 * u[:, 0] - 1.0) * (half + radius)
     z = np.sign(height) * np.maximum(np.abs(height) - half, 0.0) / radius
-    across, turn = np.sqrt(np.maximum(1.0 - z * z, 0.0)), 2.0 * np.pi * u[:, 1]
+    across = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    turn = 2.0 * np.pi * u[:, 1]
     normals = np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
     points = radius * normals
     points[:, 2] += np.clip(height, -half, half)
@@ -106,13 +117,15 @@ def _capsule(size: np.ndarray, u: np.ndarray) -> Surface:
 
 
 def _cylinder(size: np.ndarray, u: np.ndarray) -> Surface:
-    radius, half = size[0], size[1]
+    radius = size[0]
+    half = size[1]
     side = 2.0 * half / (2.0 * half + radius)
     turn = 2.0 * np.pi * u[:, 1]
     circle = np.stack((np.cos(turn), np.sin(turn)), axis=1)
     on_side = u[:, 0] < side
     rest = (u[:, 0] - side) / (1.0 - side)  # in [0, 1): both discs, one after the other
-    end, share = np.where(rest < 0.5, -1.0, 1.0), 2.0 * rest % 1.0
+    end = np.where(rest < 0.5, -1.0, 1.0)
+    share = 2.0 * rest % 1.0
     points = np.empty((len(u), 3))
     points[:, :2] = radius * circle * np.where(on_side, 1.0, np.sqrt(share))[:, None]
     points[:, 2] = np.where(on_side, (2.0 * u[:, 0] / side - 1.0) * half, end * half)
@@ -128,9 +141,11 @@ def _box(size: np.ndarray, u: np.ndarray) -> Surface:
     face = np.minimum(np.searchsorted(ends, u[:, 0], side="right"), 5)
     starts = np.concatenate(([0.0], ends[:-1]))
     first = (u[:, 0] - starts[face]) / (ends - starts)[face]
-    axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
+    axis = face // 2
+    sign = 1.0 - 2.0 * (face % 2)
     rows = np.arange(len(u))
-    points, normals = np.empty((len(u), 3)), np.zeros((len(u), 3))
+    points = np.empty((len(u), 3))
+    normals = np.zeros((len(u), 3))
     normals[rows, axis] = sign
     for step, value in ((1, first), (2, u[:, 1])):
         other = (axis + step) % 3
@@ -142,9 +157,11 @@ def _box(size: np.ndarray, u: np.ndarray) -> Surface:
 def _faces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corners (f, 3, 3), areas (f,) and unit normals (f, 3) of a mesh geom's triangles that have an area."""
     mesh = int(model.geom_dataid[geom])
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    first = model.mesh_vertadr[mesh]
+    count = model.mesh_vertnum[mesh]
     vertices = np.asarray(model.mesh_vert[first : first + count], dtype=np.float64)
-    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    first = model.mesh_faceadr[mesh]
+    count = model.mesh_facenum[mesh]
     corners = vertices[model.mesh_face[first : first + count]]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(cross, axis=1)
@@ -264,7 +281,8 @@ def _in_body(
     """Points and normals in the frame of a geom's body, without those buried in other geoms of that body."""
     points, normals = surface(model, geom, count, offset)
     turn = _matrix(model.geom_quat[geom])
-    points, normals = points @ turn.T + model.geom_pos[geom], normals @ turn.T
+    points = points @ turn.T + model.geom_pos[geom]
+    normals = normals @ turn.T
     kept = np.ones(len(points), dtype=bool)
     for other in others:
         if other != geom and model.geom_bodyid[other] == model.geom_bodyid[geom]:

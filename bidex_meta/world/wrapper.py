@@ -108,11 +108,16 @@ class NumpyWorld(VectorEnv):
     @checked_arguments
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
         set_stagger(world, stagger)
-        self.world, self.num_envs = world, world.num_envs
-        self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
-        self.single_action_space, self.action_space = world.single_action_space, world.action_space
-        self.metadata, self.render_mode = world.metadata, getattr(world, "render_mode", None)
-        self.autoreset_mode, self.spec = world.metadata["autoreset_mode"], getattr(world, "spec", None)
+        self.world = world
+        self.num_envs = world.num_envs
+        self.single_observation_space = world.single_observation_space
+        self.observation_space = world.observation_space
+        self.single_action_space = world.single_action_space
+        self.action_space = world.action_space
+        self.metadata = world.metadata
+        self.render_mode = getattr(world, "render_mode", None)
+        self.autoreset_mode = world.metadata["autoreset_mode"]
+        self.spec = getattr(world, "spec", None)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Start episodes; see ``VectorWorld.reset``."""

@@ -77,9 +77,12 @@ class Worlds(ABC):
     default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
-        self.name, self.config = name, config
+        self.name = name
+        self.config = config
         self.seed = config.seed if config.task_seed is None else config.task_seed
-        self.device, self.threads, self.engine = config.device, config.threads, config.engine
+        self.device = config.device
+        self.threads = config.threads
+        self.engine = config.engine
         self.points = config.points
         self.randomisation = None if config.randomisation is None else load_randomisation(config.randomisation)
 

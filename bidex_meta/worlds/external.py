@@ -16,8 +16,11 @@ if TYPE_CHECKING:
 HUMANOID = "gymnasium/Humanoid-v5"  # how a run names it (``--task``)
 
 # Of each of Meta-World's classes; 2 M steps are the budget of published results.
-_TRAINING_SIZE, _TRAINING_STEPS = 4, 2_000_000
-_TASKS, _EVALUATION_SIZE = 50, 5  # of a class, and how many are played at a time
+_TRAINING_SIZE = 4
+_TRAINING_STEPS = 2_000_000
+# of a class, and how many are played at a time
+_TASKS = 50
+_EVALUATION_SIZE = 5
 _HUMANOIDS = 50
 
 

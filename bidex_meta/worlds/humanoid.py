@@ -22,9 +22,14 @@ NAME = "Humanoid-v5"
 EPISODE_STEPS = 1000
 
 _SUBSTEPS = 5
-_FORWARD_WEIGHT, _HEALTHY_REWARD = 1.25, 5.0
-_CONTROL_WEIGHT, _CONTACT_WEIGHT, _CONTACT_MOST = 0.1, 5e-7, 10.0
-_LOWEST, _HIGHEST = 1.0, 2.0  # metres, of the torso
+_FORWARD_WEIGHT = 1.25
+_HEALTHY_REWARD = 5.0
+_CONTROL_WEIGHT = 0.1
+_CONTACT_WEIGHT = 5e-7
+_CONTACT_MOST = 10.0
+# metres, of the torso
+_LOWEST = 1.0
+_HIGHEST = 2.0
 _START_NOISE = 1e-2
 
 
@@ -51,7 +56,8 @@ class HumanoidWorld(ForeignWorld):
         model = mujoco.MjModel.from_xml_path(str(file))
         num_state = (model.nq - 2) + model.nv + (model.nbody - 1) * 22 + (model.nv - 6)
         super().__init__([NAME], num_envs, Sizes(num_state, model.nu, EPISODE_STEPS), seed, autoreset_mode, stagger)
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model = model
+        self._data = mujoco.MjData(model)
         self._dt = _SUBSTEPS * model.opt.timestep
         self._mass = torch.from_numpy(model.body_mass.copy())
         self._largest = torch.from_numpy(model.actuator_ctrlrange[:, 1].copy())
@@ -79,7 +85,8 @@ class HumanoidWorld(ForeignWorld):
         return [np.zeros((self.num_slot_tasks[0], 0))]
 
     def _place(self, mask: Tensor) -> None:
-        model, engine = self._model, self._engine
+        model = self._model
+        engine = self._engine
         draws = self._draws(OWN_DRAWS + model.nq + model.nv)[mask, OWN_DRAWS:]
         noise = (2.0 * draws - 1.0) * _START_NOISE
         engine.reset(mask, torch.from_numpy(model.qpos0) + noise[:, : model.nq])
@@ -99,14 +106,16 @@ class HumanoidWorld(ForeignWorld):
         return torch.cat([part.flatten(1) for part in (*parts, self._contact[:, 1:])], dim=1).float()
 
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        engine, moved = self._engine, active & ~broken
+        engine = self._engine
+        moved = active & ~broken
         # In single precision, as Gymnasium's actions are.
         engine.ctrl[:] = self._action * self._largest.float()
         engine.step(_SUBSTEPS, moved)
         self._feel(moved)
         unstable = broken | (engine.unstable() & active)
         good = moved & ~unstable
-        before, self._x = self._x, torch.where(good, self._centre(), self._x)
+        before = self._x
+        self._x = torch.where(good, self._centre(), self._x)
         contact = (_CONTACT_WEIGHT * self._contact.square().sum((1, 2))).clamp_max(_CONTACT_MOST)
         control = _CONTROL_WEIGHT * engine.ctrl.square().sum(1)
         reward = _FORWARD_WEIGHT * (self._x - before) / self._dt + _HEALTHY_REWARD * self._is_up() - control - contact
@@ -134,4 +143,5 @@ class HumanoidWorld(ForeignWorld):
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         self._restore(state)
         self._engine.load_state_dict(state["engine"])
-        self._x, self._contact = state["x"].clone(), state["contact"].clone()
+        self._x = state["x"].clone()
+        self._contact = state["contact"].clone()

@@ -78,7 +78,8 @@ class SingleClass(Worlds):
     def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         self.moving_base = {"own": None, "moving": True, "fixed": False}[config.base]
-        self.class_name, self.object = name, config.object
+        self.class_name = name
+        self.object = config.object
         if registry.plain_name(name) != name:
             self.preset = V2_PRESET
         self.name = name_with_object(name, self.object)

@@ -60,9 +60,12 @@ class DAgger(Learner):
     equal to an uninterrupted run.
     """
 
-    name, remedy = "dagger", "lower learning_rate"
-    config_type, presets = DAggerConfig, PRESETS
-    taught, discounts_by_class = True, True
+    name = "dagger"
+    remedy = "lower learning_rate"
+    config_type = DAggerConfig
+    presets = PRESETS
+    taught = True
+    discounts_by_class = True
     per_process = ("generator", "episodes", "data", "obs", "teacher_plays")
     going_on = ("obs", "teacher_plays", *Learner.going_on)
     config: DAggerConfig
@@ -72,7 +75,8 @@ class DAgger(Learner):
     def __init__(self, world: VectorWorld, config: DAggerConfig, seed: int, sources: Sources = NO_SOURCES):
         sources.check(self.name, "teachers", needed="teachers")
         super().__init__(world, config, seed)
-        self.low_precision, self.obs = self.policy.low_precision, None
+        self.low_precision = self.policy.low_precision
+        self.obs = None
         self.teacher_plays = torch.zeros(world.num_envs, dtype=torch.bool, device=self.device)
         self.lessons = Lessons(world, self.policy, config.learning_rate, config.max_grad_norm)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
@@ -80,7 +84,8 @@ class DAgger(Learner):
         self.lessons.begin(sources.teachers, config.samples, config.rollout_steps, config.batch_size)
 
     def _iterate(self) -> dict[str, float]:
-        share, unstable = self._teachers_share(), torch.zeros((), dtype=torch.int64, device=self.device)
+        share = self._teachers_share()
+        unstable = torch.zeros((), dtype=torch.int64, device=self.device)
         with self._collecting():
             if self.obs is None:
                 self._begin_all(self._first_observations(), share)

@@ -79,7 +79,10 @@ class Adapter:
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],
         first_order: bool = False, adapted: Adapted = "all", step_sizes: StepSizeKind = "fixed"
     ):  # fmt: skip
-        self.actor, self.learning_rate, self.objective, self.first_order = actor, learning_rate, objective, first_order
+        self.actor = actor
+        self.learning_rate = learning_rate
+        self.objective = objective
+        self.first_order = first_order
         self._prefix = "mean.head." if adapted == "head" else ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
         moved = self._moved([name for name, _ in actor.named_parameters()])
@@ -108,7 +111,8 @@ class Adapter:
         slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
         if self.first_order:
             slopes = {name: slope.detach() for name, slope in slopes.items()}
-        rate, factors = self.learning_rate, self.step_sizes
+        rate = self.learning_rate
+        factors = self.step_sizes
         sizes = {name: rate if factors is None else rate * factors[name] for name in own}
         return params | {name: params[name] - sizes[name] * slopes[name] for name in own}
 

@@ -39,7 +39,9 @@ class MetaPolicy(nn.Module):
         seed: int = 0
     ):  # fmt: skip
         super().__init__()
-        self.observations, self.actor, self.config = observations, actor, config
+        self.observations = observations
+        self.actor = actor
+        self.config = config
         self.adapter = Adapter(
             actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
             config.step_sizes
@@ -59,7 +61,9 @@ class MetaPolicy(nn.Module):
 
     def init(self) -> None:
         """Return to the meta-parameters and forget all adaptation and its data."""
-        self.adapted, self.stage, self.elapsed = None, Stage(), None
+        self.adapted = None
+        self.stage = Stage()
+        self.elapsed = None
 
     @torch.no_grad()
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -73,7 +77,8 @@ class MetaPolicy(nn.Module):
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
         """Store one transition of every environment."""
-        terminated, truncated = timestep.terminated.bool(), timestep.truncated.bool()
+        terminated = timestep.terminated.bool()
+        truncated = timestep.truncated.bool()
         valid = torch.ones_like(terminated) if timestep.valid is None else timestep.valid
         elapsed = torch.zeros_like(terminated, dtype=torch.int64) if self.elapsed is None else self.elapsed
         ended = terminated | truncated | ~valid
@@ -94,7 +99,8 @@ class MetaPolicy(nn.Module):
         log_std = params["log_std"].clamp(*self.adapter.log_std_range)
         batch = task_batch(self.stage, rows, log_std, self.config)
         self.adapted = detached(self.adapter.adapt(params, batch))
-        self.stage, self.elapsed = Stage(), None
+        self.stage = Stage()
+        self.elapsed = None
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
@@ -189,7 +195,9 @@ class MetaLearner(Learner):
         adapter.project()
         params = detached(adapter.meta(self.rows.count))
         seen = RunningStats((self.policy.observations.measured.size,)).to(self.device)
-        batches, reported, steps = list[TaskBatch](), dict[str, float](), 0
+        batches = list[TaskBatch]()
+        reported = dict[str, float]()
+        steps = 0
         for k in range(self.config.inner_steps + 1):
             with self._collecting():
                 stage, outcome = self._sample(params, seen)
@@ -216,7 +224,8 @@ class MetaLearner(Learner):
         sizes = torch.tensor([len(tasks) for tasks in chosen.values()], device=self.device)
         first = sizes.cumsum(0) - sizes
         self.rows = TaskRows(first[self.world.task_id] + self.world.task_index)
-        self.obs, self.steps_with_tasks = None, 0
+        self.obs = None
+        self.steps_with_tasks = 0
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
@@ -224,7 +233,9 @@ class MetaLearner(Learner):
 
         Raw observations go into the statistics ``seen``; clipped ones go to the policy.
         """
-        policy, rows, stage = self.policy, self.rows, Stage()
+        policy = self.policy
+        rows = self.rows
+        stage = Stage()
         longest = min(int(self.world.max_episode_steps.max()), self.adapt_steps)
         horizon = self.config.slice_steps or longest
         obs = self.obs

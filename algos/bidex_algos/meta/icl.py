@@ -75,8 +75,10 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 class ICL(TrialLearner):
     """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348), taught by those who know it."""
 
-    name, remedy = "icl", "lower learning_rate"
-    config_type, presets = ICLConfig, PRESETS
+    name = "icl"
+    remedy = "lower learning_rate"
+    config_type = ICLConfig
+    presets = PRESETS
     taught = True
     per_process = ("generator", "episodes", "data")
     config: ICLConfig
@@ -97,10 +99,9 @@ class ICL(TrialLearner):
     def _make_policy(
         cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device, belief: Belief | None = None
     ) -> BeliefPolicy:
-        seen, goals = (
-            cls._inputs(config, shape),
-            max(1, shape.hidden),
-        )  # at least one entry, which is 0 if no value is hidden
+        # at least one entry, which is 0 if no value is hidden
+        seen = cls._inputs(config, shape)
+        goals = max(1, shape.hidden)
 
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
@@ -133,7 +134,8 @@ class ICL(TrialLearner):
         cfg = self.config
         rows = teachers.known.nonzero().squeeze(1)
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
-        self.rows, self.first = rows, self.count.cumsum(0) - self.count
+        self.rows = rows
+        self.first = self.count.cumsum(0) - self.count
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
         self.data = TaughtTrials(
             trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, max(1, self.shape.hidden)
@@ -145,7 +147,8 @@ class ICL(TrialLearner):
         self._play(data.trials, pupil)
         data.keep()
         share = all_sum(data.taught.double().mean()) / world_size()
-        t, filled = data.trials, data.trials.filled()
+        t = data.trials
+        filled = data.trials.filled()
         valid = t.valid & filled
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
@@ -238,7 +241,8 @@ class ICL(TrialLearner):
         The likelihood is weighted by the standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model
         learns nothing in the states where it is unsure.
         """
-        policy, paid = self.policy, steps.paid[:, None].float()
+        policy = self.policy
+        paid = steps.paid[:, None].float()
         mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals), task)
         off = (mean - policy.earned(steps.rewards)).square()
         unlikely = (0.5 * off * torch.exp(-2.0 * log_std) + log_std) * log_std.detach().exp()
@@ -277,7 +281,8 @@ class _Pupil:
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
-        self._learner, self._data = learner, data
+        self._learner = learner
+        self._data = data
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
         self._tried: Tensor | None = None
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
@@ -298,7 +303,8 @@ class _Pupil:
 
         Entries that a class does not use are drawn too.
         """
-        goals, world = self._data.goals, self._learner.world
+        goals = self._data.goals
+        world = self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
         sizes = torch.tensor([len(privileged.hidden_columns[name]) for name in world.task_names], device=goals.device)
         used = torch.arange(goals.shape[2], device=goals.device) < sizes[world.task_id][:, None]
@@ -320,7 +326,8 @@ class _Pupil:
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions of the teachers or the policy, and the memory's state; store the teachers' labels."""
-        learner, data = self._learner, self._data
+        learner = self._learner
+        data = self._data
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)

@@ -45,15 +45,18 @@ PRESETS: dict[str, MAMLConfig] = {
 class MAML(MetaLearner):
     """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region."""
 
-    name, objective = "maml", "likelihood"
-    config_type, presets = MAMLConfig, PRESETS
+    name = "maml"
+    objective = "likelihood"
+    config_type = MAMLConfig
+    presets = PRESETS
     config: MAMLConfig
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
         return super()._optimisers() if self.config.outer == "adam" else {}
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        (surrogate, kl), cfg = self._objective(batches), self.config
+        surrogate, kl = self._objective(batches)
+        cfg = self.config
         if cfg.outer == "adam":
             norm = self._descend(-surrogate)
             with torch.no_grad():

@@ -52,13 +52,15 @@ class MemoryAgent:
         """Store one transition of every environment, except environments that wait for ``reset`` after an episode."""
         if self._learned is None or self._next_state is None:
             return
-        valid, ended = timestep.valid, timestep.terminated | timestep.truncated
+        valid = timestep.valid
+        ended = timestep.terminated | timestep.truncated
         # Meta-World's evaluation does not pass valid rows: all are valid.
         known = torch.ones_like(ended) if valid is None else valid
         moved = torch.ones_like(ended) if valid is None else ~self._over
         after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
         self._learned = self._learned.replaced(moved, after)
-        self._begun, self._over = self._begun | moved, (self._over & ~moved) | ended
+        self._begun = self._begun | moved
+        self._over = (self._over & ~moved) | ended
         self._next_state = None
 
     def adapt(self) -> None:
@@ -71,7 +73,8 @@ class MemoryAgent:
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)
-        action, no = mean.clamp(-1.0, 1.0), torch.zeros_like(memory.done)
+        action = mean.clamp(-1.0, 1.0)
+        no = torch.zeros_like(memory.done)
         self._playing = Memory(state, action, torch.zeros_like(memory.reward), no, no)
         return action
 

@@ -62,7 +62,8 @@ class PEARL(MTSAC):
     """PEARL (Rakelly et al. 2019, arXiv 1903.08254): off-policy meta-learning with a posterior over tasks."""
 
     name = "pearl"
-    config_type, presets = PEARLConfig, PRESETS
+    config_type = PEARLConfig
+    presets = PRESETS
     adapts = independent_adaptation = True
     per_process = (*MTSAC.per_process, "trial")
     config: PEARLConfig
@@ -71,7 +72,8 @@ class PEARL(MTSAC):
     def __init__(self, world: TaskWorld, config: PEARLConfig, seed: int):
         super().__init__(world, config, seed)
         self.agent = LatentAgent(self.policy, own_seed(seed))
-        rows, device = world.num_envs, self.device
+        rows = world.num_envs
+        device = self.device
         trained = [*self.critic.parameters(), *self.policy.encoder.parameters()]
         self.adams["critic"] = self._adam(trained, config.critic_learning_rate)
         self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(2))
@@ -86,7 +88,8 @@ class PEARL(MTSAC):
         self.of_class = torch.bincount(world.task_id, minlength=world.num_tasks)
         self.start = self.of_class.cumsum(0) - self.of_class
         task = _tasks(world)
-        self.by_task, self.count = torch.argsort(task, stable=True), torch.bincount(task)[task]
+        self.by_task = torch.argsort(task, stable=True)
+        self.count = torch.bincount(task)[task]
         self.first = torch.searchsorted(task[self.by_task], task)
         # An update chooses this many environments of each class; ``which`` maps each draw to a chosen environment.
         self.chosen = math.ceil(config.tasks_per_update / world.num_tasks)
@@ -147,15 +150,18 @@ class PEARL(MTSAC):
 
         The sum is estimated from ``context`` random transitions of these episodes: (M, 2 * latent).
         """
-        begin, end = self.bounds[trial, rows, 0], self.bounds[trial, rows, episodes]
+        begin = self.bounds[trial, rows, 0]
+        end = self.bounds[trial, rows, episodes]
         ages = (self.replay.added - end)[:, None] + self._below((end - begin)[:, None], len(rows), self.config.context)
         places = self.replay.places(rows[:, None], ages.clamp_max(self.replay.filled - 1))
-        t, weights = self.replay.take(places.flatten()), self.replay.weights(places)[..., None]
+        t = self.replay.take(places.flatten())
+        weights = self.replay.weights(places)[..., None]
         evidence = self.policy.evidence(t.obs, t.actions, t.rewards, t.next_obs).unflatten(0, places.shape)
         return (weights * evidence).sum(1) / weights.sum(1).clamp_min(1.0) * (end - begin)[:, None]
 
     def _learn(self) -> list[dict[str, Tensor]]:
-        updates, classes = self.config.updates_per_step, self.world.num_tasks
+        updates = self.config.updates_per_step
+        classes = self.world.num_tasks
         within = self._below(self.of_class[:, None], updates, classes, self.chosen)
         chosen = (self.start[:, None] + within).flatten(1)
         drawn = chosen[:, self.which]

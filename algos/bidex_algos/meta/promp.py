@@ -57,12 +57,17 @@ PRESETS: dict[str, ProMPConfig] = {
 class ProMP(MetaLearner):
     """ProMP, proximal meta-policy search (Rothfuss et al. 2019, arXiv 1810.06784)."""
 
-    name, objective = "promp", "ratio"
-    config_type, presets = ProMPConfig, PRESETS
+    name = "promp"
+    objective = "ratio"
+    config_type = ProMPConfig
+    presets = PRESETS
     config: ProMPConfig
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        measured, cfg, group = [], self.config, self.adam.param_groups[0]  # not that of learned step sizes
+        # not that of learned step sizes
+        measured = []
+        cfg = self.config
+        group = self.adam.param_groups[0]
         for epoch in range(cfg.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
             if epoch > 0 and cfg.desired_kl is not None:  # before the first step it is 0 by construction
@@ -76,7 +81,8 @@ class ProMP(MetaLearner):
         return {**dict(zip(names, means, strict=True)), "Policy/outer_learning_rate": rate}
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
-        adapter, clip = self.policy.adapter, self.config.clip
+        adapter = self.policy.adapter
+        clip = self.config.clip
         params = adapter.meta(self.rows.count)
         inner_kl = torch.zeros((), device=self.device)
         for batch in batches[:-1]:

@@ -71,8 +71,10 @@ PRESETS: dict[str, RL2Config] = {
 class RL2(TrialLearner):
     """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it."""
 
-    name, remedy = "rl2", "lower learning_rate"
-    config_type, presets = RL2Config, PRESETS
+    name = "rl2"
+    remedy = "lower learning_rate"
+    config_type = RL2Config
+    presets = PRESETS
     config: RL2Config
 
     def __init__(self, world: PooledWorld, config: RL2Config, seed: int):
@@ -88,7 +90,8 @@ class RL2(TrialLearner):
             config.trial_steps
         ).to(self.device)  # fmt: skip
         self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
-        limits, (d, a) = self.limits, (self.shape.observations, self.shape.actions)
+        limits = self.limits
+        d, a = (self.shape.observations, self.shape.actions)
         self.trials = Trials(config.episodes_per_trial, limits, d, a, config.chunk)
         steps = config.episodes_per_trial * float(limits.float().mean()) * world.num_envs * world_size()
         horizon = config.value_horizon * steps / world.num_tasks
@@ -103,7 +106,8 @@ class RL2(TrialLearner):
             # The first trial only measures. Statistics of the initial states only, in which nothing moves, made the
             # policy see so much noise that it would have to unlearn most of what it learned from this trial.
             self.policy.update_statistics(*seen)
-            losses, explained = {}, self._prepare()[1]
+            losses = {}
+            explained = self._prepare()[1]
         else:
             batch, explained = self._prepare()
             losses = self._update(batch)
@@ -115,9 +119,11 @@ class RL2(TrialLearner):
         return make_batch(self.trials, self.policy, self.critic, self.return_stats, self.world.task_id, self.config)
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
-        cfg, policy = self.config, self.policy
+        cfg = self.config
+        policy = self.policy
         old_log_std = policy.log_std.detach().clone()
-        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
+        low, high = (math.log(std) for std in cfg.std_range)
+        measured = list[Tensor]()
         # Every process makes the same number of parts, independent of the number of its chunks.
         weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # of each chunk (S,)
         batches = mini_batches(weights, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
@@ -129,12 +135,15 @@ class RL2(TrialLearner):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, chosen: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
-        policy, chunk, row = self.policy, b.chunk[chosen], b.row[chosen]
+        policy = self.policy
+        chunk = b.chunk[chosen]
+        row = b.row[chosen]
         x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
         means, _ = policy.actor(x, b.actor_states[chunk, row])
         out, _ = self.critic(x, b.critic_states[chunk, row])
         weights = b.take(b.weights, chosen) / count
-        values, targets = of_task(out, self.world.task_id[row]), b.take(b.targets, chosen)
+        values = of_task(out, self.world.task_id[row])
+        targets = b.take(b.targets, chosen)
         value = (weights * (values - targets).square()).sum()
         loss = policy_loss(
             b.take(b.actions, chosen), means, policy.log_std, b.take(b.old_means, chosen), old_log_std,

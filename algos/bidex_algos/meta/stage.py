@@ -123,7 +123,8 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
     rewards, terminated, ended, valid = (
         torch.stack(each) for each in (stage.rewards, stage.terminated, stage.ended, stage.valid)
     )
-    obs, elapsed = stage.by_task("obs", rows), stage.by_task("elapsed", rows)
+    obs = stage.by_task("obs", rows)
+    elapsed = stage.by_task("elapsed", rows)
     nothing = torch.zeros_like(rewards)
 
     def advantages(values: Tensor, lam: float) -> Tensor:

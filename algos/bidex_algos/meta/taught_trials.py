@@ -38,7 +38,9 @@ class TaughtTrials:
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int, size: int):
-        self.trials, self.kept, self.added = trials, kept, 0
+        self.trials = trials
+        self.kept = kept
+        self.added = 0
         slots, rows, actions = trials.actions.shape
         device = trials.obs.device
         self.labels = torch.zeros(slots, rows, actions, device=device)
@@ -77,7 +79,8 @@ class TaughtTrials:
 
         The step is chosen by its share in [0, 1) of the trial's length (B,).
         """
-        slot, ring = (share * self._ring["lengths"][trial, row]).long(), self._ring
+        slot = (share * self._ring["lengths"][trial, row]).long()
+        ring = self._ring
         obs, labels, rewards, paid = (ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid"))
         return Steps(obs.float(), labels.float(), ring["goals"][trial, row], rewards, paid)
 
@@ -87,7 +90,8 @@ class TaughtTrials:
 
     def load_state_dict(self, state: State) -> None:
         """Restore the result of :meth:`state_dict`; raises BidexError if its environments or trials differ."""
-        here, there = self._ring["obs"].shape[1:], state["obs"].shape[1:]
+        here = self._ring["obs"].shape[1:]
+        there = state["obs"].shape[1:]
         if here != there or len(state["obs"]) != min(state["added"], self.kept):
             raise BidexError(
                 f"The checkpoint's data set keeps trials of (slots, num_envs, observations) = {tuple(there)}, this one "

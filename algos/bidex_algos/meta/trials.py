@@ -64,8 +64,10 @@ class Trials:
     """
 
     def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, chunk: int | None):
-        self.episodes, self.limits = episodes, limits
-        rows, longest = len(limits), int(limits.max())
+        self.episodes = episodes
+        self.limits = limits
+        rows = len(limits)
+        longest = int(limits.max())
         slots, _ = in_chunks(episodes * longest, chunk)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -76,7 +78,9 @@ class Trials:
         # sampled and unclamped action, the reward (0 if not valid, when physics broke), whether the policy was shown
         # it, true ends, and the steps left until the time limit. ``lengths`` (N,) counts the slots that each
         # environment has filled.
-        self.obs, self.actions, self.rewards = zeros(observations), zeros(actions), zeros()
+        self.obs = zeros(observations)
+        self.actions = zeros(actions)
+        self.rewards = zeros()
         self.shown, self.valid, self.ended, self.terminated = (zeros(dtype=torch.bool) for _ in range(4))
         self.left = zeros(dtype=torch.int64)
         self.lengths = torch.zeros_like(limits)
@@ -127,7 +131,8 @@ class Sampling:
     """Samples actions from the policy's Gaussian."""
 
     def __init__(self, policy: RecurrentPolicy, generator: torch.Generator):
-        self._policy, self._generator = policy, generator
+        self._policy = policy
+        self._generator = generator
 
     def begin(self, shown: Tensor) -> None:
         """Do nothing."""
@@ -152,7 +157,8 @@ def play(
     In a ``blind_share`` of the episodes the policy is not shown rewards. ``statistics`` are the counters to update for
     each episode of a trial.
     """
-    rows, device = torch.arange(world.num_envs, device=world.device), world.device
+    rows = torch.arange(world.num_envs, device=world.device)
+    device = world.device
     memory = policy.fresh_memory(world.num_envs)
     trials.lengths.zero_()
     for episode in range(trials.episodes):
@@ -161,8 +167,10 @@ def play(
         shown = torch.rand(world.num_envs, generator=generator, device=device) >= blind_share
         player.begin(shown)
         playing = torch.ones(world.num_envs, dtype=torch.bool, device=device)
-        success, whole = ~playing, playing.clone()
-        elapsed, earned = torch.zeros_like(rows), torch.zeros(world.num_envs, device=device)
+        success = ~playing
+        whole = playing.clone()
+        elapsed = torch.zeros_like(rows)
+        earned = torch.zeros(world.num_envs, device=device)
         for _ in range(trials.longest):
             action, state = player.act(obs, memory, trials.lengths)
             next_obs, reward, terminated, truncated, info = world.step(action)
@@ -174,13 +182,19 @@ def play(
             ended = terminated | truncated | ~valid | (left <= 0)
             # A waiting row writes into its next slot, which therefore holds the observation after its last step.
             at = trials.lengths
-            trials.obs[at, rows], trials.actions[at, rows], trials.rewards[at, rows] = obs, action, reward
-            trials.shown[at, rows], trials.valid[at, rows], trials.ended[at, rows] = shown, valid, ended
-            trials.terminated[at, rows], trials.left[at, rows] = terminated, left
+            trials.obs[at, rows] = obs
+            trials.actions[at, rows] = action
+            trials.rewards[at, rows] = reward
+            trials.shown[at, rows] = shown
+            trials.valid[at, rows] = valid
+            trials.ended[at, rows] = ended
+            trials.terminated[at, rows] = terminated
+            trials.left[at, rows] = left
             trials.lengths += playing
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
-            earned, whole = earned + reward, whole & (valid | ~playing)
+            earned = earned + reward
+            whole = whole & (valid | ~playing)
             success = torch.where(playing, info["running"]["success"], success)
             playing = playing & ~ended
             if maths.may_look(device) and not playing.any():
@@ -240,7 +254,10 @@ def make_batch(
     # The only host sync: the number of steps of the longest trial.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
-    means, values, actor_states, critic_states = [], [], [], []
+    means = []
+    values = []
+    actor_states = []
+    critic_states = []
     actor_state = critic_state = policy.fresh_memory(len(task_id)).state
     for begin in range(0, slots, size):
         part = slice(begin, begin + size)

@@ -25,7 +25,8 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
 # Number of times of a trial whose beliefs a mini-batch decodes, and of steps whose rewards each belief predicts.
-_TIMES, _STEPS = 16, 64
+_TIMES = 16
+_STEPS = 64
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,15 @@ class BeliefActor(RecurrentNet):
     """
 
     def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
-        hidden, latent, activation = config.hidden, config.latent, config.activation
+        hidden = config.hidden
+        latent = config.latent
+        activation = config.activation
         super().__init__(inputs, hidden, config.memory, 2 * latent, 1.0, generator, activation, config.trial_steps)
         self.actor = MLP(inputs.extended("belief", 2 * latent), hidden, actions, 0.01, generator, activation)
         self.seen = seen
         self.state = MLP(seen, hidden[:-1], hidden[-1], 1.0, generator, activation)
-        self.task, self.activation = linear(latent, hidden[-1], 1.0, generator), ACTIVATIONS[activation]()
+        self.task = linear(latent, hidden[-1], 1.0, generator)
+        self.activation = ACTIVATIONS[activation]()
         self.paid = MLP(hidden[-1], (hidden[-1],), 1, 0.01, generator, activation)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,7 +102,8 @@ class VariBAD(RL2):
     """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief of what a task hides."""
 
     name = "varibad"
-    config_type, presets = VariBADConfig, PRESETS
+    config_type = VariBADConfig
+    presets = PRESETS
     config: VariBADConfig
 
     def __init__(self, world: PooledWorld, config: VariBADConfig, seed: int):
@@ -113,7 +118,8 @@ class VariBAD(RL2):
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
         """Run PPO's update with the beliefs of the played trial, then update encoder and decoder."""
-        losses, cfg = super()._update(b), self.config
+        losses = super()._update(b)
+        cfg = self.config
         ones = torch.ones_like(b.row, dtype=torch.float32)
         batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
         reward, divergence = torch.stack([self._descend(b, chosen) for _, chosen, _ in batches]).mean(0)
@@ -136,9 +142,11 @@ class VariBAD(RL2):
         previous one. In the trials ``chosen``, int64 (B,), beliefs at random times predict rewards of random steps,
         past and future.
         """
-        policy, net = self.policy, self.net
+        policy = self.policy
+        net = self.net
         previous = [b.take(each, chosen) for each in b.previous]
-        x, valid = policy.see(b.take(b.obs, chosen), *previous), b.take(b.weights, chosen)
+        x = policy.see(b.take(b.obs, chosen), *previous)
+        valid = b.take(b.weights, chosen)
         mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
         before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
         divergence = valid * gaussian_kl(mean, log_std, *before)

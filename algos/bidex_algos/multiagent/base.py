@@ -114,7 +114,8 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
     """
     given = [x.view(len(critics), -1) for x in (*before, *after)]
     for critic, old_mean, old_std, mean, std in zip(critics, *given, strict=True):
-        weight, bias = critic.head.weight, critic.head.bias
+        weight = critic.head.weight
+        bias = critic.head.bias
         weight.copy_(weight * (old_std / std)[:, None])
         bias.copy_((old_std * bias + old_mean - mean) / std)
 
@@ -154,15 +155,18 @@ class MultiAgent(OnPolicy):
         self.kl_share = 1.0 / len(self.views)
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
-        rate, eps = config.critic_learning_rate, config.adam_eps
+        rate = config.critic_learning_rate
+        eps = config.adam_eps
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)
 
     @classmethod
     def _make_policy(
         cls, config: MultiAgentConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> TeamPolicy:
-        views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
-        heads, share = shape.num_id_columns if config.policy_heads else 1, vars(config).get("share_parameters", False)
+        views = agent_views(shape.groups, shape.actions, config.agents)
+        inputs = Inputs(shape.groups)
+        heads = shape.num_id_columns if config.policy_heads else 1
+        share = vars(config).get("share_parameters", False)
         actor = TeamActor(views, config, inputs, init, heads, share)
         return TeamPolicy.made_of(actor, config, inputs, shape, device).to(device)
 
@@ -172,7 +176,8 @@ class MultiAgent(OnPolicy):
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         stats = self.return_stats
-        known, before = stats.count > 0, (stats.mean.clone(), stats.std())
+        known = stats.count > 0
+        before = (stats.mean.clone(), stats.std())
         super()._merge_returns(mean, var, count)
         if self.config.popart:
             after = stats.mean, stats.std()
@@ -191,7 +196,8 @@ class MultiAgent(OnPolicy):
 
         With ``value_clip`` the loss is at least the loss of the value clipped to that distance from the old value.
         """
-        delta, reach = self.config.huber_delta, self.config.value_clip
+        delta = self.config.huber_delta
+        reach = self.config.value_clip
         values = self._critic(b.obs, b.task_id)
 
         def huber(values: Tensor) -> Tensor:
@@ -208,7 +214,8 @@ class MultiAgent(OnPolicy):
         self.critic_adam.step()
 
     def _critic_epochs(self, batch: Batch, epochs: int, num_minibatches: int, weight: float = 1.0) -> Tensor:
-        old_values, losses = self._old_values(batch), list[Tensor]()
+        old_values = self._old_values(batch)
+        losses = list[Tensor]()
         parameters = list(self.critic.parameters())
         for _, index, count in self._mini_batches(batch.weights, epochs, num_minibatches):
             b = batch.select(index)
@@ -230,7 +237,8 @@ class OwnAdams(MultiAgent):
 
     def __init__(self, world: VectorWorld, config: MultiAgentPPOConfig, seed: int):
         super().__init__(world, config, seed)
-        own, given = self.policy.actor.parameters_of, (config, self.device, config.adam_eps, self.kl_share)
+        own = self.policy.actor.parameters_of
+        given = (config, self.device, config.adam_eps, self.kl_share)
         self.adams = [AdaptiveAdam(own(k), *given) for k in range(len(self.policy.actor.nets))]
 
     def _optimisers(self) -> Parts:
@@ -256,14 +264,17 @@ class Sequential(MultiAgent):
 
         The product of the ratios is at most ``max_factor``.
         """
-        actor, task = self.policy.actor, self.policy.actor.one_hot(batch.obs)
+        actor = self.policy.actor
+        task = self.policy.actor.one_hot(batch.obs)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
         columns = [actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)]
-        bound, factor = self.config.max_factor or math.inf, torch.ones_like(batch.advantages)
+        bound = self.config.max_factor or math.inf
+        factor = torch.ones_like(batch.advantages)
         order = torch.randperm(len(self.views), generator=self.order).tolist()
         for agent in order:
             actions, means, log_std = (parts[agent] for parts in columns)
-            old_log_probs, gain = gaussian_log_prob(actions, means, log_std), batch.advantages * factor.clamp(max=bound)
+            old_log_probs = gaussian_log_prob(actions, means, log_std)
+            gain = batch.advantages * factor.clamp(max=bound)
             seen = actor.seen(agent, batch.obs)
             share = AgentBatch(seen, task, actions, means, log_std, old_log_probs, gain, batch.weights)
             yield agent, share

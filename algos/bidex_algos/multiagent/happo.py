@@ -42,8 +42,11 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 class HAPPO(OwnAdams, Sequential):
     """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
-    name, remedy = "happo", "lower learning_rate"
-    config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS
+    name = "happo"
+    remedy = "lower learning_rate"
+    config_type = HAPPOConfig
+    presets = PRESETS
+    task_presets = TASK_PRESETS
     config: HAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -56,7 +59,9 @@ class HAPPO(OwnAdams, Sequential):
         return reported | {"Policy/lr": rate}
 
     def _agent_epochs(self, agent: int, share: AgentBatch) -> Tensor:
-        cfg, adam, parameters = self.config, self.adams[agent], self.policy.actor.parameters_of(agent)
+        cfg = self.config
+        adam = self.adams[agent]
+        parameters = self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
         for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):
             part = share.select(index)

@@ -41,8 +41,11 @@ TASK_PRESETS = {
 class HATRPO(Sequential):
     """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
-    name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
-    config_type, presets, task_presets = HATRPOConfig, PRESETS, TASK_PRESETS
+    name = "hatrpo"
+    remedy = "lower max_kl or critic_learning_rate"
+    config_type = HATRPOConfig
+    presets = PRESETS
+    task_presets = TASK_PRESETS
     config: HATRPOConfig  # type: ignore[assignment]
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -53,13 +56,15 @@ class HATRPO(Sequential):
         }
 
     def _agent_step(self, agent: int, share: AgentBatch) -> dict[str, Tensor]:
-        actor, cfg = self.policy.actor, self.config
+        actor = self.policy.actor
+        cfg = self.config
 
         def of_taken(taken: Tensor) -> tuple[Tensor, Tensor]:
             seen = share.seen[taken].to(actor.log_stds[0].dtype)
             return actor.distribution_of(agent, seen, share.task[taken])
 
         own = kl_from_itself(of_taken, share.weights, self.world.num_envs, cfg.fisher_stride)
-        distribution, bounds = partial(self._distribution, agent, share), partial(actor.clamp_std, *cfg.std_range)
+        distribution = partial(self._distribution, agent, share)
+        bounds = partial(actor.clamp_std, *cfg.std_range)
         given = share, share.gain, share.old_log_std, own, cfg
         return gaussian_step(actor.parameters_of(agent), distribution, bounds, *given, self.kl_share * cfg.max_kl)

@@ -40,7 +40,9 @@ class IPPO(MAPPO):
     """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533)."""
 
     name = "ippo"
-    config_type, presets, task_presets = IPPOConfig, PRESETS, TASK_PRESETS
+    config_type = IPPOConfig
+    presets = PRESETS
+    task_presets = TASK_PRESETS
     config: IPPOConfig
     critic: TeamCritic  # type: ignore[assignment]
 

@@ -45,7 +45,8 @@ class DeterministicTeam(Team):
         self, views: tuple[AgentView, ...], config: MADDPGConfig, groups: Inputs, generator: torch.Generator, heads: int
     ):
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator)
-        self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
+        self.heads = heads
+        self.one_hot = groups.columns(*["task_id"] * (heads > 1))
         self._order: Tensor
         order = torch.tensor([action for view in views for action in view.actions]).argsort()
         self.register_buffer("_order", order, persistent=False)
@@ -68,7 +69,8 @@ class MADDPG(DDPG):
     """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275)."""
 
     name = "maddpg"
-    config_type, presets = MADDPGConfig, PRESETS
+    config_type = MADDPGConfig
+    presets = PRESETS
     config: MADDPGConfig
 
     def __init__(self, world: VectorWorld, config: MADDPGConfig, seed: int):
@@ -79,8 +81,10 @@ class MADDPG(DDPG):
         self.owner = torch.tensor(owner, device=self.device)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
-        raw, share = self.policy.raw(obs), weights / counts.sum().clamp_min(1.0)
-        actions, losses = torch.tanh(raw), []
+        raw = self.policy.raw(obs)
+        share = weights / counts.sum().clamp_min(1.0)
+        actions = torch.tanh(raw)
+        losses = []
         for agent, view in enumerate(self.views):
             value = self._climbed(
                 self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
@@ -96,7 +100,8 @@ class MADDPG(DDPG):
     def _make_policy(
         cls, config: MADDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
-        views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
+        views = agent_views(shape.groups, shape.actions, config.agents)
+        inputs = Inputs(shape.groups)
         heads = shape.num_id_columns if config.policy_heads else 1
         actor = DeterministicTeam(views, config, inputs, init, heads)
         return DeterministicPolicy.made_of(actor, config, inputs, shape, device).to(device)

@@ -38,12 +38,16 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 class MAPPO(OwnAdams):
     """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955)."""
 
-    name, remedy = "mappo", "lower learning_rate"
-    config_type, presets, task_presets = MAPPOConfig, PRESETS, TASK_PRESETS
+    name = "mappo"
+    remedy = "lower learning_rate"
+    config_type = MAPPOConfig
+    presets = PRESETS
+    task_presets = TASK_PRESETS
     config: MAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        cfg, actor = self.config, self.policy.actor
+        cfg = self.config
+        actor = self.policy.actor
         old_values = self._old_values(batch)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
         given = zip(*(actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)), strict=True)
@@ -64,7 +68,8 @@ class MAPPO(OwnAdams):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
-        cfg, actor = self.config, self.policy.actor
+        cfg = self.config
+        actor = self.policy.actor
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)
         value = self._value_loss(b, old_values, weights)
@@ -85,14 +90,16 @@ class MAPPO(OwnAdams):
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _agent_losses(self, b: Batch, weights: Tensor, old_log_std: Tensor) -> list[PolicyLoss]:
-        actor, task = self.policy.actor, self.policy.actor.one_hot(b.obs)
+        actor = self.policy.actor
+        task = self.policy.actor.one_hot(b.obs)
         with autocast(self.device, self.low_precision):
             means = actor.means(b.obs)
         advantages = b.advantages if b.advantages.dim() == 2 else b.advantages[:, None].expand(-1, len(self.views))
         given = zip(*(actor.parts(x) for x in (b.actions, b.old_means, old_log_std)), strict=True)
         losses = []
         for agent, (actions, old_means, old_std) in enumerate(given):
-            log_std, old_log_probs = actor.own_log_std(agent, task), b.old_log_probs[:, agent]
+            log_std = actor.own_log_std(agent, task)
+            old_log_probs = b.old_log_probs[:, agent]
             old = old_means, old_std, old_log_probs, advantages[:, agent]
             losses.append(policy_loss(actions, means[agent], log_std, *old, weights=weights, clip=self.config.clip))
         return losses

@@ -29,7 +29,9 @@ class Team(nn.Module):
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
         self.families = [[i for i, other in enumerate(forms) if other == form] for form in dict.fromkeys(forms)]
         self.columns = nn.ModuleList(Columns(part for g in view.groups for part in g.where) for view in views)
-        self.share, made, self.net_of = share, list[MLP](), [0] * len(views)
+        self.share = share
+        made = list[MLP]()
+        self.net_of = [0] * len(views)
         for i, view in enumerate(views):
             family = next(family for family in self.families if i in family)
             inputs = Inputs(view.own_groups())
@@ -91,7 +93,8 @@ class TeamActor(Team):
         heads: int = 1, share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
-        self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
+        self.heads = heads
+        self.one_hot = groups.columns(*["task_id"] * (heads > 1))
         order = torch.tensor([action for view in views for action in view.actions])
         self._order: Tensor
         self._taken: Tensor

@@ -106,7 +106,8 @@ class Critics(nn.Module):
         count: int = 2
     ):  # fmt: skip
         super().__init__()
-        self.heads, network = heads, network_of(config)
+        self.heads = heads
+        network = network_of(config)
         given = inputs, config.hidden, heads, 1.0, generator, config.activation, layer_norm
         self.nets = nn.ModuleList(network(*given) for _ in range(count))
 

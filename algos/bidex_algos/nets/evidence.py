@@ -44,7 +44,8 @@ class BeliefNet(nn.Module):
         generator: torch.Generator, activation: Activation = "elu", classes: int = 1
     ):  # fmt: skip
         super().__init__()
-        width, self.classes = hidden[-1], classes
+        width = hidden[-1]
+        self.classes = classes
         self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
         # One layer holds all classes; the columns of each class have length 1.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)

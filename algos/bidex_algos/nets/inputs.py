@@ -106,7 +106,8 @@ class GroupEncoder(nn.Module):
         names = [group.name for group in inputs.groups if group.name not in inputs.hidden]
         encoded = {name: inputs.columns(name) for name in names if name in inputs.encoders}
         made: dict[str, Any] = {n: inputs.encoders[n](columns.size, generator) for n, columns in encoded.items()}
-        self.columns, self.groups = nn.ModuleDict(encoded), nn.ModuleDict(made)
+        self.columns = nn.ModuleDict(encoded)
+        self.groups = nn.ModuleDict(made)
         self.plain = inputs.columns(*(name for name in names if name not in encoded))
         self.size = self.plain.size + sum(encoder.size for encoder in made.values())
         self.identity = self.plain.size == inputs.width
@@ -124,7 +125,8 @@ class TaskEmbedding(nn.Module):
 
     def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):
         super().__init__()
-        self.size, self.unit = size, unit
+        self.size = size
+        self.unit = unit
         self.vectors = nn.Parameter(torch.randn(tasks, size, generator=generator))
 
     def forward(self, one_hot: Tensor) -> Tensor:

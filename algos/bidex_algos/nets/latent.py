@@ -28,7 +28,8 @@ class LatentPolicy(SquashedPolicy):
         size: int, hidden: Sequence[int], reward_unit: float, generator: torch.Generator, activation: Activation
     ):  # fmt: skip
         super().__init__(ObservationNormaliser(inputs, normalise_observations), actor, low_precision)
-        self.size, self.reward_unit = size, reward_unit
+        self.size = size
+        self.reward_unit = reward_unit
         self.noted = inputs.columns(*(group.name for group in inputs.groups if group.name not in _NOT_NOTED))
         self.rewards = ObservationNormaliser(1)
         transition = 2 * self.noted.size + actions + 1

@@ -114,7 +114,8 @@ class Moore(Headed):
             layers += [StackedLinear(modules, before, width, math.sqrt(2.0), generator)]
             layers += [PlainNorm(layer_norm), ACTIVATIONS[activation]()]
         self.body = nn.Sequential(*layers[:-2])  # vectors are orthogonalised before the non-linearity
-        self.activation, self.scale = ACTIVATIONS[activation](), math.sqrt(hidden[-1])
+        self.activation = ACTIVATIONS[activation]()
+        self.scale = math.sqrt(hidden[-1])
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def experts(self, x: Tensor) -> Tensor:
@@ -159,7 +160,8 @@ class PaCo(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (batch, inputs) to float32 (batch, outputs)."""
-        weights, features = self.weights(x), self.encoder(x)
+        weights = self.weights(x)
+        features = self.encoder(x)
         for layer in self.layers:
             features = self.between(mixed(weights, layer(features)))
         with torch.autocast(x.device.type, enabled=False):
@@ -181,7 +183,9 @@ class SoftModules(Headed):
         activation: Activation = "elu", layer_norm: bool = False, *, modules: int
     ):  # fmt: skip
         super().__init__()
-        inputs, gain, embedding = Inputs.of(inputs), math.sqrt(2.0), hidden[0]
+        inputs = Inputs.of(inputs)
+        gain = math.sqrt(2.0)
+        embedding = hidden[0]
         self.modules_of_layer = modules
         self.one_hot = inputs.columns("task_id")
         self.encoder = GroupEncoder(inputs.without("task_id"), generator)
@@ -230,7 +234,8 @@ class Towers(Headed):
         activation: Activation = "elu", layer_norm: bool = False, *, modules: int, shared: int
     ):  # fmt: skip
         super().__init__()
-        inputs, gain = Inputs.of(inputs), math.sqrt(2.0)
+        inputs = Inputs.of(inputs)
+        gain = math.sqrt(2.0)
         self.one_hot = inputs.columns("task_id")
         self.encoder = GroupEncoder(inputs.without("task_id"), generator)
         widths = list(pairwise([self.encoder.size, *hidden]))
@@ -242,7 +247,8 @@ class Towers(Headed):
 
     def features(self, x: Tensor) -> Tensor:
         """Compute the features as in the base class."""
-        one_hot, features = self.one_hot(x), self.encoder(x)
+        one_hot = self.one_hot(x)
+        features = self.encoder(x)
         for layer in self.common:
             features = self.between(layer(features))
         if not self.own:  # tasks differ by the output layer alone
@@ -271,7 +277,8 @@ class Transformer(Headed):
         activation: Activation = "elu", layer_norm: bool = False, *, modules: int
     ):  # fmt: skip
         super().__init__()
-        inputs, width = Inputs.of(inputs), hidden[-1]
+        inputs = Inputs.of(inputs)
+        width = hidden[-1]
         shown = [group.name for group in inputs.groups if group.name not in inputs.hidden]
         encoders = [GroupEncoder(inputs.only(name), generator) for name in shown]
         self.encoders = nn.ModuleList(encoders)

@@ -65,7 +65,8 @@ class Headed(nn.Module):
         """Return the outputs (batch, outputs / heads) of the head ``index``, int64 (batch,)."""
         features = self.features(x)
         with torch.autocast(x.device.type, enabled=False):
-            weight, bias = self.head.weight, self.head.bias
+            weight = self.head.weight
+            bias = self.head.bias
             return own_head(features.to(weight.dtype), weight, bias, index, heads)
 
 
@@ -101,7 +102,8 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
     """
 
     def stacked(name: str, x: Tensor) -> Tensor:
-        weight, bias = params[f"{prefix}{name}.weight"], params[f"{prefix}{name}.bias"]
+        weight = params[f"{prefix}{name}.weight"]
+        bias = params[f"{prefix}{name}.bias"]
         if not f"{prefix}{name}.".startswith(own):
             return affine(x, weight[0], bias[0])
         return stacked_affine(x, weight, bias)
@@ -152,7 +154,8 @@ class GaussianActor(nn.Module):
         activation: Activation = "elu", heads: int = 1, network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         self.mean = network(inputs, hidden, heads * actions, 0.01, generator, activation)
         self.log_std = nn.Parameter(torch.full((heads, actions) if heads > 1 else (actions,), math.log(init_std)))
 

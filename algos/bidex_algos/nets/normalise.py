@@ -65,7 +65,9 @@ class ObservationNormaliser(nn.Module):
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
         super().__init__()
-        self.enabled, self.settled, self.clip = enabled, False, clip
+        self.enabled = enabled
+        self.settled = False
+        self.clip = clip
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
@@ -125,9 +127,11 @@ class TaskNormaliser(ObservationNormaliser):
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)
-        self.tasks, self.one_hot = tasks, inputs.columns("task_id")
+        self.tasks = tasks
+        self.one_hot = inputs.columns("task_id")
         self.stats = RunningStats((tasks, self.measured.size))
-        self.shift, self.scale = torch.zeros(tasks, inputs.width), torch.ones(tasks, inputs.width)
+        self.shift = torch.zeros(tasks, inputs.width)
+        self.scale = torch.ones(tasks, inputs.width)
 
     def forward(self, obs: Tensor) -> Tensor:
         """Normalise (..., columns), float32."""

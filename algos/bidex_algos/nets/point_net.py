@@ -29,7 +29,8 @@ class PointNet(nn.Module):
         self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3, read: int = 0
     ):
         super().__init__()
-        self.channels, self.size = channels, widths[-1] + 3
+        self.channels = channels
+        self.size = widths[-1] + 3
         points = entries // channels
         self.step = 1 if read == 0 else max(1, points // read)
         layers: list[nn.Module] = []
@@ -43,7 +44,8 @@ class PointNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Encode clouds."""
         cloud = x.unflatten(-1, (-1, self.channels))[..., :: self.step, :]
-        place, rest = cloud[..., :3], cloud[..., 3:]
+        place = cloud[..., :3]
+        rest = cloud[..., 3:]
         centre = place.mean(dim=-2, keepdim=True)
         points = torch.cat(((place - centre) / _SPREAD, rest), dim=-1)
         return torch.cat((self._largest(points.flatten(0, -3)).view(*x.shape[:-1], -1), centre[..., 0, :]), dim=-1)
@@ -89,7 +91,8 @@ def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
                 f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
                 "--points (a suite's table [points]) out."
             )
-        widths, read = tuple(options["point_widths"]), options["points_read"]
+        widths = tuple(options["point_widths"])
+        read = options["points_read"]
         make = partial(PointNet, widths=widths, channels=channels, read=read)
         inputs = inputs.encoded(group.name, make, scaled=False)
     return inputs

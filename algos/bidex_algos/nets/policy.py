@@ -28,7 +28,9 @@ class ActorPolicy(nn.Module):
 
     def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
-        self.observations, self.actor, self.low_precision = observations, actor, low_precision
+        self.observations = observations
+        self.actor = actor
+        self.low_precision = low_precision
 
     @classmethod
     def made_of(cls, actor: nn.Module, config: Any, inputs: Inputs, shape: Shape, device: torch.device) -> Self:
@@ -76,7 +78,8 @@ class DeterministicActor(nn.Module):
         activation: Activation, network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         self.net = network(inputs, hidden, heads * actions, 0.01, generator, activation)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -112,7 +115,8 @@ def gaussian_policy(
     make: type[GaussianActor] = GaussianActor
 ) -> GaussianPolicy:  # fmt: skip
     """Make a policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
-    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    heads = shape.num_id_columns if config.policy_heads else 1
+    network = network_of(config)
     actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
     return GaussianPolicy.made_of(actor, config, inputs, shape, device)
 
@@ -121,7 +125,8 @@ def deterministic_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device
 ) -> DeterministicPolicy:
     """Make a deterministic policy as in :func:`gaussian_policy`."""
-    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    heads = shape.num_id_columns if config.policy_heads else 1
+    network = network_of(config)
     actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
     return DeterministicPolicy.made_of(actor, config, inputs, shape, device)
 
@@ -156,9 +161,11 @@ class SquashedActor(nn.Module):
         network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         low, high = (math.log(std) for std in std_range)
-        self.middle, self.reach = 0.5 * (low + high), 0.5 * (high - low)
+        self.middle = 0.5 * (low + high)
+        self.reach = 0.5 * (high - low)
         self.net = network(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
         with torch.no_grad():
             start = math.atanh((math.log(init_std) - self.middle) / self.reach)
@@ -201,7 +208,8 @@ def squashed_policy(
     network: MakeNetwork | None = None
 ) -> SquashedPolicy:  # fmt: skip
     """Make a squashed policy as in :func:`gaussian_policy`."""
-    heads, network = shape.num_id_columns if config.policy_heads else 1, network or network_of(config)
+    heads = shape.num_id_columns if config.policy_heads else 1
+    network = network or network_of(config)
     sizes = config.hidden, shape.actions, heads
     actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)
     return SquashedPolicy.made_of(actor, config, inputs, shape, device)

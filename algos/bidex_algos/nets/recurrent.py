@@ -82,7 +82,9 @@ class RecurrentPolicy(nn.Module):
         normalise_observations: bool, make_actor: Callable[[Inputs], nn.Module]
     ):  # fmt: skip
         super().__init__()
-        self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
+        self.num_actions = actions
+        self.memory = memory
+        self.reward_unit = reward_unit
         self.inputs = inputs.extended("last_step", actions + 3)
         self.observations = ObservationNormaliser(inputs, normalise_observations)
         self.rewards = ObservationNormaliser(1)

@@ -23,7 +23,8 @@ class Shape:
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
         """Return the shape of a world."""
-        observations, actions = world.single_observation_space, world.single_action_space
+        observations = world.single_observation_space
+        actions = world.single_action_space
         hidden = int(getattr(world, "hidden_size", 0))
         groups = tuple(world.observation_groups)
         classes = 1 if any(group.name == "task_id" for group in groups) else world.num_tasks

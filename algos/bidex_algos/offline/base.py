@@ -68,7 +68,8 @@ class Batches:
     """Transitions on a device, in batches of ``per_task`` of each of ``num_tasks`` tasks."""
 
     def __init__(self, data: Joined, num_tasks: int, per_task: int, device: torch.device):
-        self._per_task, self._device = per_task, device
+        self._per_task = per_task
+        self._device = device
         self._observations, self._at, self._actions, self._rewards, self._terminated = (
             each.to(device) for each in (data.observations, data.at, data.actions, data.rewards, data.terminated)
         )
@@ -106,7 +107,8 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
     """
     returns = data.rewards.double()
     factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]
-    span, longest = 1, int(data.left.max()) + 1
+    span = 1
+    longest = int(data.left.max()) + 1
     while span < longest:
         inside = data.left[:-span] >= span
         behind = factor[:-span] ** span * returns[span:]

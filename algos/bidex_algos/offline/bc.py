@@ -22,8 +22,10 @@ PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 class BC(Offline):
     """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics."""
 
-    name, remedy = "bc", "lower learning_rate"
-    config_type, presets = BCConfig, PRESETS
+    name = "bc"
+    remedy = "lower learning_rate"
+    config_type = BCConfig
+    presets = PRESETS
     config: BCConfig
     policy: DeterministicPolicy
     policy_of = staticmethod(deterministic_policy)

@@ -63,7 +63,8 @@ class ActionModel(nn.Module):
     def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
         super().__init__()
         self.codes = config.latent * actions
-        encoded, decoded = inputs.extended("action", actions), inputs.extended("code", self.codes)
+        encoded = inputs.extended("action", actions)
+        decoded = inputs.extended("code", self.codes)
         self.encoder = MLP(encoded, config.vae_hidden, 2 * self.codes, 1.0, generator, config.activation)
         self.decoder = MLP(decoded, config.vae_hidden, actions, 1.0, generator, config.activation)
 
@@ -93,9 +94,11 @@ class BCQPolicy(nn.Module):
         self, config: BCQConfig, inputs: Inputs, shape: Shape, generator: torch.Generator, device: torch.device
     ):
         super().__init__()
-        self.perturbation, self.low_precision = config.perturbation, use_bfloat16(config.autocast, device)
+        self.perturbation = config.perturbation
+        self.low_precision = use_bfloat16(config.autocast, device)
         self.observations = observation_normaliser(config, inputs, shape.num_id_columns)
-        judged, heads = inputs.extended("action", shape.actions), shape.num_id_columns
+        judged = inputs.extended("action", shape.actions)
+        heads = shape.num_id_columns
         self.actor = DeterministicActor(
             judged, config.hidden, shape.actions, heads if config.policy_heads else 1, generator, config.activation,
             network_of(config)
@@ -123,7 +126,8 @@ class BCQPolicy(nn.Module):
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return the action for raw observations (N, d): (N, a) in [-1, 1]."""
-        count, rows = len(self.codes), len(obs)
+        count = len(self.codes)
+        rows = len(obs)
         many = self.observations(obs).repeat_interleave(count, 0)
         with autocast(obs.device, self.low_precision):
             actions = self.propose(self.actor, many, self.codes.repeat(rows, 1))
@@ -136,8 +140,10 @@ class BCQPolicy(nn.Module):
 class BCQ(Offline):
     """Batch-constrained deep Q-learning on data sets (Fujimoto et al. 2019, arXiv 1812.02900)."""
 
-    name, remedy = "bcq", "lower critic_learning_rate"
-    config_type, presets = BCQConfig, PRESETS
+    name = "bcq"
+    remedy = "lower critic_learning_rate"
+    config_type = BCQConfig
+    presets = PRESETS
     config: BCQConfig
     policy: BCQPolicy
     policy_of = BCQPolicy
@@ -151,7 +157,8 @@ class BCQ(Offline):
         return self.policy.critic
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
         reported = self._fit_model(obs, draw.actions)
         reported |= self._fit_critics(obs, draw, self._target(draw, next_obs))
         reported |= self._fit_actor(obs)
@@ -172,7 +179,8 @@ class BCQ(Offline):
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
         count = self.config.candidates
-        many, task = next_obs.repeat_interleave(count, 0), self.task_of_draw.repeat_interleave(count)
+        many = next_obs.repeat_interleave(count, 0)
+        task = self.task_of_draw.repeat_interleave(count)
         codes = bounded(self._normal(many.new_empty(len(many), self.policy.model.codes)))
         with autocast(self.device, self.low_precision):
             values = self.target_critic(many, self.policy.propose(self.target_actor, many, codes), task)

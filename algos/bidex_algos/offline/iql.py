@@ -53,8 +53,10 @@ class BoundedMean(GaussianActor):
 class IQL(Offline):
     """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169)."""
 
-    name, remedy = "iql", "lower beta"
-    config_type, presets = IQLConfig, PRESETS
+    name = "iql"
+    remedy = "lower beta"
+    config_type = IQLConfig
+    presets = PRESETS
     config: IQLConfig
     policy: GaussianPolicy
     policy_of = staticmethod(partial(gaussian_policy, make=BoundedMean))
@@ -66,7 +68,8 @@ class IQL(Offline):
         self.log_bounds = [float(torch.tensor(std).log()) for std in config.std_range]
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
         with torch.no_grad():
             judged = self._values(self.target_critic, obs, draw.actions).amin(0)
         ahead = judged - self._worth(obs)
@@ -86,7 +89,8 @@ class IQL(Offline):
     def _fit_actor(self, obs: Tensor, actions: Tensor, advantage: Tensor) -> dict[str, Tensor]:
         weight = (self.config.beta * advantage).exp().clamp_max(self.config.max_weight)
         with autocast(self.device, self.low_precision):
-            mean, log_std = self.policy.actor(obs), self.policy.actor.log_std_of(obs)
+            mean = self.policy.actor(obs)
+            log_std = self.policy.actor.log_std_of(obs)
         log_std = log_std.clamp(*self.log_bounds)
         loss = -(weight * gaussian_log_prob(actions, mean, log_std)).mean()
         self._descend(loss, "actor", self.policy.actor)

@@ -39,8 +39,10 @@ PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "la
 class TD3BC(BC):
     """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860)."""
 
-    name, remedy = "td3bc", "lower critic_learning_rate"
-    config_type, presets = TD3BCConfig, PRESETS
+    name = "td3bc"
+    remedy = "lower critic_learning_rate"
+    config_type = TD3BCConfig
+    presets = PRESETS
     config: TD3BCConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     num_critics = 2
 
@@ -49,7 +51,8 @@ class TD3BC(BC):
         self.target_actor = copy.deepcopy(self.policy.actor)
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs))
         if self.env_steps % self.config.policy_delay == 0:
             reported |= self._fit_actor(obs, draw)

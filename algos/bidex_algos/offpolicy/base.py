@@ -76,7 +76,9 @@ class ReturnScale:
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
-        self.gamma, self.task_id, self.num_tasks = gamma, world.task_id, world.num_tasks
+        self.gamma = gamma
+        self.task_id = world.task_id
+        self.num_tasks = world.num_tasks
         self.stats = RunningStats((world.num_tasks,), max_count=horizon).to(world.device)
         self.discounted = torch.zeros(world.num_envs, device=world.device)
 
@@ -181,7 +183,8 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        rows, device = self.world.num_envs, self.device
+        rows = self.world.num_envs
+        device = self.device
         if self.replay.added < self.config.warmup_steps:
             actions = torch.rand(rows, self.shape.actions, generator=self.generator, device=device) * 2.0 - 1.0
         else:
@@ -202,7 +205,8 @@ class OffPolicy(Learner):
         return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
     def _learn(self) -> list[dict[str, Tensor]]:
-        updates, tasks = self.config.updates_per_step, self.world.num_tasks
+        updates = self.config.updates_per_step
+        tasks = self.world.num_tasks
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
         stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
         weights = self.replay.weights(stretches.last)

@@ -97,9 +97,11 @@ class BRC(Categorical, MTSAC):
     """BRC (Nauman et al. 2025, arXiv 2505.23150) on a batched world."""
 
     name = "brc"
-    config_type, presets = BRCConfig, PRESETS
+    config_type = BRCConfig
+    presets = PRESETS
     config: BRCConfig
-    critic_network, unit_embeddings = ResidualMLP, True
+    critic_network = ResidualMLP
+    unit_embeddings = True
     policy_of = staticmethod(partial(squashed_policy, network=ResidualMLP))
 
     @torch.no_grad()
@@ -113,7 +115,8 @@ class BRC(Categorical, MTSAC):
             return super()._reward_scale()
         tasks = torch.arange(self.world.num_tasks, device=self.device)
         gamma = discounts(self.world, self.config.gamma, tasks)
-        bound, each = self.config.value_bound, abs(self.target_entropy) / (1.0 - gamma)
+        bound = self.config.value_bound
+        each = abs(self.target_entropy) / (1.0 - gamma)
         # Room for the entropy of all future steps, but at least half of the range is left for rewards.
         room = bound - (self.log_alpha.detach().exp() * each).clamp_max(0.5 * bound)
         return (self.returns.bound / room).clamp_min(1e-8)

@@ -30,7 +30,9 @@ class Atoms(nn.Module):
 
     def __init__(self, low: float, high: float, count: int):
         super().__init__()
-        self.low, self.high, self.count = low, high, count
+        self.low = low
+        self.high = high
+        self.count = count
         self.values: Tensor
         self.register_buffer("values", torch.linspace(low, high, count), persistent=False)
 
@@ -87,7 +89,8 @@ class CategoricalCritics(nn.Module):
         super().__init__()
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
-        outputs, norm = heads * config.atoms, config.critic_layer_norm
+        outputs = heads * config.atoms
+        norm = config.critic_layer_norm
         given = inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm
         nets = [network(*given) for _ in range(count)]
         # At first the mean is 0 and the standard deviation a tenth of the bound. From a uniform distribution, which is
@@ -141,11 +144,14 @@ class ReturnBound(ReturnScale):
         self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
         super().note(reward, terminated, truncated, broken)
         over = terminated | truncated | broken
-        self.mass, self.recent = self.mass.masked_fill(over, 0.0), self.recent.masked_fill(over, 0.0)
+        self.mass = self.mass.masked_fill(over, 0.0)
+        self.recent = self.recent.masked_fill(over, 0.0)
 
     def _take(self, cut: Tensor, valid: Tensor) -> None:
         super()._take(cut, valid)
-        size, (rewards, mass), rest = self.discounted.abs(), self.recent, 1.0 - self.gamma
+        size = self.discounted.abs()
+        rewards, mass = self.recent
+        rest = 1.0 - self.gamma
         size = torch.where(cut, torch.maximum(size / (rest * self.mass), rewards.abs() / (rest * mass)), size)
         size = size.masked_fill(~valid, 0.0)
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))

@@ -52,8 +52,10 @@ PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDP
 class DDPG(OffPolicy):
     """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world."""
 
-    name, remedy = "ddpg", "lower critic_learning_rate"
-    config_type, presets = DDPGConfig, PRESETS
+    name = "ddpg"
+    remedy = "lower critic_learning_rate"
+    config_type = DDPGConfig
+    presets = PRESETS
     config: DDPGConfig
     policy: DeterministicPolicy
     policy_of = staticmethod(deterministic_policy)
@@ -77,7 +79,8 @@ class DDPG(OffPolicy):
         return torch.randn(like.shape, generator=self.generator, device=self.device)
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         if due := self._actor_is_due():
             self._policy_step(obs, draw, weights, counts)

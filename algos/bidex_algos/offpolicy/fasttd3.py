@@ -55,7 +55,8 @@ class FastTD3(Categorical, TD3):
     """Multi-task FastTD3 (Seo et al. 2025, arXiv 2505.22642) on a batched world."""
 
     name = "fasttd3"
-    config_type, presets = FastTD3Config, PRESETS
+    config_type = FastTD3Config
+    presets = PRESETS
     config: FastTD3Config
     delayed_targets = False
 

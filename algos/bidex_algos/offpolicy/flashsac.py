@@ -153,7 +153,8 @@ class FlashSAC(Categorical, MTSAC):
     """FlashSAC (Kim et al. 2026, arXiv 2604.04539) on a batched world."""
 
     name = "flashsac"
-    config_type, presets = FlashSACConfig, PRESETS
+    config_type = FlashSACConfig
+    presets = PRESETS
     config: FlashSACConfig
     per_process = (*Categorical.per_process, "noise", "repeats")
     going_on = ("updates", "noise", "repeats", *MTSAC.going_on)
@@ -181,15 +182,18 @@ class FlashSAC(Categorical, MTSAC):
     def _explore(self, obs: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             mean, log_std = self.policy.actor(self.policy.observations(obs))
-        fresh, noise = self.repeats == 0, torch.randn(mean.shape, generator=self.generator, device=self.device)
+        fresh = self.repeats == 0
+        noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
         steps = torch.multinomial(self.shares, len(obs), replacement=True, generator=self.generator) + 1
         self.noise = torch.where(fresh[:, None], noise, self.noise)
         self.repeats = torch.where(fresh, steps, self.repeats) - 1
         return sample_squashed(mean, log_std, self.noise)[0]
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
-        both, count = torch.cat([obs, next_obs]), len(obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
+        both = torch.cat([obs, next_obs])
+        count = len(obs)
         with torch.no_grad():
             next_actions, log_prob = self.policy.sample(next_obs, self.generator)
             actions = torch.cat([draw.actions, next_actions])

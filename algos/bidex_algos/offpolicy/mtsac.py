@@ -84,8 +84,10 @@ TASK_PRESETS: dict[str, dict[str, MTSACConfig]] = {
 class MTSAC(OffPolicy):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world."""
 
-    name, remedy = "mtsac", "lower critic_learning_rate"
-    config_type, presets = MTSACConfig, PRESETS
+    name = "mtsac"
+    remedy = "lower critic_learning_rate"
+    config_type = MTSACConfig
+    presets = PRESETS
     config: MTSACConfig
     policy: SquashedPolicy
     policy_of = staticmethod(squashed_policy)
@@ -100,7 +102,8 @@ class MTSAC(OffPolicy):
         return self.policy.sample(self.policy.observations(obs), self.generator)[0]
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         reported |= self._policy_step(obs, *self.policy.sample(obs, self.generator), weights, counts)
         follow(self.target_critic, self.critic, self.config.tau)

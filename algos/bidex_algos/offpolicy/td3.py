@@ -40,7 +40,8 @@ class TD3(DDPG):
     """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world."""
 
     name = "td3"
-    config_type, presets = TD3Config, PRESETS
+    config_type = TD3Config
+    presets = PRESETS
     config: TD3Config
     num_critics = 2
     going_on = ("updates", *DDPG.going_on)
@@ -54,6 +55,7 @@ class TD3(DDPG):
         return self.updates % self.config.policy_delay == 0
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        action, bound = super()._target_action(next_obs), self.config.target_bound
+        action = super()._target_action(next_obs)
+        bound = self.config.target_bound
         noise = self.config.target_std * self._normal(action)
         return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)

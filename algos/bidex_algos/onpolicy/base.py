@@ -170,7 +170,9 @@ class OnPolicy(Learner):
 
     @torch.no_grad()
     def _prepare(self) -> tuple[Batch, Tensor]:
-        r, cfg, num_tasks = self.rollout, self.config, self.world.num_tasks
+        r = self.rollout
+        cfg = self.config
+        num_tasks = self.world.num_tasks
         steps, rows = r.rewards.shape
         task_id = self.world.task_id
         flat_task_id = task_id.expand(steps, rows).reshape(-1)
@@ -183,9 +185,11 @@ class OnPolicy(Learner):
             return x if self.num_critics == 1 else x.repeat_interleave(self.num_critics, 1)
 
         judged = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id)
-        values, last_values = judged.view(steps, -1), self._final_value(r.last_obs, task_id).view(-1)
+        values = judged.view(steps, -1)
+        last_values = self._final_value(r.last_obs, task_id).view(-1)
         rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
-        element, elements = self._element(task_id).reshape(-1), self.num_critics * num_tasks
+        element = self._element(task_id).reshape(-1)
+        elements = self.num_critics * num_tasks
         next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
         gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
         advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
@@ -194,7 +198,8 @@ class OnPolicy(Learner):
         self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
         group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
         advantages = estimates.normalise_per_task(advantages, group, elements, valid)
-        actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
+        actions = r.actions.flatten(0, 1)
+        old_means = r.means.flatten(0, 1)
         batch = Batch(
             obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),

@@ -29,14 +29,17 @@ class Lessons:
     data: Labelled | None = None
 
     def __init__(self, world: VectorWorld, policy: GaussianPolicy, learning_rate: float, max_grad_norm: float):
-        self.world, self.policy, self.max_grad_norm = world, policy, max_grad_norm
+        self.world = world
+        self.policy = policy
+        self.max_grad_norm = max_grad_norm
         self.adam = torch.optim.Adam(policy.actor.mean.parameters(), lr=learning_rate, fused=True)
         (actions,) = world.single_action_space.shape
         self.label_stats = RunningStats((world.num_tasks, actions)).to(world.device)
 
     def begin(self, teachers: Teachers, samples: int, least_steps: int, batch_size: int) -> None:
         """Set the teachers; keep the newest ``samples`` labels, and at least ``least_steps`` of each environment."""
-        (actions,), (observations,) = self.world.single_action_space.shape, self.world.single_observation_space.shape
+        (actions,) = self.world.single_action_space.shape
+        (observations,) = self.world.single_observation_space.shape
         rows = teachers.known.nonzero().squeeze(1)
         steps = max(least_steps, samples // len(rows))
         self.teachers = teachers
@@ -64,9 +67,11 @@ class Lessons:
     def learn(self, updates: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
         """Take ``updates`` steps down the mean of the classes' losses, weighted (K,); return the unweighted losses."""
         assert self.data is not None
-        data, device = self.data, generator.device
+        data = self.data
+        device = generator.device
         tasks = data.tasks.repeat_interleave(self.batch_per_task)
-        unit, losses = self.label_stats.std(_FLOOR).float()[tasks], list[Tensor]()
+        unit = self.label_stats.std(_FLOOR).float()[tasks]
+        losses = list[Tensor]()
         for places in data.draw(updates, self.batch_per_task, generator):
             obs, labels = data.take(places)
             obs = self.policy.observations(obs)

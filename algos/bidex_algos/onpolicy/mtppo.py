@@ -113,7 +113,8 @@ class Demonstrations:
     """
 
     def __init__(self, data: Joined, config: MTPPOConfig, seed: int, device: torch.device):
-        self._config, self.fingerprint = config, data.fingerprint()
+        self._config = config
+        self.fingerprint = data.fingerprint()
         self._obs = data.observations.index_select(0, data.at).to(device)
         self._actions = data.actions.to(device)
         counts = torch.bincount(data.task)
@@ -128,7 +129,8 @@ class Demonstrations:
 
     def draw(self) -> tuple[Tensor, Tensor]:
         """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
-        size, device = (self._config.demonstration_batch,), self._obs.device
+        size = (self._config.demonstration_batch,)
+        device = self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
         # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
         place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
@@ -167,8 +169,10 @@ def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
 class MTPPO(OnPolicy):
     """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world."""
 
-    name, remedy = "mtppo", "lower learning_rate"
-    config_type, presets = MTPPOConfig, PRESETS
+    name = "mtppo"
+    remedy = "lower learning_rate"
+    config_type = MTPPOConfig
+    presets = PRESETS
     imitates = True
     config: MTPPOConfig
     demonstrations: Demonstrations | None = None
@@ -242,7 +246,9 @@ class MTPPO(OnPolicy):
         return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
+        cfg = self.config
+        actor = self.policy.actor
+        critic_alone = self._critic_alone()
         old_log_std = actor.log_std.detach().clone()
         measured = list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
@@ -278,7 +284,8 @@ class MTPPO(OnPolicy):
         """Learn from teachers in proportion to the failure of each class; do nothing while only the critic learns."""
         assert lessons.data is not None
         lessons.take_moments(self.config.rollout_steps)
-        tasks, needs = lessons.data.tasks, self._needs()
+        tasks = lessons.data.tasks
+        needs = self._needs()
         most = needs[tasks].max()
         updates = 0 if self._critic_alone() else round(self.config.teacher_updates * float(most))
         losses = lessons.learn(updates, self.generator, needs[tasks] / most) if updates else {}
@@ -291,17 +298,20 @@ class MTPPO(OnPolicy):
         return (1.0 - successes / counts.clamp_min(_EPISODES) / self.config.teacher_success).clamp_min(0.0)
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        cfg, actor = self.config, self.policy.actor
+        cfg = self.config
+        actor = self.policy.actor
         loss = self._loss(b, count, old_log_std)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
         rest = cfg.value_loss_weight * value - cfg.entropy_weight * loss.entropy
-        numbers, imitated = loss.numbers(value), None
+        numbers = loss.numbers(value)
+        imitated = None
         if self.demonstrations is not None and (weight := self._imitated()):
             imitated = self.demonstrations.loss(self.policy) / world_size()
             rest = rest + weight * imitated
         self.adams.zero_grad()
         if self.balance is not None:
-            losses, least = self._per_task(-loss.earned, b.task_id), self._per_task(self._least(b, count), b.task_id)
+            losses = self._per_task(-loss.earned, b.task_id)
+            least = self._per_task(self._least(b, count), b.task_id)
             numbers.append(self.balance.backward(losses, least, list(actor.parameters())))
             rest.backward()
         else:
@@ -328,7 +338,8 @@ class MTPPO(OnPolicy):
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
-        own, lessons = self.demonstrations, self.lessons
+        own = self.demonstrations
+        lessons = self.lessons
         parts = {} if lessons is None else {"teacher_adam": lessons.adam, "label_stats": lessons.label_stats}
         return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
 
@@ -354,7 +365,8 @@ class MTPPO(OnPolicy):
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
-        stored, own = state.get("demonstrations"), self.demonstrations
+        stored = state.get("demonstrations")
+        own = self.demonstrations
         if own is not None and stored is not None and stored != own.fingerprint:
             raise BidexError(
                 f"{self.name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "
@@ -371,4 +383,5 @@ class PPO(MTPPO):
     The class is MT-PPO with the presets of a single task (the appendix's B.1).
     """
 
-    presets, task_presets = SINGLE_TASK_PRESETS, TASK_PRESETS
+    presets = SINGLE_TASK_PRESETS
+    task_presets = TASK_PRESETS

@@ -74,7 +74,8 @@ def gaussian_step(
         objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
         return objective, kl
 
-    surrogate, ratio = surrogate_and_kl()[0], config.accept_ratio
+    surrogate = surrogate_and_kl()[0]
+    ratio = config.accept_ratio
     return trust_region_step(parameters, surrogate, own_kl, measure, config, max_kl, "Policy/kl", ratio)
 
 
@@ -89,15 +90,18 @@ def kl_from_itself(
     # The samples are steps by rows. Each later step starts at a later row; otherwise some rows would never be taken.
     taken = (sample + sample // rows) % stride == 0
     mean, log_std = distribution(taken)
-    kl, weight = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std), weights[taken]
+    kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
+    weight = weights[taken]
     return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()
 
 
 class MTTRPO(OnPolicy):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world."""
 
-    name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
-    config_type, presets = MTTRPOConfig, PRESETS
+    name = "mttrpo"
+    remedy = "lower max_kl or critic_learning_rate"
+    config_type = MTTRPOConfig
+    presets = PRESETS
     config: MTTRPOConfig
 
     def __init__(self, world: VectorWorld, config: MTTRPOConfig, seed: int):
@@ -108,7 +112,8 @@ class MTTRPO(OnPolicy):
         return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        actor, cfg = self.policy.actor, self.config
+        actor = self.policy.actor
+        cfg = self.config
 
         def distribution() -> tuple[Tensor, Tensor]:
             with autocast(self.device, self.low_precision):
@@ -134,7 +139,8 @@ class MTTRPO(OnPolicy):
         return kl_from_itself(distribution, batch.weights, self.world.num_envs, self.config.fisher_stride)
 
     def _critic_epochs(self, batch: Batch) -> Tensor:
-        cfg, parameters = self.config, list(self.critic.parameters())
+        cfg = self.config
+        parameters = list(self.critic.parameters())
         losses: list[Tensor] = []
         for _, index, count in self._mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches):
             b = batch.select(index)

@@ -117,7 +117,8 @@ class AdaptiveAdam:
         share: float = 1.0
     ):  # fmt: skip
         self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
-        self.bounds, self.weights = config.learning_rate_range, list(parameters)
+        self.bounds = config.learning_rate_range
+        self.weights = list(parameters)
         self.rate = torch.tensor(config.learning_rate, device=device)
         self.actor = _Adam(self.weights, self.rate, eps)
 
@@ -161,7 +162,8 @@ class AdaptiveAdams(AdaptiveAdam):
     def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
         """Take one step of both; ``apart``: clip each norm separately; ``critic_alone``: the actor does not change."""
         self.follow(None if critic_alone else kl)
-        actor, critic = self.weights, self.critic_weights
+        actor = self.weights
+        critic = self.critic_weights
         for weights in [actor, critic] if apart else [actor + critic]:
             nn.utils.clip_grad_norm_(weights, max_grad_norm)
         if not critic_alone:

@@ -82,7 +82,8 @@ class HeldObject:
         the lower of the two sides. Without a start pose of the hand the palm is taken as level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
-        half, zero = 0.5 * math.pi * draws[:, 0], torch.zeros_like(draws[:, 0])
+        half = 0.5 * math.pi * draws[:, 0]
+        zero = torch.zeros_like(draws[:, 0])
         about_normal = torch.stack((zero, half.sin(), zero, half.cos()), dim=1)
         over = (draws[:, 1] < 0.0).to(place)
         turned_over = torch.stack((zero, zero, over, 1.0 - over), dim=1)
@@ -170,7 +171,10 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 
 
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
-    mass, longest, (least, most) = float(model.body_mass[1]), float((high - low).max()), (0.002, 2.0)  # a hand has 5
+    # a hand has 5
+    mass = float(model.body_mass[1])
+    longest = float((high - low).max())
+    least, most = (0.002, 2.0)
     if not least <= mass <= most:
         raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:

@@ -16,8 +16,10 @@ import numpy as np
 from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.utils.files import is_file, read_bytes
 
-_MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
-_MOST_TAGS, _DEEPEST = 2_000, 32
+_MOST_BYTES = 1_000_000
+_MOST_MESH_BYTES = 20_000_000
+_MOST_TAGS = 2_000
+_DEEPEST = 32
 _TAGS = {"mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"}
 _TAGS |= {"body", "inertial", "geom", "joint", "freejoint", "site"}
 """Tags that a file may hold; a file that names points (``points=True``) may also hold sensors."""
@@ -63,8 +65,10 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
 def set_contacts(spec: mujoco.MjSpec) -> None:
     """Give geoms the softness and the margin that the world's time steps need; friction stays the file's."""
     for geom in spec.geoms:
-        geom.solref[:2], geom.solimp[:3] = _SOLREF, _SOLIMP
-        geom.margin, geom.gap = _MARGIN, 0.0
+        geom.solref[:2] = _SOLREF
+        geom.solimp[:3] = _SOLIMP
+        geom.margin = _MARGIN
+        geom.gap = 0.0
 
 
 def colliding(model: mujoco.MjModel) -> int:
@@ -106,11 +110,13 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
     def refuse(expected: str, received: str, mend: str) -> NoReturn:
         raise BidexError(f"{path}: expected {expected}, got {received}. {mend}")
 
-    seen, depth = 0, 0
+    seen = 0
+    depth = 0
 
     def start(name: str, attributes: dict[str, str]) -> None:
         nonlocal seen, depth
-        seen, depth = seen + 1, depth + 1
+        seen = seen + 1
+        depth = depth + 1
         if seen > _MOST_TAGS or depth > _DEEPEST:
             refuse(f"at most {_MOST_TAGS:,} tags, {_DEEPEST} deep", "more", "Simplify the object.")
         if name == "include":
@@ -131,7 +137,8 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
         depth -= 1
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
     received = "a document type, which may define entities"
     parser.StartDoctypeDeclHandler = lambda *_: refuse("plain MJCF", received, "Leave it out.")
     try:
@@ -164,7 +171,8 @@ def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
     Ellipsoids and meshes may stand out by 1 % of their size. Without colliding geoms both arrays are empty.
     """
-    centres, radii = [np.zeros((0, 3))], [np.zeros(0)]
+    centres = [np.zeros((0, 3))]
+    radii = [np.zeros(0)]
     for geom, turn in _colliding(model, body):
         points, radius = _own_frame(model, geom)
         centres.append(points @ turn.T + model.geom_pos[geom])
@@ -178,8 +186,10 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     The result is the intersection of the outline's box and the box of the geoms' own boxes, which both hold the geoms.
     """
     centres, radii = outline(model, body)
-    low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
-    boxes, own = model.geom_aabb, _colliding(model, body)
+    low = (centres - radii[:, None]).min(axis=0)
+    high = (centres + radii[:, None]).max(axis=0)
+    boxes = model.geom_aabb
+    own = _colliding(model, body)
     ends = [(boxes[geom, :3] + _SIGNS * boxes[geom, 3:]) @ turn.T + model.geom_pos[geom] for geom, turn in own]
     corners = np.concatenate(ends)
     return np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0))
@@ -187,7 +197,8 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     """Return ball centres (k, 3) in the geom's frame, and their radius."""
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+    kind = mujoco.mjtGeom(model.geom_type[geom])
+    size = model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return np.zeros((1, 3)), size[0]
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
@@ -201,7 +212,8 @@ def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
         return np.concatenate((rim, rim * (1, 1, -1))), 0.0
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
         return _directions() * size, 0.0
-    first, count = model.mesh_vertadr[model.geom_dataid[geom]], model.mesh_vertnum[model.geom_dataid[geom]]
+    first = model.mesh_vertadr[model.geom_dataid[geom]]
+    count = model.mesh_vertnum[model.geom_dataid[geom]]
     vertices = model.mesh_vert[first : first + count].astype(np.float64)
     return vertices[np.unique((vertices @ _directions().T).argmax(axis=0))], 0.0
 
@@ -209,6 +221,7 @@ def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 def _directions() -> np.ndarray:
     """Return unit vectors spread evenly over the ball (a Fibonacci lattice), shape (k, 3)."""
     i = np.arange(_OVER) + 0.5
-    z, angle = 1 - 2 * i / _OVER, np.pi * (1 + 5**0.5) * i
+    z = 1 - 2 * i / _OVER
+    angle = np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - z**2)
     return np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)

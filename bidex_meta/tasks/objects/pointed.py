@@ -84,12 +84,14 @@ class OwnObjectClass(ReachTask):
 
 
 def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
-    spec, like = read_own(file, points=True), _usual_model(usual)
+    spec = read_own(file, points=True)
+    like = _usual_model(usual)
     if spec.body("object") is None:
         raise BidexError(f'{file}: expected a body called "object", got none. Name the outermost one so.')
     model = compiled(file, spec)
     for kind in ("joint", "sensor"):
-        wanted, found = _named(like, kind), _named(model, kind)
+        wanted = _named(like, kind)
+        found = _named(model, kind)
         if wanted != found:
             missing = sorted(set(wanted) ^ set(found)) or list(wanted)
             raise BidexError(
@@ -97,7 +99,8 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
                 f"({', '.join(wanted)}); look at {', '.join(missing)}. See docs/objects.md."
             )
     check_collisions(file, model, _MOST_GEOMS)
-    mass, (low, high) = float(model.body_mass.sum()), _box(model)
+    mass = float(model.body_mass.sum())
+    low, high = _box(model)
     if not 0.0 < mass <= _MOST_MASS:
         raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Mend mass or density.")
     if (high - low).max() > _LARGEST:
@@ -119,15 +122,18 @@ def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
     middle = 0.5 * (torch.tensor([space.low]) + torch.tensor([space.high]))
     views = {name: start[:, columns] for name, columns in scene.qpos.items()}
     task.start(torch.zeros(1, task.start_draws, dtype=start.dtype), task.freeze(middle.to(start)), views)
-    model, data = scene.model, mujoco.MjData(scene.model)
+    model = scene.model
+    data = mujoco.MjData(scene.model)
     data.qpos[:] = start[0, : model.nq].numpy()
     mujoco.mj_forward(model, data)
-    deepest, met = 0.0, ""
+    deepest = 0.0
+    met = ""
     for contact in data.contact:
         owners = [model.body(int(model.geom_bodyid[geom])) for geom in contact.geom]
         own = [body.name.startswith(f"{task.own.name}/") for body in owners]
         if own[0] != own[1] and -contact.dist > deepest:
-            deepest, met = -float(contact.dist), owners[own[0]].name
+            deepest = -float(contact.dist)
+            met = owners[own[0]].name
     return deepest, "the table" if met == "world" else met
 
 
@@ -147,7 +153,8 @@ def _box(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the box around all colliding geoms, from the origin of the body ``object``, metres."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    lows, highs = [], []
+    lows = []
+    highs = []
     for body in range(1, model.nbody):
         centres, radii = outline(model, body)
         if len(centres):

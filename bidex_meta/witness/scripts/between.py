@@ -48,14 +48,16 @@ class Between:
     def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
         """``room``: of each hand's point at most so far from the thing before they close, metres."""
         right, left = (min(take.apart, each) for each in room)
-        self.take, self.apart = take, 0.5 * (right + left)
+        self.take = take
+        self.apart = 0.5 * (right + left)
         self.right, self.left = (point(hands.at(side)) for side in SIDES)
         self.thing = x, y, z = point(hands.where(f"{thing}/position"))
         self.half = 0.5 * (self.right[1] - self.left[1])
         self.middle = tuple(0.5 * (a + b) for a, b in zip(self.right, self.left, strict=True))
         aside = 0.5 * (right - left) * ramp(self.half, self.apart - 0.02, self.apart - 0.005)
         self.way = x + take.ahead - self.middle[0], y + aside - self.middle[1]
-        self.off, self.over = math.hypot(*self.way), self.middle[2] - z - take.above
+        self.off = math.hypot(*self.way)
+        self.over = self.middle[2] - z - take.above
         self.firm = min(
             (float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free)
             for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True)
@@ -73,7 +75,8 @@ class Between:
 
     def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
         """Where the hands go to take the thing to a place, at a height ``carried``, and to set it down at another."""
-        aside, held = self._get(), self._bring(goal, carried, lowered)
+        aside = self._get()
+        held = self._bring(goal, carried, lowered)
         x, y, z, half = (a + self.held * (b - a) for a, b in zip(aside, held, strict=True))
         return self._points(x, y, z, half)
 
@@ -98,7 +101,8 @@ class Between:
 
     def _get(self) -> tuple[float, float, float, float]:
         """From above to both sides of the thing, and closer until it is held."""
-        take, (x, y, height) = self.take, self.middle
+        take = self.take
+        x, y, height = self.middle
         near = max(ramp(self.off, 0.06, 0.04), ramp(height, take.high - 0.03, take.high - 0.01))
         low = self.thing[2] + take.above
         over = self._rise(low + (take.high - low) * ramp(self.off, take.aim, take.aim + 0.03))
@@ -110,7 +114,8 @@ class Between:
         """Up first, then over the place, then down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
-        far, up = math.hypot(*way), self.thing[2]
+        far = math.hypot(*way)
+        up = self.thing[2]
         share = max(ramp(up, carried - 0.012, carried - 0.004), ramp(far, 0.02, 0.012)) * min(1.0, 0.04 / (far + 1e-9))
         wanted = lowered + (carried - lowered) * ramp(far, 0.007, 0.018)
         rise = max(-0.03, min(0.03, wanted - up)) * ramp(self.firm, 0.4, 0.8)

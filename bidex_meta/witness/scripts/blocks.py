@@ -8,13 +8,16 @@ _DOWN = 0.2  # bend of the wrist that brings straight fingers below the forearm,
 
 # Of a fork: from its block to the hand's point where it pushes, and where it lets go of it; height above the floor;
 # angles that spread forefinger and little finger. Metres, rad.
-_BEHIND, _CLEAR, _LOW = 0.06, 0.09, 0.642
+_BEHIND = 0.06
+_CLEAR = 0.09
+_LOW = 0.642
 _FORK = {"FFJ3": 0.3, "LFJ3": -0.3, "MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1": 1.4}
 
 
 def push_blocks(hands: HandController) -> Actions:
     """Each hand takes its block between forefinger and little finger and pushes it to its goal."""
-    blocks, goals = {"right": "block2", "left": "block1"}, {"right": "goal2", "left": "goal1"}
+    blocks = {"right": "block2", "left": "block1"}
+    goals = {"right": "goal2", "left": "goal1"}
     for side in SIDES:
         hands.bend(side, 0.0, 0.0, THJ3=0.5, THJ1=-0.5, THJ0=-1.5, WRJ0=_DOWN, **_FORK)
         hands.hold(side)

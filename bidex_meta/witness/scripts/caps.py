@@ -60,7 +60,10 @@ def _ahead(hands: HandController) -> Tensor:
 _PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
 # Of a peg's circle about the cup, and of the right fingertips', metres; how far either is behind an ear that it pushes;
 # angle of the left ear from which on the right hand pushes it: the left thumb would meet the lid, rad.
-_RADIUS, _TIP_RADIUS, _TOUCH, _FAR = 0.068, 0.078, 0.2, 0.5
+_RADIUS = 0.068
+_TIP_RADIUS = 0.078
+_TOUCH = 0.2
+_FAR = 0.5
 _FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
 
 
@@ -97,7 +100,8 @@ def swing_cup(hands: HandController) -> Actions:
 def _push_on(hands: HandController) -> Actions:
     """The left hand makes room, and the right one pushes the ear to its goal with straight fingers."""
     x, y, z = hands.at("left").tolist()
-    back, aside = (x + 0.05, y - 0.08, z), (x + 0.05, y - 0.3, z + 0.1)
+    back = (x + 0.05, y - 0.08, z)
+    aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
         """The right hand's point for a fingertip at an angle behind the ear, so far towards the hand."""
@@ -116,7 +120,8 @@ def _push_on(hands: HandController) -> Actions:
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
     """The place at an angle behind the left ear on a circle about the cup, at a height above its origin."""
-    cup, at = hands.where("cup/position"), _yaw(hands) + math.pi - angle
+    cup = hands.where("cup/position")
+    at = _yaw(hands) + math.pi - angle
     return cup + torch.tensor([radius * math.cos(at), radius * math.sin(at), height], dtype=cup.dtype)
 
 

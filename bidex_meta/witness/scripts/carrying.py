@@ -3,7 +3,9 @@
 from bidex_meta.witness.controller import Actions, HandController, point
 
 # Joint angles of the right hand before and after it closes on the egg, rad, and the steps that it takes.
-_OPEN, _FIST, _CLOSING = (0.5, 0.5), (1.3, 1.35), 10
+_OPEN = (0.5, 0.5)
+_FIST = (1.3, 1.35)
+_CLOSING = 10
 _THUMB = {"THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
 _SETTLING = 25  # steps in which the hand stays below the egg, before it moves on
 _ASIDE = 0.01  # of the hand's point from the egg in x while it closes, metres: eggs escape on the thumb's side

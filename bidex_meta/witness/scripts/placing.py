@@ -4,11 +4,15 @@ from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.between import Between, Take
 
 # The right forefinger and the left little finger press, spread towards each other, until they are straight.
-_SPREAD, _WRIST, _YAW = 0.12, 0.06, 0.12
+_SPREAD = 0.12
+_WRIST = 0.06
+_YAW = 0.12
 _PRESSED = ("FFJ3", "LFJ3"), (_SPREAD, -_SPREAD), (0.0, 0.0)
 _BUCKET = Take(0.065, 0.013, 0.775, 0.145, 0.02, *_PRESSED)
 _BLOCK = Take(0.075, 0.005, 0.775, 0.115, 0.02, *_PRESSED)
-_STANDS, _OVER = 0.657, 0.765  # heights of a bucket on the table, and of the block over it, metres
+# heights of a bucket on the table, and of the block over it, metres
+_STANDS = 0.657
+_OVER = 0.765
 
 
 def place_in_bucket(hands: HandController) -> Actions:
@@ -24,7 +28,8 @@ def place_in_bucket(hands: HandController) -> Actions:
         goal = hands.frozen("goal") if hands.wide else place
         gap = float((place - hands.where("block/position"))[1])
         # The right hand must not come down on the bucket.
-        bucket, block = Between(hands, "bucket", _BUCKET), Between(hands, "block", _BLOCK, (max(0.1, gap - 0.12), 1.0))
+        bucket = Between(hands, "bucket", _BUCKET)
+        block = Between(hands, "block", _BLOCK, (max(0.1, gap - 0.12), 1.0))
         lifted = bucket.held > 0.5 and bucket.thing[2] > _STANDS + 0.012
         if lifted or bucket.far(goal) > 0.033 - 0.021 * bucket.held:
             points = bucket.carry(goal, _STANDS + 0.02, _STANDS)

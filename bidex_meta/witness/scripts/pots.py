@@ -8,9 +8,11 @@ from bidex_meta.witness.controller import Actions, HandController, Point, beside
 
 _BACK = 0.698  # how far a wrist bends back, rad
 # Position of a hand's point, from the pot's origin, if its fingertips carry a grip of the pot, metres.
-_REACH, _GRIP_HEIGHT = 0.1755 + 0.085, 0.068
+_REACH = 0.1755 + 0.085
+_GRIP_HEIGHT = 0.068
 # Turn that lays the left fingers on the underside of the kettle's trough; the kettle's tilt when it pours, rad.
-_TROUGH, _POUR = math.radians(59.0), math.radians(50.0)
+_TROUGH = math.radians(59.0)
+_POUR = math.radians(50.0)
 
 
 def lift_underarm(hands: HandController) -> Actions:
@@ -25,7 +27,8 @@ def lift_underarm(hands: HandController) -> Actions:
     out[2] = 0.0
 
     def under(middle: Tensor, height: float, steps: int, speed: float, reach: float = _REACH) -> Actions:
-        right, left = middle + reach * out, middle - reach * out
+        right = middle + reach * out
+        left = middle - reach * out
         yield from hands.lead(beside(right, 0.0, 0.0, height), beside(left, 0.0, 0.0, height), steps, speed)
 
     height = float(pot[2]) + _GRIP_HEIGHT
@@ -42,7 +45,8 @@ def lift_underarm(hands: HandController) -> Actions:
 def pour_water(hands: HandController) -> Actions:
     """The right hand grips the handle, the left goes under the spout; they lift the kettle and tilt it."""
     # Water itself is not paid.
-    kettle, bucket = hands.where("kettle/position"), hands.where("bucket/position")
+    kettle = hands.where("kettle/position")
+    bucket = hands.where("bucket/position")
     back = hands.where("kettle/handle_position") - kettle  # from spout to handle
     back = back / back.norm()
 
@@ -66,7 +70,8 @@ def pour_water(hands: HandController) -> Actions:
     yield from grip(kettle, loose=0.025, steps=17)
     hands.bend("right", 1.2, 1.5)
     yield from grip(kettle, steps=17)
-    sine, cosine = math.sin(_POUR), math.cos(_POUR)
+    sine = math.sin(_POUR)
+    cosine = math.cos(_POUR)
     lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine  # of a tilted kettle, along ``back`` and up
     way = bucket + (0.07 - lip[0]) * back - kettle
     way[2] += 0.098 - lip[1]

@@ -6,9 +6,12 @@ from bidex_meta.witness.scripts.between import Between, Take, ramp
 
 # Bend of the knuckles, rad: the fingers point down, and give way to what their backs press. About 2 N are enough; more
 # turn the hands, whose torque is weak.
-_BENT, _FIRM = 1.3, 1.4
+_BENT = 1.3
+_FIRM = 1.4
 _TAKE = Take(0.0, 0.065, 0.765, 0.097, 0.012, ("MFJ2", "MFJ2"), (_BENT, _BENT), (_FIRM, _FIRM))
-_LIES, _EDGE = 0.629, 0.05  # height of a block on the table; a block's edge, metres
+# height of a block on the table; a block's edge, metres
+_LIES = 0.629
+_EDGE = 0.05
 
 
 def stack_in_order(hands: HandController) -> Actions:
@@ -20,9 +23,11 @@ def stack_in_order(hands: HandController) -> Actions:
         hands.hold(side)
     while hands.steps_left:
         for side in SIDES:  # up, before the fingers swing down
-            knuckle, height = float(hands.where(f"{side}/MFJ2_position")), float(hands.at(side)[2])
+            knuckle = float(hands.where(f"{side}/MFJ2_position"))
+            height = float(hands.at(side)[2])
             hands.bend(side, _BENT * max(ramp(height, 0.72, 0.75), ramp(knuckle, 0.3, 0.6)), 0.0)
-        below, above = _between(hands, lower, upper), _between(hands, upper, lower)
+        below = _between(hands, lower, upper)
+        above = _between(hands, upper, lower)
         top = below.thing[2] + _EDGE
         if below.far(goals[lower]) > 0.022 - 0.014 * below.held:
             points = below.carry(goals[lower], _LIES, _LIES)

@@ -10,7 +10,8 @@ from bidex_meta.witness.controller import Actions, HandController, Point
 _ABOVE = 1.0  # height at which a hand is clear of the bars, metres
 _DOOR_HEIGHT = 0.72  # of the hands at a door, between the ends of the bars, metres
 # From a hand's point to its fingers' middle joints: ahead, and away from where the palm faces, metres.
-_TO_FINGERS, _TO_PALM = 0.06, 0.02
+_TO_FINGERS = 0.06
+_TO_PALM = 0.02
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class _Leaf:
 
     def place(self, along: float, over: float, angle: float) -> tuple[float, float]:
         """A point of the leaf that stands open by this angle towards the hands (away from them: negative)."""
-        sine, cosine = math.sin(angle), math.cos(angle)
+        sine = math.sin(angle)
+        cosine = math.cos(angle)
         return self.hinge[0] + over * cosine + along * sine, self.hinge[1] + over * sine - along * cosine
 
 
@@ -74,7 +76,9 @@ def close_outward(hands: HandController) -> Actions:
         at = []
         for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
             x, y = leaf.place(leaf.along, leaf.over - 0.04, -angle)
-            ahead, sine, cosine = _TO_FINGERS + back, math.sin(yaw), math.cos(yaw)
+            ahead = _TO_FINGERS + back
+            sine = math.sin(yaw)
+            cosine = math.cos(yaw)
             at.append((x + ahead * cosine + _TO_PALM * sine, y + ahead * sine - _TO_PALM * cosine))
         yield from _lead(hands, at, yaws, steps, speed)
 

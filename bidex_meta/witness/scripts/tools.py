@@ -73,7 +73,8 @@ def open_pen(hands: HandController) -> Actions:
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
     """Goes down to an end of the pen, closes around it, and then goes so far along it."""
-    end, at = hands.where(_ENDS[side]).clone(), hands.at(side)
+    end = hands.where(_ENDS[side]).clone()
+    at = hands.at(side)
     end[0] -= 0.008
     over = float(at[2] - end[2])
     off = float((end - at)[:2].norm())
@@ -106,9 +107,11 @@ def open_scissors(hands: HandController) -> Actions:
     yield from over(0.022, 16, 0.5)
     while hands.steps_left:
         left = target - float(hands.where("scissors/angle"))
-        right_loop, left_loop = hands.where(loops["right"]), hands.where(loops["left"])
+        right_loop = hands.where(loops["right"])
+        left_loop = hands.where(loops["left"])
         out = (right_loop - left_loop) / (right_loop - left_loop).norm()
         way = max(-0.025, min(0.025, 0.2 * left)) * out
-        a, b = hands.at("right") + way, hands.at("left") - way
+        a = hands.at("right") + way
+        b = hands.at("left") - way
         heights = [_tip(hands, side, hands.where(loops[side]), 0.022, _HOOKS[side])[2] for side in SIDES]
         yield from hands.lead((float(a[0]), float(a[1]), heights[0]), (float(b[0]), float(b[1]), heights[1]))

@@ -10,7 +10,8 @@ _CUP = {"knuckles": 0.6, "middles": 0.55, "THJ4": 0.4, "THJ3": 0.6, "THJ1": 0.0,
 _FIST = {"knuckles": 1.3, "middles": 1.35, "THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
 _CUBE_KNUCKLES = ("FFJ2", "MFJ2", "RFJ2")
 # Speed of the turn over the angle that is left, 1/s, and at most, rad/s: faster ones shake cubes out.
-_RATE, _FASTEST = 4.0, 1.8
+_RATE = 4.0
+_FASTEST = 1.8
 # Share of the full gain with which a cup follows its cube: 98 instead of 82 % of fifty episodes; twice it, 68 %.
 _FOLLOW = 0.5
 
@@ -27,7 +28,8 @@ def turn_cubes(hands: HandController) -> Actions:
 def _next(hands: HandController, side: str) -> Point:
     """Bends the fingers and turns a hand; returns where it should go."""
     cube, goal = _CUBES[side]
-    place, knuckles = hands.where(f"{cube}/position"), _knuckles(hands, side, "position")
+    place = hands.where(f"{cube}/position")
+    knuckles = _knuckles(hands, side, "position")
     mount = hands.orientation(f"{side}/mount_quaternion")
     height = -float(rotate(conjugate(mount), place - hands.at(side))[1])  # above the palm; 3 cm where it lies
     speed = float(hands.where(f"{cube}/linear_velocity").norm())
