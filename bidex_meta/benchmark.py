@@ -125,7 +125,10 @@ class Benchmark:
     """
 
     def __init__(self, name_or_path: str | Path | Suite, seed: int = 0) -> None:
-        self.suite = name_or_path if isinstance(name_or_path, Suite) else load_suite(name_or_path)
+        if isinstance(name_or_path, Suite):
+            self.suite = name_or_path
+        else:
+            self.suite = load_suite(name_or_path)
         self.seed = whole_number("seed", seed, 0)
         classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._classes = ByClass(classes, self.suite.rules)
@@ -246,7 +249,10 @@ class Benchmark:
         if randomisation is None:
             randomisation = not evaluates
         if isinstance(randomisation, bool):
-            randomisation = self.suite.randomisation if randomisation else None
+            if randomisation:
+                randomisation = self.suite.randomisation
+            else:
+                randomisation = None
         config = WorldConfig(
             num_envs=num_envs,
             device=device,
@@ -276,7 +282,10 @@ class Benchmark:
         return [Task.from_variation(env_name, variation) for variation in variations]
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
-        moving = True if self.suite.base == "moving" else None
+        if self.suite.base == "moving":
+            moving = True
+        else:
+            moving = None
         hides = self.suite.observation == "masked"
         points = (self.suite.points, self.suite.point_kinds)
         classes = dict[str, type[SuiteEnv]]()
@@ -349,7 +358,10 @@ def make_task_world(
     tasks = _drawn(task_class.variation_space, of_tasks, task_name, "train", 50)
     slot = Slot(name_with_object(task_name, object), task_class, tasks)
     if task_sampling is None:
-        task_sampling = "fixed" if mode.name == "DISABLED" else "uniform"
+        if mode.name == "DISABLED":
+            task_sampling = "fixed"
+        else:
+            task_sampling = "uniform"
     config = WorldConfig(
         num_envs=num_envs,
         device=device,

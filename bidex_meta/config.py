@@ -179,7 +179,10 @@ class RunConfig(Generic[LearnerSettings]):
 
     def early_end(self, metrics: Mapping[str, Json]) -> str | None:
         """The tag of the metrics that has reached what ends the run early; None where the run goes on."""
-        prefix = "Train" if self.evaluate_every is None else "Eval"
+        if self.evaluate_every is None:
+            prefix = "Train"
+        else:
+            prefix = "Eval"
         limits = {
             f"{prefix}/mean_return": self.stop_at_return,
             f"{prefix}/success_rate": self.stop_at_success,
@@ -192,7 +195,9 @@ class RunConfig(Generic[LearnerSettings]):
 
     def goal(self, last: Mapping[str, Json]) -> int:
         """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
-        return last["step"] if self.minutes is not None or self.early_end(last) else self.steps
+        if self.minutes is not None or self.early_end(last):
+            return last["step"]
+        return self.steps
 
 
 def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:

@@ -82,13 +82,17 @@ _VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
 def plain_name(name: str) -> str:
     """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
     found = _VERSIONED.match(name)
-    return name if found is None else found[1] + name[found.end() :]
+    if found is None:
+        return name
+    return found[1] + name[found.end() :]
 
 
 def versioned_name(name: str, rules: Rules) -> str:
     """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
     task_class, dash, thing = plain_name(name).partition("-")
-    return f"{task_class}-v2{dash}{thing}" if rules == V2 else name
+    if rules == V2:
+        return f"{task_class}-v2{dash}{thing}"
+    return name
 
 
 _Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
@@ -230,7 +234,9 @@ def _chosen(value: Any) -> Any:
         return {name: _chosen(each) for name, each in value.items()}
     if isinstance(value, tuple):
         return [_chosen(each) for each in value]
-    return portable(str(value)) if isinstance(value, Path | str) else value
+    if isinstance(value, Path | str):
+        return portable(str(value))
+    return value
 
 
 def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
@@ -373,7 +379,10 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
         mend = "Leave one of them out."
         raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
     for name in entry.objects or [given]:
-        object = None if name is None else _object(file, str(name))
+        if name is None:
+            object = None
+        else:
+            object = _object(file, str(name))
         yield SuiteClass(
             name=name_with_object(entry.name, object),
             class_name=entry.name,
@@ -387,14 +396,22 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
 
 def _object(file: Path, name: str) -> str:
     """An object's name; of a file its path, which is relative to the suite file's folder."""
-    return str(absolute(file.parent / expanded(name))) if name.endswith(".xml") else name
+    if name.endswith(".xml"):
+        return str(absolute(file.parent / expanded(name)))
+    return name
 
 
 def _check(suite: Suite) -> None:
     _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
-    expected = SPLITS if suite.kind == "meta" else ("train",)
+    if suite.kind == "meta":
+        expected = SPLITS
+    else:
+        expected = ("train",)
     if suite.splits != expected:
-        mend = "Give each class a split." if suite.kind == "meta" else 'Leave split out, or write kind = "meta".'
+        if suite.kind == "meta":
+            mend = "Give each class a split."
+        else:
+            mend = 'Leave split out, or write kind = "meta".'
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
     all_listed = all(entry.tasks for entry in suite.classes)

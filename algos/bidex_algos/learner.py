@@ -83,7 +83,10 @@ class Learner(Contract):
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
         """Describe the networks' reading of an observation; encoders of observation groups are added here."""
-        size = vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
+        if shape.num_id_columns:
+            size = vars(config).get("task_embedding", 0)
+        else:
+            size = 0
         return with_task_embedding(with_point_net(Inputs(shape.groups), config), size, cls.unit_embeddings)
 
     @abstractmethod
@@ -219,7 +222,9 @@ def _saved(part: Any) -> Any:
         return [_saved(each) for each in part]
     if isinstance(part, Tensor):
         return part.detach()
-    return part.get_state() if isinstance(part, torch.Generator) else part.state_dict()
+    if isinstance(part, torch.Generator):
+        return part.get_state()
+    return part.state_dict()
 
 
 @torch.no_grad()
@@ -252,7 +257,10 @@ def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
     for name in names:
         if name in own and name in given and _plain(own[name]) != _plain(given[name]):
             flag = f"--learner.{name.replace('_', '-')}"
-            mend = "Name a run on the same observations" if name in _WORLD else f"Add {flag} as there"
+            if name in _WORLD:
+                mend = "Name a run on the same observations"
+            else:
+                mend = f"Add {flag} as there"
             raise BidexError(
                 f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
                 f"{mend}, or start afresh."
@@ -260,7 +268,9 @@ def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
 
 
 def _plain(value: object) -> object:
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return list(value)
+    return value
 
 
 def _shapes(weights: State) -> dict[str, tuple[int, ...]]:

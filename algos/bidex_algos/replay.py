@@ -131,7 +131,8 @@ class Replay:
 
     def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
         """Return the transitions at ``places`` (B,); with ``last`` they end like the transitions at ``last``."""
-        last = places if last is None else last
+        if last is None:
+            last = places
         everything = self._obs.flatten(0, 1)
         following = everything.index_select(0, self.after(last))
         cut = self.at("cut", last)

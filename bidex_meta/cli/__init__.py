@@ -95,13 +95,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
         # A reader that closes only stdout has seen enough (`| head`). If stderr is closed, work may have been aborted.
-        code = errors.EXIT_UNREAD if unread(sys.stderr) else 0
+        if unread(sys.stderr):
+            code = errors.EXIT_UNREAD
+        else:
+            code = 0
         silence(sys.stdout)  # otherwise Python complains when it flushes at exit
         silence(sys.stderr)
         return code
     except OSError as error:
         silence(sys.stdout)  # otherwise Python retries the failed write at exit
-        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        if error.filename is None:
+            place = ""
+        else:
+            place = f"{os.fsdecode(error.filename)}: "
         return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
     except (Exception, SystemExit) as error:
         message = own_fault(error)

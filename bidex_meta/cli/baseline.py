@@ -66,7 +66,10 @@ def main(arguments: Sequence[str]) -> None:
     worlds = Worlds.open(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
     if not worlds.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
-    found = _scripted(worlds, flags) if what == "script" else _played(what, worlds, flags)
+    if what == "script":
+        found = _scripted(worlds, flags)
+    else:
+        found = _played(what, worlds, flags)
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     if flags.out is not None:
         stored = ("return", "return_interval", "success", "episodes", "unstable")
@@ -77,7 +80,10 @@ def main(arguments: Sequence[str]) -> None:
     if flags.json:
         print(json.dumps(numbers, indent=2))
         return
-    where = "" if flags.out is None else f", stored in {flags.out}"
+    if flags.out is None:
+        where = ""
+    else:
+        where = f", stored in {flags.out}"
     print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{where}", found))
 
 

@@ -69,7 +69,10 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
     columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
     rows = []
     for group in groups:
-        score = None if group.scores is None else iqm_over_seeds(group.scores)
+        if group.scores is None:
+            score = None
+        else:
+            score = iqm_over_seeds(group.scores)
         measures = (iqm_over_seeds(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
         over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
         cells = [NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]

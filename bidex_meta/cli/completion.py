@@ -44,7 +44,10 @@ def main(arguments: Sequence[str]) -> None:
 
         # tyro reads flags from a function's annotations; a non-empty name would become a prefix of every flag.
         takes.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
-        takes.__defaults__ = None if found.default is None else (found.default,)
+        if found.default is None:
+            takes.__defaults__ = None
+        else:
+            takes.__defaults__ = (found.default,)
         app.command(name=name, help=command.summary)(takes)
     script = io.StringIO()
     # tyro prints and exits.

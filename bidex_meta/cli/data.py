@@ -40,7 +40,10 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(DataFlags, arguments, "data")
     what = known_name("data command", flags.what, _ACTIONS)
     if (what == "list") == bool(flags.name):
-        mend = "takes no name" if flags.name else "needs the name of a data set (see bidex-meta data list)"
+        if flags.name:
+            mend = "takes no name"
+        else:
+            mend = "needs the name of a data set (see bidex-meta data list)"
         raise BidexError(f"bidex-meta data {what} {mend}.")
     if flags.episodes is not None and what != "check":
         raise BidexError(f"--episodes goes with check, not with {what}. Leave it out.")

@@ -101,12 +101,16 @@ def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
 def _found(module: str, name: str) -> tuple[str, ast.AST | None]:
     """Follow imports of a name; return the module that binds the name, and the bound class or value."""
     node = _statements(module).get(name)
-    return _found(node.module or "", name) if isinstance(node, ast.ImportFrom) else (module, node)
+    if isinstance(node, ast.ImportFrom):
+        return _found(node.module or "", name)
+    return (module, node)
 
 
 def _docstring(module: str, name: str) -> str:
     node = _found(module, name)[1]
-    return (ast.get_docstring(node) or "") if isinstance(node, ast.ClassDef) else ""
+    if isinstance(node, ast.ClassDef):
+        return ast.get_docstring(node) or ""
+    return ""
 
 
 def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | None]:
@@ -122,7 +126,9 @@ def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | N
 
 def _constant(module: str, name: str, attribute: str) -> object:
     value = _attribute(module, name, attribute)[1]
-    return value.value if isinstance(value, ast.Constant) else None
+    if isinstance(value, ast.Constant):
+        return value.value
+    return None
 
 
 def _keys(module: str, node: ast.AST | None) -> list[str]:

@@ -61,5 +61,8 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     classes = worlds.task_classes()  # raises BidexError for worlds that are not ours
     if flags.actor not in ("zero", "random"):
         say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
-    task = name_among(name_with_object(flags.task, flags.object), classes) if flags.task else slots[0]
+    if flags.task:
+        task = name_among(name_with_object(flags.task, flags.object), classes)
+    else:
+        task = slots[0]
     return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)

@@ -74,7 +74,9 @@ class LookFlags:
     @property
     def actor(self) -> str:
         """The policy, named by RUN or by --policy."""
-        return self.policy if self.run is None else str(self.run)
+        if self.run is None:
+            return self.policy
+        return str(self.run)
 
 
 def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:
@@ -121,7 +123,10 @@ def _refuse(word: str, options: Any, command: str) -> NoReturn:
         raise BidexError(f"Unexpected {word!r} after bidex-meta {command}. {end}")
     flag = word.split("=")[0]
     near = _near(flag, list(_flags(options)))
-    hint = f"Did you mean {' or '.join(near)}? " if near else ""
+    if near:
+        hint = f"Did you mean {' or '.join(near)}? "
+    else:
+        hint = ""
     raise BidexError(f"Unknown flag {flag} of bidex-meta {command}. {hint}{end}")
 
 
@@ -155,7 +160,8 @@ def _one_line(box: str) -> str:
     lines = [line.strip().strip("│").strip() for line in box.splitlines()]
     # If the terminal cannot draw boxes, the title is a separate line with a rule below, not part of the upper edge.
     start = next((i + 1 for i, line in enumerate(lines) if line and set(line) <= set("-")), 0)
-    start = 1 if box.lstrip().startswith("╭") else start
+    if box.lstrip().startswith("╭"):
+        start = 1
     words: list[str] = []
     for line in lines[start:]:
         if words and re.fullmatch(r"[─-]+|╰.*", line):

@@ -51,7 +51,10 @@ def main(arguments: Sequence[str]) -> None:
     found = checked(flags.run)
     if not of_data and not any(name.endswith(".pt") for name in files):
         raise BidexError(f"{flags.run} has no checkpoint, so that there is no policy to publish. Train it on.")
-    card = run_card(found, flags.name) if isinstance(found, RunFolder) else data_card(found, flags.name)
+    if isinstance(found, RunFolder):
+        card = run_card(found, flags.name)
+    else:
+        card = data_card(found, flags.name)
     content = published(flags.run, files) | {CARD: card.encode()}
     if flags.name.startswith(FOLDER):
         with new_folder(absolute(flags.name.removeprefix(FOLDER))) as target:

@@ -270,7 +270,10 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
     rows = flags.num_envs or _DEMONSTRATORS[flags.starts]
     if name not in source.task_classes() or ":" in name:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
-    witness = {} if flags.script else {name: load_witness(name)}
+    if flags.script:
+        witness = {}
+    else:
+        witness = {name: load_witness(name)}
     if flags.script:
         script_of(source.task_classes()[name])  # raises BidexError for a class without a script
     on_tasks = flags.starts == "tasks"
@@ -303,7 +306,10 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
             say(f"{after.steps[0]:,} of {size:,} transitions | {stored} of {rows} replays succeed")
 
     policy = {"algo": None, "actions": "script" if flags.script else "witness", **drawn}
-    kind = "demonstrations-tasks" if on_tasks else "demonstrations"
+    if on_tasks:
+        kind = "demonstrations-tasks"
+    else:
+        kind = "demonstrations"
     return _Collection(source, kind, plan, [policy], world, 1.0, play)
 
 

@@ -49,7 +49,10 @@ def main(arguments: Sequence[str]) -> None:
     if out is None:
         if flags.actor in ("zero", "random"):
             raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
-        name = "tiled" if flags.tiled else short_name(flags.task or "film")
+        if flags.tiled:
+            name = "tiled"
+        else:
+            name = short_name(flags.task or "film")
         out = Path(flags.actor) / "videos" / (name + video.film_suffix())
     suffix = video.check_suffix(out)
     refuse_links(*([] if flags.out else [out.parent, out]))
@@ -71,12 +74,21 @@ def main(arguments: Sequence[str]) -> None:
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     if flags.points:
         world = _with_clouds(world)
-    rows = list(range(len(slots))) if flags.tiled else [world.slot_env_ids[slots.index(task)].start]
+    if flags.tiled:
+        rows = list(range(len(slots)))
+    else:
+        rows = [world.slot_env_ids[slots.index(task)].start]
     longest = int(world.max_episode_steps[rows].max())
-    steps = flags.steps if flags.steps is not None else 0 if suffix == ".png" else longest
+    if flags.steps is not None:
+        steps = flags.steps
+    elif suffix == ".png":
+        steps = 0
+    else:
+        steps = longest
     look = {"width": width, "height": height, "camera": flags.camera}
     if flags.tiled:
-        every = every if suffix != ".png" else max(steps, 1)
+        if suffix == ".png":
+            every = max(steps, 1)
         frames = film_tiles(agent, world, rows, steps, flags.seed, every, flags.large, **look)
         count = steps // every + 1
     elif suffix == ".png":  # only the last frame

@@ -134,7 +134,10 @@ def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
         return {**found, "reason": reason}
     if not groups:
         return found
-    picture = _picture(lambda: plots.draw_comparison(estimates(groups))) if len(groups) > 1 else None
+    if len(groups) > 1:
+        picture = _picture(lambda: plots.draw_comparison(estimates(groups)))
+    else:
+        picture = None
     return {**found, "tables": [group_table(groups), class_table(groups)], "picture": picture}
 
 
@@ -159,7 +162,11 @@ def _differences(runs: Sequence[Run], names: dict[Path, str]) -> Json:
 
 
 def _cell(value: object) -> str:
-    return NONE if value is None else value if isinstance(value, str) else json.dumps(value)
+    if value is None:
+        return NONE
+    if isinstance(value, str):
+        return value
+    return json.dumps(value)
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:

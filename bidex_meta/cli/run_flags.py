@@ -52,7 +52,10 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     BidexError is raised for bad input.
     """
     resume = peek(arguments, "--resume")
-    folder = RunFolder.open(Path(resume)) if resume else None
+    if resume:
+        folder = RunFolder.open(Path(resume))
+    else:
+        folder = None
     default = _defaults(arguments, folder)
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore

@@ -57,7 +57,10 @@ def main(arguments: Sequence[str]) -> None:
         check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
     weights = _weights(folders)
     name = flags.name or short_name(first.algo)
-    suite = worlds.name if worlds.suite is None else worlds.suite.file.stem
+    if worlds.suite is None:
+        suite = worlds.name
+    else:
+        suite = worlds.suite.file.stem
     path = flags.out / entry_name(suite, name)
     if exists(path):
         raise BidexError(f"There is {path} already. Give another --name, or delete it.")
@@ -118,7 +121,10 @@ def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
     config = folder.config()
     git = versions.get("git") or {}
     commit = git.get("commit") and git["commit"][:10] + "+" * bool(git.get("dirty"))
-    gpus = set(versions.get("gpus") or []) if config.device.startswith("cuda") else set()
+    if config.device.startswith("cuda"):
+        gpus = set(versions.get("gpus") or [])
+    else:
+        gpus = set()
     device = ", ".join(gpus) or f"{config.device}, {config.threads} thread{'s' * (config.threads != 1)}"
     return round(training_seconds(folder.metrics()) / 3600.0, 3), device, commit
 

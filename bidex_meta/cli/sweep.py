@@ -118,7 +118,9 @@ class State(NamedTuple):
     @property
     def speed(self) -> float:
         """Measured steps per second; 0 before the first line of metrics."""
-        return self.step / self.seconds if self.seconds else 0.0
+        if self.seconds:
+            return self.step / self.seconds
+        return 0.0
 
 
 def state_of(run: PlannedRun) -> State:
@@ -126,20 +128,33 @@ def state_of(run: PlannedRun) -> State:
     rows = []
     evaluated = False
     if exists(run.folder.config_path):
-        wanted = run.config if run.after is None else replace(run.config, start_from=str(run.after.resolve()))
+        if run.after is None:
+            wanted = run.config
+        else:
+            wanted = replace(run.config, start_from=str(run.after.resolve()))
         # Seeds share a config, and the machine may have changed, so seed, threads and device are ignored.
         for name, there, here in run.folder.config().differences(wanted, ignored=("seed", "threads", "device")):
             raise BidexError(
                 f"{run.path} is a run of another config: {name} is {there} there, not {here}. Give the arm another "
                 "name, or move the folder away."
             )
-        rows = last_rows(run.folder.metrics_path) if is_file(run.folder.metrics_path) else []
+        if is_file(run.folder.metrics_path):
+            rows = last_rows(run.folder.metrics_path)
+        else:
+            rows = []
         evaluated = run.folder.evaluated
     last = rows[-1] if rows else {"step": 0}
     why = _last_line(_beside(run, "failed"))
     steps = run.config.goal(last)
     done = evaluated and run.folder.evaluation().get("steps", steps) >= steps
-    state = "runs" if _locked(run) else "done" if done else "failed" if why else "left"
+    if _locked(run):
+        state = "runs"
+    elif done:
+        state = "done"
+    elif why:
+        state = "failed"
+    else:
+        state = "left"
     return State(run, state, last["step"], steps, last.get("Perf/training_time") or 0.0, why)
 
 
@@ -164,7 +179,10 @@ class Job:
             return True
         if self.stopped:
             return False
-        words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
+        if exists(run.folder.config_path):
+            words = ["run", f"--resume={run.path}", *run.words]
+        else:
+            words = run.begin
         with _beside(run, "log").open("ab") as log:
             one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
             self.process = subprocess.Popen(  # Ctrl-C reaches only the sweep, which then stops its runs
@@ -300,7 +318,10 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
                 if not job.done(force_check=True):
                     continue
             executor.update_parameters(name=run.name)
-            after = None if run.after is None else run.after.resolve()
+            if run.after is None:
+                after = None
+            else:
+                after = run.after.resolve()
             jobs[run.name] = executor.submit(QueuedJob(replace(run, path=run.path.resolve(), after=after), COMMAND))
             number.write_text(f"{jobs[run.name].job_id}\n")
     except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
@@ -331,7 +352,9 @@ def _signal_of(code: int) -> int | None:
     if code == 0:  # an unfinished run that exits with 0 has saved at SIGTERM
         return signal.SIGTERM
     number = -code if code < 0 else code - 128
-    return number if number in (*BATCH_SIGNALS, signal.SIGTERM) else None
+    if number in (*BATCH_SIGNALS, signal.SIGTERM):
+        return number
+    return None
 
 
 def _locked(run: PlannedRun) -> bool:
@@ -351,7 +374,10 @@ def _beside(run: PlannedRun, kind: str) -> Path:
 
 
 def _last_line(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if is_file(path) else []
+    if is_file(path):
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    else:
+        lines = []
     return next((one_line(line) for line in reversed(lines) if line.strip()), "")
 
 
@@ -364,10 +390,19 @@ def _print(states: Sequence[State]) -> None:
         alike = [speed for subject, speed in speeds if subject == each.run.subject] or [speed for _, speed in speeds]
         speed = each.speed or (mean(alike) if alike else math.nan)
         minutes = each.run.config.minutes
-        seconds = (each.goal - each.step) / speed if minutes is None else 60 * minutes - each.seconds
-        hours = 0.0 if each.state == "done" else max(seconds / 3600, 0.0)
+        if minutes is None:
+            seconds = (each.goal - each.step) / speed
+        else:
+            seconds = 60 * minutes - each.seconds
+        if each.state == "done":
+            hours = 0.0
+        else:
+            hours = max(seconds / 3600, 0.0)
         total += hours
-        goal = f"{each.goal:,}" if minutes is None else f"{minutes:g} min"
+        if minutes is None:
+            goal = f"{each.goal:,}"
+        else:
+            goal = f"{minutes:g} min"
         cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "–" if math.isnan(hours) else f"{hours:.2f}"]
         rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
     headers = ["run", "state", "steps", "of", "steps/s", "hours left", "why"]

@@ -170,9 +170,15 @@ def evaluation_table(
     if any(result.unstable for result in policy.classes.values()):
         caption += f"\n{_BROKEN}"
     table = Sheet(headers, title, caption, _SPARE)
-    differences = compare(policy, random) if random is not None else {}
+    if random is not None:
+        differences = compare(policy, random)
+    else:
+        differences = {}
     rows = policy.to_json()
-    others = random.to_json() if random is not None else None
+    if random is not None:
+        others = random.to_json()
+    else:
+        others = None
     for name, row in rows["classes"].items():
         episodes = f"{row['episodes']}" + (f" ({row['unstable']} unstable)" if row["unstable"] else "")
         cells = [name, episodes, f"{row['length']:.1f}", percent(row["success"])]
@@ -221,7 +227,10 @@ def gained(measures: Mapping[str, Difference | None]) -> list[str]:
     success, earned, score = (measures[name] for name in ("success", "return", "score"))
     percents = NONE
     if success is not None:
-        ends = None if success.interval is None else (100 * success.interval[0], 100 * success.interval[1])
+        if success.interval is None:
+            ends = None
+        else:
+            ends = (100 * success.interval[0], 100 * success.interval[1])
         percents = ranged(100 * success.value, ends, sign=True, unit=" %")
     others = ((earned, ""), (score, NONE))
     return [
@@ -286,5 +295,8 @@ def _score(value: float | None) -> str:
 def ranged(value: float, interval: Interval | None, sign: bool = False, unit: str = "") -> str:
     """Format a value and the ends of its interval."""
     form = "+.4g" if sign else ".4g"
-    ends = NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
+    if interval is None:
+        ends = NONE
+    else:
+        ends = f"{interval[0]:{form}}, {interval[1]:{form}}"
     return f"{value:{form}}{unit} [{ends}]"

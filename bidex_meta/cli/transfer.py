@@ -65,7 +65,10 @@ class TransferFlags:
 
 def main(arguments: Sequence[str]) -> None:
     """Run the runs that are left, print and store the tables; exit with code 1 if a run has failed."""
-    at = arguments.index("--") if "--" in arguments else len(arguments)
+    if "--" in arguments:
+        at = arguments.index("--")
+    else:
+        at = len(arguments)
     flags = parse(TransferFlags, arguments[:at], "transfer")
     arms = arms_of([flags.run, *flags.start_from])
     for run in (flags.run, *flags.start_from):
@@ -151,7 +154,10 @@ def _steps_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[s
         measures = [*map(_text, (*row["at"].values(), row["success"])), _text(row["return"], 1.0), _text(row["area"])]
         median = row["half"]["median"]
         seeds = row["half"]["of_seeds"]
-        half = f"> {end:,}" if median is None else f"{median:,}"
+        if median is None:
+            half = f"> {end:,}"
+        else:
+            half = f"{median:,}"
         half += f" ({sum(each is not None for each in seeds)} of {len(seeds)})"
         cells.append(
             [row["class"], row["from"], *_seeds(row), *measures, _text(row["over_nothing"], form="+.1f"), half]
@@ -173,7 +179,9 @@ def _seeds(row: Json) -> list[str]:
 
 
 def _text(found: Json | None, factor: float = 100.0, form: str = ".1f") -> str:
-    return NONE if found is None else Estimate(found["value"], found["interval"]).text(factor, form=form)
+    if found is None:
+        return NONE
+    return Estimate(found["value"], found["interval"]).text(factor, form=form)
 
 
 def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:

@@ -76,7 +76,10 @@ def held_out(worlds: Worlds, asked: Sequence[str]) -> list[str]:
 
     Raises BidexError if the suite has no held-out class.
     """
-    classes = [] if worlds.suite is None else worlds.suite.classes
+    if worlds.suite is None:
+        classes = []
+    else:
+        classes = worlds.suite.classes
     found = [entry.name for entry in classes if entry.splits == ("test",)]
     if not found:
         raise BidexError(
@@ -117,7 +120,10 @@ def suite_file(worlds: Any, name: str, folder: Path) -> Path:
 
 
 def _entry(each: SuiteClass, split: str) -> dict[str, Any]:
-    own = {"gamma": each.gamma} if each.gamma is not None else {}
+    if each.gamma is not None:
+        own = {"gamma": each.gamma}
+    else:
+        own = {}
     scale = {"reward_scale": each.reward_scale, "options": dict(each.options)}
     return {"name": each.class_name, "split": split, **scale, **own}
 
@@ -213,7 +219,9 @@ def shared_words(num_envs: int, more: Sequence[str]) -> list[str]:
 def reinforced(steps: int, planned: RunConfig[Any]) -> list[str]:
     """Return the words of a run by reinforcement: evaluate 100 times, or after each iteration; [] for 0 steps."""
     iteration = planned.num_envs * planned.learner_values["rollout_steps"]
-    return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"] if steps else []
+    if steps:
+        return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"]
+    return []
 
 
 def cells_of(
@@ -234,8 +242,14 @@ def cells_of(
 
 
 def _cell(file: Path, name: str, arm: Arm, seed: int, words: list[str], out: Path, count: int | None) -> Cell:
-    start = [] if arm.path is None else [f"--start-from={arm.path}"]
-    how = _ALGO if count is None else f"{count}-demonstrations"
+    if arm.path is None:
+        start = []
+    else:
+        start = [f"--start-from={arm.path}"]
+    if count is None:
+        how = _ALGO
+    else:
+        how = f"{count}-demonstrations"
     path = out / "runs" / f"{short_name(name)}-{arm.name}-{how}-seed{seed}".replace(" ", "-")
     run = PlannedRun(path, arm.name, name, seed, (f"--suite={file}", *words, *arm.network, *start))
     return Cell(replace(run, config=config_of_words(run.begin[1:])), name, arm.name, count)

@@ -80,7 +80,10 @@ _NOTHING = ("uniform", "zero", "held")  # policies that have learned nothing
 
 def _cells(name: str, row: Json) -> list[str]:
     shares = ("" if row[key] is None else f"{100 * row[key]:.1f} %" for key in _SHARES)
-    rank = "" if row["alignment"] is None else f"{row['alignment']['rank']:.2f}"
+    if row["alignment"] is None:
+        rank = ""
+    else:
+        rank = f"{row['alignment']['rank']:.2f}"
     return [name, ", ".join(row["hidden"]) or "nothing", *shares, rank]
 
 

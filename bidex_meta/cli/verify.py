@@ -41,7 +41,10 @@ def main(arguments: Sequence[str]) -> None:
     else:
         _print_table(f"{found.title}, recorded and again", found.classes)
         verdict = f"{found.count(EQUAL)} equal bit for bit, {found.count(WITHIN)} within, {found.count(DIFFERS)} differ"
-        end = "" if found.agrees else ": this run is not what its evaluation says"
+        if found.agrees:
+            end = ""
+        else:
+            end = ": this run is not what its evaluation says"
         print(f"{len(found.classes)} classes: {verdict}{end}")
     if not found.agrees:
         raise SystemExit(EXIT_FAILED)

@@ -37,7 +37,10 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
     if flags.all and (flags.out is not None or flags.file is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
-    names = registry.names() if flags.task is None else [known_name("task", flags.task, registry.names())]
+    if flags.task is None:
+        names = registry.names()
+    else:
+        names = [known_name("task", flags.task, registry.names())]
     if flags.out is not None:
         video.check_suffix(flags.out)
         check_writable(flags.out)

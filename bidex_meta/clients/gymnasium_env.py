@@ -73,7 +73,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Return a picture (height, width, 3), uint8; None without a render mode."""
-        return None if self.render_mode is None else self.world.render()
+        if self.render_mode is None:
+            return None
+        return self.world.render()
 
     def close(self) -> None:
         """Free the world."""

@@ -94,7 +94,10 @@ def both_seeds(seed: int | None, benchmark_seed: int | None = None) -> tuple[int
 
     Without a seed, Gymnasium draws starts from a random seed. The tasks are part of the benchmark and stay the same.
     """
-    given = seed if benchmark_seed is None else benchmark_seed
+    if benchmark_seed is None:
+        given = seed
+    else:
+        given = benchmark_seed
     if given is None:
         return 0, secrets.randbits(63)
     return given, given if seed is None else seed

@@ -27,6 +27,9 @@ def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = Auto
     given = world.metadata["autoreset_mode"]
     if given != mode:
         usual = mode == AutoresetMode.SAME_STEP
-        mend = "without autoreset_mode" if usual else f"with autoreset_mode={mode.name!r}"
+        if usual:
+            mend = "without autoreset_mode"
+        else:
+            mend = f"with autoreset_mode={mode.name!r}"
         raise BidexError(f"Expected a world in autoreset mode {mode.name}, got {given.name}; make it {mend}.")
     set_stagger(world, stagger)

@@ -82,8 +82,14 @@ class HandsEnv(ParallelEnv):
             expected = self.action_spaces[name].shape
             given = dense(actions.get(name), torch.device("cpu"))
             if given is None or given.shape != expected:
-                shown = shortened(actions[name]) if name in actions else "nothing"
-                got = shown if given is None else f"shape {tuple(given.shape)}"
+                if name in actions:
+                    shown = shortened(actions[name])
+                else:
+                    shown = "nothing"
+                if given is None:
+                    got = shown
+                else:
+                    got = f"shape {tuple(given.shape)}"
                 raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
             joint[self._actions[name]] = given
         self._state, reward, terminated, truncated, info = self._env.step(joint)

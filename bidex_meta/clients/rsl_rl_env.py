@@ -36,12 +36,18 @@ class RslRlVecEnv(VecEnv):
         self.device = world.device
         self.cfg = cfg or {}
         limits = world.max_episode_steps
-        self.max_episode_length = int(limits[0]) if bool((limits == limits[0]).all()) else limits
+        if bool((limits == limits[0]).all()):
+            self.max_episode_length = int(limits[0])
+        else:
+            self.max_episode_length = limits
         groups = {group.name: group for group in world.observation_groups}
         for name in set(policy) - groups.keys():
             raise unknown_name("observation group", name, groups)
         entries = [torch.arange(part.start, part.stop) for name in policy for part in groups[name].where]
-        self._policy = torch.cat(entries).to(world.device) if entries else None
+        if entries:
+            self._policy = torch.cat(entries).to(world.device)
+        else:
+            self._policy = None
         self._log = EpisodeLog(world)
         self._obs: Tensor | None = None
 
@@ -53,7 +59,10 @@ class RslRlVecEnv(VecEnv):
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
         given = dense(value, self.world.device)
-        steps = torch.zeros(0) if given is None else given.to(torch.int64)
+        if given is None:
+            steps = torch.zeros(0)
+        else:
+            steps = given.to(torch.int64)
         if given is None or steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
             got = shortened(value if given is None else given.tolist())
             what = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
@@ -74,7 +83,10 @@ class RslRlVecEnv(VecEnv):
         """Return the present observations, `policy` (num_envs, p) and `critic` (num_envs, d)."""
         if self._obs is None:
             return self.reset()[0]
-        policy = self._obs if self._policy is None else self._obs[:, self._policy]
+        if self._policy is None:
+            policy = self._obs
+        else:
+            policy = self._obs[:, self._policy]
         return TensorDict({"policy": policy, "critic": self._obs}, [self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, Info]:

@@ -35,7 +35,10 @@ class TorchRLEnv(envs.EnvBase):
         low = torch.as_tensor(world.observation_space.low)
         high = torch.as_tensor(world.observation_space.high)
         bounded = bool(low.isfinite().all() and high.isfinite().all())
-        seen = data.Bounded(low, high, device=device) if bounded else data.Unbounded(low.shape, device=device)
+        if bounded:
+            seen = data.Bounded(low, high, device=device)
+        else:
+            seen = data.Unbounded(low.shape, device=device)
         column = torch.Size([rows, 1])
         flag = data.Binary(1, column, dtype=torch.bool, device=device)
         counters = {name: data.Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
@@ -53,13 +56,23 @@ class TorchRLEnv(envs.EnvBase):
         self._world_seed = seed
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        asked = tensordict.get("_reset", None) if tensordict is not None else None
-        mask = torch.ones_like(self._begun) if asked is None else asked.squeeze(-1)
+        if tensordict is not None:
+            asked = tensordict.get("_reset", None)
+        else:
+            asked = None
+        if asked is None:
+            mask = torch.ones_like(self._begun)
+        else:
+            mask = asked.squeeze(-1)
         left = mask & ~self._begun  # environments whose episode did not end in the last step
         if asked is None or bool(left.any()):
-            options = None if bool(left.all()) or asked is None else {"reset_mask": left}
+            if bool(left.all()) or asked is None:
+                options = None
+            else:
+                options = {"reset_mask": left}
             self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)
-            self._world_seed = None if options is None else self._world_seed
+            if options is None:
+                self._world_seed = None
         self._begun = self._begun & ~mask
         return self._entries(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
 
@@ -72,6 +85,7 @@ class TorchRLEnv(envs.EnvBase):
 
     def _entries(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
         running = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
-        success = torch.zeros_like(self._begun) if success is None else success
+        if success is None:
+            success = torch.zeros_like(self._begun)
         entries = {"observation": obs.clone(), "success": success[:, None], "episode": running}
         return TensorDict(entries, self.batch_size, device=self.device)

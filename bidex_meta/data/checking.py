@@ -92,7 +92,10 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
 
 def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, Episode]]:
     """Yield at most ``most`` evenly spread episodes (None: all), each with its number."""
-    every = 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
+    if most is None:
+        every = 1
+    else:
+        every = max(1, math.ceil(dataset.num_episodes / most))
     yield from ((number, episode) for number, episode in enumerate(dataset.episodes()) if number % every == 0)
 
 
@@ -205,7 +208,11 @@ def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Sho
 def _size(block: Block, sensor: str) -> int:
     if len(block.sensors) == block.size:
         return 1
-    return 4 if sensor.endswith("quaternion") else block.size if len(block.sensors) == 1 else 3
+    if sensor.endswith("quaternion"):
+        return 4
+    if len(block.sensors) == 1:
+        return block.size
+    return 3
 
 
 @dataclass(frozen=True)

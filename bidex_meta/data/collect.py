@@ -53,14 +53,20 @@ class Actor:
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
-        drawing = policy if self.sampled and isinstance(policy, SamplingAgent) else None
+        if self.sampled and isinstance(policy, SamplingAgent):
+            drawing = policy
+        else:
+            drawing = None
         # Each kind of draw has its own generator; the policy's generator is on the network's device. With the same seed
         # the noise would repeat the policy's own normal draws.
         inner = torch.Generator(world.device).manual_seed(seed)
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
-            action = drawing.sample_action(obs, inner) if drawing else policy.eval_action(obs)
+            if drawing:
+                action = drawing.sample_action(obs, inner)
+            else:
+                action = policy.eval_action(obs)
             if self.noise > 0.0:
                 action = action + self.noise * torch.randn(action.shape, generator=outer).to(action)
             return action.clamp(-1.0, 1.0)
@@ -139,7 +145,10 @@ def collect(
 def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[np.ndarray, int]:
     """Return the environments of the next round, bool (N,), and the number of episodes that each plays."""
     known = now.episodes[which] > 0
-    mean = now.steps[which] / now.episodes[which] if known else float(world.max_episode_steps.float().mean())
+    if known:
+        mean = now.steps[which] / now.episodes[which]
+    else:
+        mean = float(world.max_episode_steps.float().mean())
     step_bytes = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 1) + 2
     rows = np.ones(world.num_envs, bool)
     most = max(1, round(PART_BYTES / (step_bytes * mean * world.num_envs)))
@@ -201,5 +210,8 @@ def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writ
 def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
     """Return the most bytes that the running episodes of the environments ``rows`` (None: all) take in memory."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
-    limits = world.max_episode_steps if rows is None else world.max_episode_steps[list(rows)]
+    if rows is None:
+        limits = world.max_episode_steps
+    else:
+        limits = world.max_episode_steps[list(rows)]
     return int(limits.sum()) * step

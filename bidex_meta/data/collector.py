@@ -40,7 +40,10 @@ class EpisodeCollector(PooledWorldWrapper):
         if world.metadata["autoreset_mode"].name == "NEXT_STEP":
             what = "Expected a world in autoreset mode SAME_STEP or DISABLED to record, got NEXT_STEP"
             raise BidexError(f"{what}; make it without autoreset_mode.")
-        chosen = range(world.num_envs) if rows is None else rows
+        if rows is None:
+            chosen = range(world.num_envs)
+        else:
+            chosen = rows
         if len(set(chosen)) != len(chosen) or not all(0 <= row < world.num_envs for row in chosen):
             most = world.num_envs - 1
             raise BidexError(f"Expected different rows of 0 to {most} to record, got {list(chosen)[:10]}.")
@@ -73,7 +76,10 @@ class EpisodeCollector(PooledWorldWrapper):
         """Start episodes; leave out the running episodes of the environments that are reset."""
         obs, info = self.world.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
-        begun = np.ones(len(self.rows), bool) if mask is None else self._own(torch.as_tensor(mask))
+        if mask is None:
+            begun = np.ones(len(self.rows), bool)
+        else:
+            begun = self._own(torch.as_tensor(mask))
         if begun.all() or not self._pools:
             self._read_pools()  # a reset of all environments may bring other tasks
         self.left_out[CUT] += int((begun & self._running & (self._length > 0)).sum())
@@ -197,7 +203,10 @@ class EpisodeCollector(PooledWorldWrapper):
         self._read_pools()
 
     def _read_pools(self) -> None:
-        self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
+        if isinstance(self.world, PooledWorld):
+            self._pools = list(self.world.pools)
+        else:
+            self._pools = []
 
 
 class RunCollector(EpisodeCollector):

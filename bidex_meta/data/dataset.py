@@ -88,7 +88,8 @@ def data_folder() -> Path:
 @checked_arguments
 def dataset_names(folder: Path | None = None) -> list[str]:
     """List the complete data sets in a folder (``data_folder()``), by names such as ``CatchUnderarm/random-v0``."""
-    folder = data_folder() if folder is None else folder
+    if folder is None:
+        folder = data_folder()
     complete = islice(folder.glob("**/data/" + part_files.METADATA) if folder.is_dir() else (), _MOST_LISTED)
     return sorted(path.parent.parent.relative_to(folder).as_posix() for path in complete)
 
@@ -124,7 +125,10 @@ class Dataset:
         self.num_steps: int = content["total_steps"]
         self.name: str = content.get("dataset_id", folder.parent.name)
         self.metadata: Json = content.get("bidex") or {"tasks": [self.name], "kind": "outside"}
-        self._paths = part_files.parts_of(folder) if "bidex" in content else [folder / part_files.MAIN]
+        if "bidex" in content:
+            self._paths = part_files.parts_of(folder)
+        else:
+            self._paths = [folder / part_files.MAIN]
         self._sealed = {folder / part_files.METADATA: sealed}
 
     def check_digests(self) -> list[str]:

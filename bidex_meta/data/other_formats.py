@@ -56,12 +56,16 @@ def _space(content: Json, entry: str) -> Json:
     """Read a space as Minari writes it, JSON within JSON; return an empty dict if there is no space."""
     space = content.get(entry)
     try:
-        space = json.loads(space) if isinstance(space, str) else space
+        if isinstance(space, str):
+            space = json.loads(space)
     except (ValueError, RecursionError):
         return {}
     return space if isinstance(space, dict) else {}
 
 
 def _not_flat(name: str, what: str, found: str) -> BidexError:
-    expected = "a row of numbers" if what in _SPACES else "a number"
+    if what in _SPACES:
+        expected = "a row of numbers"
+    else:
+        expected = "a number"
     return BidexError(f"{name}: expected {expected} a step as {what}, got {found}. Flatten them and store it again.")

@@ -42,7 +42,10 @@ def default_name(subject: str, kind: str) -> str:
     """Return the name, such as ``CatchUnderarm/random-v0``, of a new data set of a suite, a suite file or a class."""
     if ":" in subject:
         return f"{short_name(subject)}/{kind}-v0"
-    parts = [Path(subject).stem] if subject.endswith(".toml") else subject.split("/")
+    if subject.endswith(".toml"):
+        parts = [Path(subject).stem]
+    else:
+        parts = subject.split("/")
     words = [re.sub(r"[^\w-]+", "-", word) for word in parts]
     return f"{'/'.join(words)}/{kind}-v0"
 

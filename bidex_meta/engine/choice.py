@@ -48,7 +48,10 @@ def known_device(device: str | torch.device) -> torch.device:
 def checked_device(device: str | torch.device) -> torch.device:
     """Return the device of a name, ``auto`` resolved; BidexError if this machine has no such device."""
     if isinstance(device, str) and device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        if torch.cuda.is_available():
+            device = "cuda"
+        else:
+            device = "cpu"
     place = known_device(device)
     if place.type == "cpu":
         return place

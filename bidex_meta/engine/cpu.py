@@ -44,10 +44,14 @@ class CpuEngine(Engine):
     ) -> None:
         """Build the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
-        self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
+        if refresh:
+            self._after_step = mujoco.mjtStage.mjSTAGE_VEL
+        else:
+            self._after_step = mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.
         mujoco.set_mju_user_warning(lambda message: None)
-        threads = usable_cores() if threads is None else threads
+        if threads is None:
+            threads = usable_cores()
         self._batch = mujoco.batch.Batch(models[0], self.num, nthread=threads, persistent=True)
         self._forked = False
         if threads > 1:
@@ -116,7 +120,10 @@ class CpuEngine(Engine):
 
     def unstable(self) -> Tensor:
         counts = self._batch.warning[:, :, 1]
-        bad = counts.take(_BAD, axis=1).any(axis=1) if counts.any() else np.zeros(self.num, dtype=bool)
+        if counts.any():
+            bad = counts.take(_BAD, axis=1).any(axis=1)
+        else:
+            bad = np.zeros(self.num, dtype=bool)
         # One non-finite addend makes the sum non-finite.
         return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
@@ -185,7 +192,9 @@ class CpuEngine(Engine):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        return float(max(0.0, -data.contact.dist.min())) if data.ncon else 0.0
+        if data.ncon:
+            return float(max(0.0, -data.contact.dist.min()))
+        return 0.0
 
 
 _WITH_THREADS: "weakref.WeakSet[CpuEngine]" = weakref.WeakSet()

@@ -37,7 +37,10 @@ def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tenso
     Raises BidexError for a state of another model or another number of rows, or with numbers that are not finite.
     """
     if not isinstance(state, Mapping) or set(state) != set(views):
-        got = sorted(map(str, state)) if isinstance(state, Mapping) else type(state).__name__
+        if isinstance(state, Mapping):
+            got = sorted(map(str, state))
+        else:
+            got = type(state).__name__
         raise BidexError(f"Expected an engine's state with {sorted(views)}, got {got}; build the same world first.")
     return {name: _checked_field(name, state[name], view) for name, view in views.items()}
 
@@ -49,16 +52,24 @@ def dense(given: object, device: torch.device, dtype: torch.dtype | None = None)
     """
     try:
         # C order, because torch does not accept arrays with negative strides.
-        tensor = given.detach() if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, order="C"))
+        if isinstance(given, Tensor):
+            tensor = given.detach()
+        else:
+            tensor = torch.as_tensor(np.asarray(given, order="C"))
         usable = tensor.layout == torch.strided and not tensor.is_complex()
-        return tensor.to(device=device, dtype=dtype) if usable else None
+        if usable:
+            return tensor.to(device=device, dtype=dtype)
+        return None
     except (TypeError, ValueError, RuntimeError, OverflowError, NotImplementedError):
         return None
 
 
 def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
     if not isinstance(value, Tensor) or value.shape[:1] != view.shape[:1] or value.numel() != view.numel():
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        if isinstance(value, Tensor):
+            got = tuple(value.shape)
+        else:
+            got = type(value).__name__
         raise BidexError(
             f"Expected {name} of an engine's state of shape {tuple(view.shape)}, got {got}; build the world with the "
             "same suite and num_envs."
@@ -79,6 +90,9 @@ def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
     """Return whether each of some rows (indices, (k,)) has a number out of bounds or not finite, bool (k,)."""
     bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for name, value in fields.items():  # a comparison with NaN is false
-        limit = LARGEST if name in ("qpos", "qvel", "mocap_pos", "mocap_quat") else float(mujoco.mjMAXVAL)
+        if name in ("qpos", "qvel", "mocap_pos", "mocap_quat"):
+            limit = LARGEST
+        else:
+            limit = float(mujoco.mjMAXVAL)
         bad |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit).all(dim=1)
     return bad

@@ -86,7 +86,10 @@ def lean(m: mjw.Model) -> Lean:
     for names, changes, allowed in table:
         for name in names if allowed else ():
             parts[name] = _without(parts[name], **changes)
-    solver = ImplicitSolver(m) if implicit and m.opt.integrator == mjw.IntegratorType.IMPLICIT else None
+    if implicit and m.opt.integrator == mjw.IntegratorType.IMPLICIT:
+        solver = ImplicitSolver(m)
+    else:
+        solver = None
     return Lean(m, parts[early], parts[last], parts[integration] if implicit else None, parts[refresh], solver)
 
 

@@ -66,8 +66,14 @@ class WarpEngine(Engine):
         self._device = wp.get_device(str(self.device))
         # torch makes the stream: CUDA's legacy stream, torch's default, waits for streams that Warp makes.
         priority = -1 if _is_slow(models[0]) else 0
-        self._lent = torch.cuda.Stream(self.device, priority=priority) if self._device.is_cuda else None
-        self._stream = wp.stream_from_torch(self._lent) if self._lent is not None else None
+        if self._device.is_cuda:
+            self._lent = torch.cuda.Stream(self.device, priority=priority)
+        else:
+            self._lent = None
+        if self._lent is not None:
+            self._stream = wp.stream_from_torch(self._lent)
+        else:
+            self._stream = None
         self._graphs: dict[str, Callable[[], None]] = {}
         with self._on_device():
             self._put(capacity)
@@ -117,7 +123,10 @@ class WarpEngine(Engine):
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Step all simulations; simulations outside the mask take the same time but keep their state."""
-        kept = [] if active is None else [value.clone() for value in self._stepped]
+        if active is None:
+            kept = []
+        else:
+            kept = [value.clone() for value in self._stepped]
         self._substeps = substeps
         self._play(f"step {substeps}", self._advance)
         if active is not None:
@@ -190,7 +199,9 @@ class WarpEngine(Engine):
 
     def contact_depth(self, row: int) -> float:
         distances = self.data(row).contact.dist
-        return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
+        if len(distances):
+            return float(max(0.0, -np.min(distances)))
+        return 0.0
 
     def demand(self) -> tuple[int, int]:
         """Return the candidate pairs and the convex collider's contacts in the present state, over all worlds."""
@@ -254,7 +265,9 @@ class WarpEngine(Engine):
 
     def _from_scratch(self) -> AbstractContextManager[Any]:
         """Make Warp allocate from the engine's scratch memory on CUDA, the only device with a choice."""
-        return wp.ScopedAllocator(self._device, self._scratch) if self._device.is_cuda else nullcontext()
+        if self._device.is_cuda:
+            return wp.ScopedAllocator(self._device, self._scratch)
+        return nullcontext()
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:

@@ -66,7 +66,9 @@ def _outcome(recorded: Json, again: Json, wider: float) -> str:
         return EQUAL
     if recorded.get("episodes", again["episodes"]) != again["episodes"]:
         return DIFFERS
-    return WITHIN if all(_is_within(recorded, again, name, wider) for name in _MEASURES) else DIFFERS
+    if all(_is_within(recorded, again, name, wider) for name in _MEASURES):
+        return WITHIN
+    return DIFFERS
 
 
 def _is_within(recorded: Json, again: Json, name: str, wider: float) -> bool:
@@ -85,7 +87,10 @@ def _widest(recorded: Json, again: Json, name: str, own: float) -> float:
     """
     from scipy.stats import f
 
-    count = again["tasks"] if again["tasks"] >= MANY_TASKS else again["episodes"]
+    if again["tasks"] >= MANY_TASKS:
+        count = again["tasks"]
+    else:
+        count = again["episodes"]
     if name == "success":
         return 1.5 * 1.96 * math.sqrt(max(recorded[name] * (1 - recorded[name]), 0.0) / count)
     return own and 2 * own * math.sqrt(f.ppf(0.999, count - 1, count - 1))

@@ -44,7 +44,9 @@ class Group:
     def steps_text(self) -> str:
         """Return the mean number of steps, with its range if seeds differ."""
         low, high = self.steps_range
-        return f"{self.steps:,}" if low == high else f"{self.steps:,} ({low:,} to {high:,})"
+        if low == high:
+            return f"{self.steps:,}"
+        return f"{self.steps:,} ({low:,} to {high:,})"
 
 
 def read_groups(runs: Sequence[Run]) -> list[Group]:
@@ -71,7 +73,10 @@ def run_kind(config: AnyConfig, split: str = "train") -> Json:
 
 def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
     """Data sets by their names; of those called as the run's class the kind alone, or classes were no one group."""
-    own = "" if config.task is None else f"{name_with_object(short_name(config.task), config.object)}/"
+    if config.task is None:
+        own = ""
+    else:
+        own = f"{name_with_object(short_name(config.task), config.object)}/"
     return " + ".join(name.removeprefix(own) for name in names) or None
 
 

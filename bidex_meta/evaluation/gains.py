@@ -69,7 +69,10 @@ def _over_classes(means: list[float], resampled: list[np.ndarray], classes: int)
     """Return the mean over classes; None if a class is missing, as the rest would pass for a mean over all."""
     if len(means) < classes:
         return None
-    together = np.mean(resampled, axis=0) if len(resampled) == classes else None
+    if len(resampled) == classes:
+        together = np.mean(resampled, axis=0)
+    else:
+        together = None
     return estimate_from(float(np.mean(means)), together)
 
 

@@ -151,7 +151,10 @@ def _faults(entry: Entry, path: Path) -> Iterator[str]:
             yield f"{part}: expected the classes {', '.join(names)}, got {', '.join(classes)}"
         for name, row in classes.items():
             where = f"{part}.{name}"
-            wanted = len(entry.own[name].tasks[0]) if tasks is None else tasks[name]
+            if tasks is None:
+                wanted = len(entry.own[name].tasks[0])
+            else:
+                wanted = tasks[name]
             yield from (f"{where}.{fault}" for fault in _faults_of(row, runs, wanted, entry.episodes))
 
 
@@ -191,7 +194,10 @@ def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
     """Return the number of train tasks of each class; None for a suite of one's own or of another version."""
     if name in METAWORLD_SUITES:
         return dict.fromkeys(METAWORLD_SUITES[name], _TASKS_OF_METAWORLD)
-    suite = load_suite(name) if name in suite_names() else None
+    if name in suite_names():
+        suite = load_suite(name)
+    else:
+        suite = None
     if suite is None or suite.version != version:
         return None
     return {

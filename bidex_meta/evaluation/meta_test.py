@@ -107,7 +107,10 @@ def meta_evaluate(
     )  # fmt: skip
     shots = protocol.shots
     seed = protocol.seed
-    worlds = [world] if adapt_world is None else [world, adapt_world]
+    if adapt_world is None:
+        worlds = [world]
+    else:
+        worlds = [world, adapt_world]
     _check(agent, worlds, shots)
     found = {s: list[dict[str, np.ndarray]]() for s in range(shots + 1) if evaluated is None or s in evaluated}
     if not found:
@@ -124,11 +127,15 @@ def meta_evaluate(
                     starts = _seed(seed, "adaptation", number, shot)
                     adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, longest, starts)
                 if shot in found:
-                    starts = seed if number == 0 else _seed(seed, "evaluation", number)
+                    if number == 0:
+                        starts = seed
+                    else:
+                        starts = _seed(seed, "evaluation", number)
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts)
                     found[shot].append(portions.labelled(played, number))
     joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
-    references = references_of(world) if references is None else references
+    if references is None:
+        references = references_of(world)
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
     first = joined[0]
     return MetaEvaluation(

@@ -52,7 +52,8 @@ def evaluate(
     check_precision()
     check_world(world)
     episodes = play_tasks(agent, world, protocol.episodes_per_task, protocol.seed)
-    references = references_of(world) if references is None else references
+    if references is None:
+        references = references_of(world)
     return Evaluation(results_by_class(world.task_names, episodes, references), protocol.episodes_per_task)
 
 
@@ -84,7 +85,10 @@ def check_world(world: TaskWorld) -> None:
         raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
     mode = world.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:
-        name = mode.name if isinstance(mode, AutoresetMode) else mode
+        if isinstance(mode, AutoresetMode):
+            name = mode.name
+        else:
+            name = mode
         raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {name}.")
     if len(set(world.task_names)) != len(world.task_names):
         raise BidexError(f"Results are stored by name, but the world's names are not unique: {world.task_names}.")

@@ -37,7 +37,9 @@ class Reference:
     @property
     def floor(self) -> float:
         """The score's zero: what a policy that has learned nothing gets, by doing anything or nothing."""
-        return self.random if self.zero is None else max(self.random, self.zero)
+        if self.zero is None:
+            return self.random
+        return max(self.random, self.zero)
 
     def scores(self, returns: np.ndarray) -> np.ndarray | None:
         """100 · (R − R_floor) / (R_expert − R_floor) of every return R; None without an expert above the floor."""
@@ -55,7 +57,10 @@ def counted_returns(
     random actions or, where that is unknown, of the worst ``finished`` episode (n,) of this policy and those it is
     compared with; with its own if that is lower, or without either.
     """
-    others = finished if reference is None else np.array([reference.random])
+    if reference is None:
+        others = finished
+    else:
+        others = np.array([reference.random])
     bound = others.min() if len(others) else np.inf
     return np.where(broken, np.minimum(returns, bound), returns)
 
@@ -102,7 +107,9 @@ def references() -> dict[str, Reference]:
 def references_of(world: object) -> dict[str, Reference]:
     """Those of a world's classes by name; none of foreign classes, of version 2, nor where bases are fixed."""
     classes = [slot.task_class for slot in getattr(world, "slots", ())]
-    return references() if classes and all(each.moving_base and each.rules.as_printed for each in classes) else {}
+    if classes and all(each.moving_base and each.rules.as_printed for each in classes):
+        return references()
+    return {}
 
 
 def rescored(classes: Json, config: AnyConfig) -> Json:

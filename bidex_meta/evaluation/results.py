@@ -45,12 +45,16 @@ class ClassResult:
     def score(self) -> float | None:
         """Return the mean normalised score; None if a reference is missing."""
         scores = self.scores
-        return None if scores is None else float(scores.mean())
+        if scores is None:
+            return None
+        return float(scores.mean())
 
     @property
     def scores(self) -> np.ndarray | None:
         """Return the normalised score of each episode, ``(episodes,)``; None if a reference is missing."""
-        return None if self.reference is None else self.reference.scores(self.returns)
+        if self.reference is None:
+            return None
+        return self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
         """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` of few tasks.
@@ -58,7 +62,9 @@ class ClassResult:
         Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """
         names, task = np.unique(self.tasks, return_inverse=True)
-        return values if len(names) < MANY_TASKS else np.bincount(task, values) / np.bincount(task)
+        if len(names) < MANY_TASKS:
+            return values
+        return np.bincount(task, values) / np.bincount(task)
 
     def to_json(self) -> Json:
         """Return the numbers of this class, ready for JSON."""

@@ -145,7 +145,10 @@ def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, T
     for step in range(int(world.max_episode_steps.max())):
         if step % _HOLD == 0:
             rough = 2.0 * torch.rand(action.shape, generator=generator) - 1.0
-        action = rough if explorer is None else explorer.eval_action(obs) + _NOISE * rough
+        if explorer is None:
+            action = rough
+        else:
+            action = explorer.eval_action(obs) + _NOISE * rough
         obs, _, terminated, truncated, info = world.step(action)
         sensors.append(engine.sensordata.cpu().clone())
         rewards.append(info["reward_unscaled"].cpu())

@@ -84,4 +84,6 @@ def _classes(folder: RunFolder) -> Json:
 
 def _table(classes: Json) -> str:
     lines = [f"| {_cell(name)} | {100 * row['success']:.1f} % | {row['return']:.4g} |" for name, row in classes.items()]
-    return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""]) if lines else ""
+    if lines:
+        return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""])
+    return ""

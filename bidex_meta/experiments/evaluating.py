@@ -144,10 +144,16 @@ def evaluate(
     policy = policy_of(folder, state, config.device)
     size = Options(episodes=episodes, num_envs=num_envs, seed=seed)
     count = episodes or worlds.default_episodes
-    beside = ", and the same of a random policy" if random else ""
+    if random:
+        beside = ", and the same of a random policy"
+    else:
+        beside = ""
     say(f"Evaluating: {count} episode{'s' * (count > 1)} of each task{beside}.")
     own = _played(worlds, policy, split, size, random)
-    others = _played(worlds.others, policy, split, size, random) if other_tasks else None
+    if other_tasks:
+        others = _played(worlds.others, policy, split, size, random)
+    else:
+        others = None
     found = RunEvaluation(folder, config.algo, worlds, steps, own, others, conditions(worlds, num_envs))
     if save:
         write_json(folder.evaluation_path, found.to_json())
@@ -213,7 +219,10 @@ def meta_test(
 
 def _closing(conditions: Json, worlds: Worlds) -> Json:
     """Return the last entries of ``evaluation.json``."""
-    randomised = {} if worlds.randomisation is None else {"randomisation": asdict(worlds.randomisation)}
+    if worlds.randomisation is None:
+        randomised = {}
+    else:
+        randomised = {"randomisation": asdict(worlds.randomisation)}
     return {"conditions": conditions, **randomised}
 
 
@@ -226,7 +235,10 @@ def _set_up(folder: RunFolder, device: str, engine: str, randomisation: str | Pa
     stored = folder.config()
     device = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=engine)
-    file = None if randomisation is None else str(randomisation)
+    if randomisation is None:
+        file = None
+    else:
+        file = str(randomisation)
     worlds = Worlds.open({**config.to_json(), "randomisation": file})
     set_up_torch(config.threads)
     return config, worlds
@@ -237,6 +249,9 @@ def _played(worlds: Worlds, policy: Agent, split: str, size: Options, random: bo
     world = worlds.world(split, size.num_envs)
     protocol = worlds.protocol(split, size.episodes, size.seed)
     found = worlds.judge(policy, world, protocol)
-    other = worlds.judge(RandomAgent(world.action_space), world, protocol) if random else None
+    if random:
+        other = worlds.judge(RandomAgent(world.action_space), world, protocol)
+    else:
+        other = None
     world.close()
     return PlayedTasks(worlds, split, protocol.seed, found, other)

@@ -142,7 +142,10 @@ def library() -> Any:
 
 def called(function: str, name: str, **options: Any) -> Any:
     """Calls the library for a repository, ``datasets/`` before the name of a data set; its errors as one line."""
-    kind = "dataset" if name.startswith(DATASETS) else "model"
+    if name.startswith(DATASETS):
+        kind = "dataset"
+    else:
+        kind = "model"
     try:
         return getattr(library(), function)(name.removeprefix(DATASETS), repo_type=kind, **options)
     except BidexError:

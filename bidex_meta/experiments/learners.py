@@ -88,7 +88,10 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 def _from_elsewhere(name: str) -> type[Learner]:
     """The learner ``package.module:Class``, with the defaults of :class:`Learner` and its module's ``PRESETS``."""
     make, module = outside_class(name, "--algo")
-    bases = (make,) if issubclass(make, Learner) else (make, Learner)
+    if issubclass(make, Learner):
+        bases = (make,)
+    else:
+        bases = (make, Learner)
     members = {"__module__": make.__module__, "__doc__": make.__doc__}
     learner: type[Learner] = type(make.__name__, bases, members)
     learner.presets = learner.presets or vars(module).get("PRESETS", {})
@@ -134,7 +137,10 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
     from bidex_meta.engine.choice import known_device
 
     if asked == "auto":
-        asked = "cuda" if on_gpu and torch.cuda.is_available() else "cpu"
+        if on_gpu and torch.cuda.is_available():
+            asked = "cuda"
+        else:
+            asked = "cpu"
     known_device(asked)
     here = launch()
     if here.count > 1 and asked.startswith("cuda:"):

@@ -52,14 +52,20 @@ def meta_test(
     check_worlds(worlds, config.algo)
     found = {}
     for split in splits:
-        source = worlds.others if split == OTHERS else worlds
+        if split == OTHERS:
+            source = worlds.others
+        else:
+            source = worlds
         part = "train" if split == OTHERS else split
         counts = [len(pool) for pool in source.tasks(part).values()]
         limit = options.num_envs or _ENVIRONMENTS
         protocol = _protocol(worlds, config, options, split, counts, limit)
         rollouts = protocol.rollouts or 1
         num_envs = environments_for(len(counts), (protocol.tasks or 1) * protocol.trials, rollouts, limit)
-        often = f", each {protocol.trials} times" if protocol.trials > 1 else ""
+        if protocol.trials > 1:
+            often = f", each {protocol.trials} times"
+        else:
+            often = ""
         kind = "other" if split == OTHERS else split
         say(
             f"Meta-test on {kind} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {protocol.tasks} of "
@@ -104,7 +110,9 @@ def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int)
             counts = [len(pool) for pool in worlds.tasks("train").values()]
             of_class = config.num_envs // len(counts)
             asked = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
-    return min(asked, most) if learner_kind(config.algo).make.independent_adaptation else asked
+    if learner_kind(config.algo).make.independent_adaptation:
+        return min(asked, most)
+    return asked
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:

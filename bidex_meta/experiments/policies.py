@@ -78,7 +78,10 @@ def load_policy(
 
     ``which`` is ``last``, ``best`` or a file. Raises BidexError if there is no such run or checkpoint.
     """
-    folder = run if isinstance(run, RunFolder) else RunFolder.open(run)
+    if isinstance(run, RunFolder):
+        folder = run
+    else:
+        folder = RunFolder.open(run)
     load, step = policy_loader(folder, str(checked_device(device)), which)
     return load(), step
 

@@ -119,7 +119,9 @@ def _check_names(config: AnyConfig) -> None:
 
 def _written(name: str | None) -> str | None:
     """Return a name as a config holds it: the whole path of a file."""
-    return str(absolute(name)) if name is not None and Path(name).suffix in (".toml", ".xml") else name
+    if name is not None and Path(name).suffix in (".toml", ".xml"):
+        return str(absolute(name))
+    return name
 
 
 def _learner_config(preset: Any, config: AnyConfig, where: str) -> Any:

@@ -37,7 +37,10 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     names = {name.partition("/")[0] for name in world.task_names}
     references = {name: known for name, known in source.references().items() if name in names}
     altered = source.object or source.points or source.moving_base is not None
-    env_id = task_id(alone) if alone and not altered else None
+    if alone and not altered:
+        env_id = task_id(alone)
+    else:
+        env_id = None
     return {
         "suite": None if alone else source.name,
         "suite_version": source.suite.version if source.suite else None,
@@ -87,7 +90,9 @@ def implied(datasets: Sequence[Dataset]) -> Json:
 
 def task_seed(datasets: Sequence[Dataset]) -> int | None:
     """The seed of the tasks that the first data set was collected on: a learner is evaluated on those."""
-    return datasets[0].metadata.get("seed") if datasets else None
+    if datasets:
+        return datasets[0].metadata.get("seed")
+    return None
 
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
@@ -119,7 +124,10 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
         _check_goals(dataset, source)
         actions = max(task_class.action_size for task_class in classes.values())
         if dataset.action_size != actions:
-            mend = "Add --base moving" if dataset.action_size > actions else "Record it with the same bases"
+            if dataset.action_size > actions:
+                mend = "Add --base moving"
+            else:
+                mend = "Record it with the same bases"
             raise BidexError(
                 f"{dataset.name} has {dataset.action_size} actions, {source.name} here {actions}: its bases do not "
                 f"move alike. {mend}."

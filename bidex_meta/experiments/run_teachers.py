@@ -118,7 +118,10 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         if name != SCRIPTS and len(rows):
             policy, _ = load_policy(RunFolder.open(Path(name)), device)
             single = Worlds.open(RunFolder.open(Path(name)).config().to_json()).class_name is not None
-            width = classes[learn[0]].observation_size if single else int(world.single_observation_space.shape[0])
+            if single:
+                width = classes[learn[0]].observation_size
+            else:
+                width = int(world.single_observation_space.shape[0])
             tutors.append(Tutor(policy, rows, width))
     if untaught := [task for task in classes if task not in assigned]:
         rest = ", and not learned" * learner_kind(config.algo).make.taught

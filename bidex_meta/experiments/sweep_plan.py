@@ -76,7 +76,10 @@ class PlannedRun:
     @property
     def begin(self) -> list[str]:
         """The words that begin it."""
-        start = [] if self.after is None else [f"--start-from={self.after}"]
+        if self.after is None:
+            start = []
+        else:
+            start = [f"--start-from={self.after}"]
         return ["run", *self.words, *start, f"--seed={self.seed}", "--threads=1", f"--run-dir={self.path}"]
 
 
@@ -136,7 +139,10 @@ def _runs(path: Path, file: _File, arms: Sequence[_Arm], out: Path) -> Iterator[
             on = arm if arm.suites or arm.tasks else file
             subjects = [("suite", suite) for suite in on.suites or ()] + [("task", task) for task in on.tasks or ()]
             for (values, flags), (kind, subject) in itertools.product(_combinations(file, arm), subjects):
-                given = absolute(path.parent / expanded(subject)) if subject.endswith(".toml") else subject
+                if subject.endswith(".toml"):
+                    given = absolute(path.parent / expanded(subject))
+                else:
+                    given = subject
                 called = Path(short_name(subject)).stem
                 label = arm.name + values
                 words = (f"--{kind}={given}", f"--algo={arm.algo}", *(w.replace("{subject}", called) for w in flags))
@@ -181,7 +187,9 @@ def words_of(flag: str, value: object) -> list[str]:
 
 
 def _text(value: object) -> str:
-    return "x".join(map(_text, value)) if isinstance(value, list) else str(value)
+    if isinstance(value, list):
+        return "x".join(map(_text, value))
+    return str(value)
 
 
 def _named(value: object) -> str:

@@ -193,14 +193,20 @@ def _begin(
     set_up_torch(config.threads)
     kind = learner_kind(config.algo, config.task)
     worlds = Worlds.open({**config.to_json(), "device": launch().own_device(config.device)})
-    rows = f"{launch().count} x {config.num_envs}" if launch().count > 1 else f"{config.num_envs}"
+    if launch().count > 1:
+        rows = f"{launch().count} x {config.num_envs}"
+    else:
+        rows = f"{config.num_envs}"
     say(f"{config.algo} on {worlds.name}, {rows} environments on {config.device}, seed {config.seed}")
     say(f"Preset {config.preset}: {preset_reason(config)}.")
     note(f"Building the world of {worlds.name}")
     autoreset = kind.autoreset(config.learner_values)
     world: Any = together(lambda: worlds.world("train", config.num_envs, autoreset))
     if config.record:
-        place = old.path if old else new or new_folder_name(config)
+        if old:
+            place = old.path
+        else:
+            place = new or new_folder_name(config)
         world = together(lambda: run_recording.recorded(config, place, world))
     note("Making the learner")
     learner = together(lambda: _make_learner(config, kind, worlds, world, fresh=loaded is None))
@@ -218,7 +224,10 @@ def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: V
     """Return the learner with its data and teachers; a fresh one with the weights that it shall start from."""
     sources = _sources(config, worlds, world)
     # A learner from elsewhere that takes no sources need not have the argument.
-    more = {} if sources == NO_SOURCES else {"sources": sources}
+    if sources == NO_SOURCES:
+        more = {}
+    else:
+        more = {"sources": sources}
     learner = kind.make(world, config.learner, config.seed, **more)
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
@@ -268,7 +277,10 @@ def _train(
     elif run.is_resumed:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
         say("No checkpoint yet: starting from the beginning.")
-    seconds = math.inf if config.minutes is None else 60.0 * config.minutes
+    if config.minutes is None:
+        seconds = math.inf
+    else:
+        seconds = 60.0 * config.minutes
     iterate = partial(
         runner.train, learner, run.world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
     )
@@ -278,7 +290,10 @@ def _train(
     if run.is_resumed:
         folder.change_config(config)  # more steps, say; not before it is known that the run goes on
     rows = mend(folder.metrics_path, resume_step or 0)
-    last = rows[-1] if rows and rows[-1]["step"] == resume_step else None
+    if rows and rows[-1]["step"] == resume_step:
+        last = rows[-1]
+    else:
+        last = None
     with contextlib.ExitStack() as stack:
         size = runner.checkpoint_bytes(learner, run.world, config.learner, config.steps)
         stack.enter_context(folder.checkpoints.room(size))
@@ -341,10 +356,19 @@ def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
         return
     count = launch().count
     which = ", ".join(map(str, missing))
-    gone = f"process {which} of {count} is gone or stuck" if which else f"one of {count} processes has ended"
+    if which:
+        gone = f"process {which} of {count} is gone or stuck"
+    else:
+        gone = f"one of {count} processes has ended"
     left = "Training had not begun."
     if folder is not None:
-        step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
-        saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
+        if folder.checkpoints_path.is_dir():
+            step = folder.checkpoints.newest_step()
+        else:
+            step = None
+        if step is None:
+            saved = "There is no checkpoint yet"
+        else:
+            saved = f"The last checkpoint is at {step:,} steps"
         left = f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, count)}"
     _LOG.error("%s (%s). %s", gone, loss, left)

@@ -123,7 +123,10 @@ def verify(
     config = _where(device, engine, then, config)
     worlds = Worlds.open(config.to_json())
     set_up_torch(config.threads)
-    environments = then["num_envs"] if num_envs is None else num_envs
+    if num_envs is None:
+        environments = then["num_envs"]
+    else:
+        environments = num_envs
     state, step = _checkpoint(folder, recorded["steps"])
     apart = others(then, conditions(worlds, environments))
     for line in apart:
@@ -169,7 +172,10 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
     """The checkpoint that was evaluated."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
-        found = checkpoint(folder, which, noted=True) if there else None
+        if there:
+            found = checkpoint(folder, which, noted=True)
+        else:
+            found = None
         if found is not None and found[1] == steps:
             return found
     raise BidexError(
@@ -184,7 +190,10 @@ def _again(
     """The recorded evaluation, made again."""
     load = partial(policy_of, folder, state, config.device)
     if learner_kind(config.algo).make.adapts != ("splits" in recorded):
-        kind = "a meta-test" if "splits" in recorded else "no meta-test"
+        if "splits" in recorded:
+            kind = "a meta-test"
+        else:
+            kind = "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
         split = recorded.get("split", "train")

@@ -86,7 +86,10 @@ class Watch:
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        metrics = self._meta_test() if self._kind.make.adapts else _metrics(self._judge())
+        if self._kind.make.adapts:
+            metrics = self._meta_test()
+        else:
+            metrics = _metrics(self._judge())
         ranks = ("Eval/success_rate", "Eval/score", "Eval/mean_return")
         found = {name: metrics[name] for name in ranks if name in metrics}
         if self._best is None or _better(found, self._best):
@@ -166,5 +169,8 @@ def _metrics(found: Evaluation) -> dict[str, float]:
 
 def _better(found: dict[str, float], best: dict[str, float]) -> bool:
     """By success; where that is equal by the score, or the return where there is no score."""
-    second = "Eval/score" if "Eval/score" in found and "Eval/score" in best else "Eval/mean_return"
+    if "Eval/score" in found and "Eval/score" in best:
+        second = "Eval/score"
+    else:
+        second = "Eval/mean_return"
     return [found[name] for name in ("Eval/success_rate", second)] > [best["Eval/success_rate"], best[second]]

@@ -51,7 +51,10 @@ def units_by_agent(line: str) -> dict[str, list[str]]:
     for part in line.split(";"):
         name, equals, units = (each.strip() for each in part.partition("="))
         if not equals or not name or name in found:
-            why = f"{name} twice" if name in found else repr(line)
+            if name in found:
+                why = f"{name} twice"
+            else:
+                why = repr(line)
             raise BidexError(
                 f"agents: expected {', '.join(NAMED)}, the path of a TOML file, or name=unit+unit;name=unit with each "
                 f"agent once, got {why}. Mend it as docs/learners/multiagent.md shows."

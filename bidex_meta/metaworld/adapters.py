@@ -39,9 +39,10 @@ class ForMetaWorld:
     ):
         self._agent = cast(MetaLearningAgent, agent)
         self._device = checked_device(device)
-        self._task_of_row = (
-            None if task_of_row is None else self._tensor(real_numbers("task_of_row", task_of_row, 1).astype(np.int64))
-        )
+        if task_of_row is None:
+            self._task_of_row = None
+        else:
+            self._task_of_row = self._tensor(real_numbers("task_of_row", task_of_row, 1).astype(np.int64))
         self._begins = True
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
@@ -225,12 +226,16 @@ class MetaWorldEnvs(VectorEnv):
     def get_attr(self, name: str) -> tuple[object, ...]:
         """Return an attribute for each environment."""
         value = getattr(self, name)
-        return tuple(value) if name == "task_name" else (value,) * self.num_envs
+        if name == "task_name":
+            return tuple(value)
+        return (value,) * self.num_envs
 
     def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
         """Call a method (or read an attribute) once and return the result for each environment."""
         value = getattr(self, name)
-        return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
+        if callable(value):
+            return (value(*args, **kwargs),) * self.num_envs
+        return self.get_attr(name)
 
     def set_attr(self, name: str, values: object) -> None:
         """Set an attribute."""

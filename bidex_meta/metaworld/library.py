@@ -60,7 +60,10 @@ def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     library = _library()
     seed = seed % 2**32
     whole = suite == "metaworld/MT10"
-    benchmarks = [library.MT10(seed=seed)] if whole else [library.MT1(name, seed=seed) for name in names]
+    if whole:
+        benchmarks = [library.MT10(seed=seed)]
+    else:
+        benchmarks = [library.MT1(name, seed=seed) for name in names]
     tasks = [task for benchmark in benchmarks for task in benchmark.train_tasks]
     return {name: tuple(task for task in tasks if task.env_name == name) for name in names}
 

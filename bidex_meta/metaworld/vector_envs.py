@@ -64,7 +64,10 @@ def make_ml_envs(
     `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or a size that does not divide
     evenly.
     """
-    benchmark = ML1(name, seed) if _is_class(name) else Benchmark(name, seed or 0)
+    if _is_class(name):
+        benchmark = ML1(name, seed)
+    else:
+        benchmark = Benchmark(name, seed or 0)
     return _meta(benchmark, seed, meta_batch_size, total_tasks_per_cls, split, **options)
 
 
@@ -82,7 +85,10 @@ def make_split(
     suite by this class in the id's version, as in Meta-World; with another suite it raises BidexError. Options are
     those of `make_mt_envs` or `make_ml_envs`.
     """
-    benchmark = Benchmark(suite, task_seed) if env_name is None else _of_one_class(suite, env_name, task_seed)
+    if env_name is None:
+        benchmark = Benchmark(suite, task_seed)
+    else:
+        benchmark = _of_one_class(suite, env_name, task_seed)
     if benchmark.suite.kind == "multi-task":
         return _multi_task(benchmark, seed, **options)
     select = {"task_select": "pseudorandom", "terminate_on_success": split == "test"}
@@ -98,7 +104,10 @@ def _of_one_class(suite: str, env_name: str, seed: int) -> Benchmark:
     given = registry.resolve(env_name)
     named = versioned_name(given, rules)
     if suite not in ("ML1", "ML1-v2"):
-        make = "make_ml_envs" if load_suite(suite).kind == "meta" else "make_mt_envs"
+        if load_suite(suite).kind == "meta":
+            make = "make_ml_envs"
+        else:
+            make = "make_mt_envs"
         raise BidexError(f"env_name goes with the ids of ML1, got it with {suite}. For one class: {make}({named!r}).")
     if rules == V1 and given != plain_name(given):
         raise BidexError(
@@ -151,8 +160,14 @@ def _meta(
         raise BidexError(f"{benchmark.name} shows its goals: make_mt_envs({benchmark.name!r}) makes its environments.")
     if split not in benchmark.suite.splits:
         raise BidexError(f"split: expected train or test, got {split!r}.")
-    classes = benchmark.train_classes if split == "train" else benchmark.test_classes
-    size = len(classes) if meta_batch_size is None else meta_batch_size
+    if split == "train":
+        classes = benchmark.train_classes
+    else:
+        classes = benchmark.test_classes
+    if meta_batch_size is None:
+        size = len(classes)
+    else:
+        size = meta_batch_size
     if size < 1 or size % len(classes):
         what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
         raise BidexError(f"meta_batch_size: expected {what}; got {size}.")

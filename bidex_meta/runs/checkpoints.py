@@ -100,8 +100,13 @@ class Checkpoints:
 
     def found_of_best(self) -> dict[str, float] | None:
         """Return the results of the policy in ``best.pt``; None if there is no readable one."""
-        content = _read(self.best, "none is known") if exists(self.best) else None
-        return None if content is None else content.get("found")
+        if exists(self.best):
+            content = _read(self.best, "none is known")
+        else:
+            content = None
+        if content is None:
+            return None
+        return content.get("found")
 
     @checked_arguments
     def load_one(self, path: Path) -> tuple[State, int]:
@@ -118,7 +123,9 @@ class Checkpoints:
     def newest_step(self) -> int | None:
         """Return the environment steps of the newest checkpoint, by the file names; None if there is none yet."""
         files = self._step_files()
-        return int(files[0].stem.removeprefix("step_")) if files else None
+        if files:
+            return int(files[0].stem.removeprefix("step_"))
+        return None
 
     def load(self) -> tuple[State, int] | None:
         """Load the newest readable checkpoint as ``(state, step)``, tensors on the CPU; None if there is none yet.
@@ -142,7 +149,10 @@ class Checkpoints:
 
     def _step_files(self) -> list[Path]:
         """Return the paths ``step_<N>.pt``, newest first."""
-        paths = self.folder.iterdir() if self.folder.is_dir() else ()
+        if self.folder.is_dir():
+            paths = self.folder.iterdir()
+        else:
+            paths = ()
         found = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
         return [path for _, path in sorted(found, reverse=True)]
 
@@ -162,7 +172,10 @@ def _read(path: Path, then: str = "trying an older one") -> State | None:
 
 
 def _reason(error: Exception) -> str:
-    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    if isinstance(error, ValueError):
+        kind = ""
+    else:
+        kind = f"{type(error).__name__}: "
     return kind + one_line(error)[:100].rstrip(".")
 
 
@@ -209,7 +222,9 @@ def _halved(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _halved(part) for name, part in sorted(value.items())}
     is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
-    return value.to(_torch().float16) if is_number else value
+    if is_number:
+        return value.to(_torch().float16)
+    return value
 
 
 def _digest(content: State) -> str:
@@ -240,6 +255,9 @@ def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
             _feed(each, found, depth + 1)
     else:
         # repr gives every bit of a float, except for NaN.
-        content = value if isinstance(value, bytes) else repr(value).encode()
+        if isinstance(value, bytes):
+            content = value
+        else:
+            content = repr(value).encode()
         found.update(f"{type(value).__name__} {len(content)}:".encode())
         found.update(content)

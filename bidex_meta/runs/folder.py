@@ -88,7 +88,10 @@ class RunFolder:
         folder = cls(Path(path))
         if not is_file(folder.config_path):
             near = sorted(map(str, _runs_below(folder.path)))[:3]
-            hint = f" There are runs below it: {', '.join(near)}." if near else ""
+            if near:
+                hint = f" There are runs below it: {', '.join(near)}."
+            else:
+                hint = ""
             if not near and _torn_start(folder.path):
                 hint = f" Its run was killed as it began. Begin again: --run-dir {path}"
             raise BidexError(f"{path} is not a run folder: it has no config.json.{hint}")

@@ -126,4 +126,6 @@ def _row(line: bytes) -> Json | None:
     if not isinstance(row, dict) or type(row.get("step")) is not int or row["step"] < 0:
         return None
     numbers = [value for value in row.values() if value is not None]
-    return row if all(type(value) in (int, float) and math.isfinite(value) for value in numbers) else None
+    if all(type(value) in (int, float) and math.isfinite(value) for value in numbers):
+        return row
+    return None

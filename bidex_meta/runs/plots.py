@@ -119,7 +119,10 @@ def draw_adaptation(evaluation: Json, where: object) -> Figure:
     Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if ``evaluation`` (of evaluation.json or
     of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names the source in messages) holds no meta-test.
     """
-    splits = evaluation.get("splits") if isinstance(evaluation, dict) else None
+    if isinstance(evaluation, dict):
+        splits = evaluation.get("splits")
+    else:
+        splits = None
     if not splits:
         raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {_AGAIN.format(where)}")
     check_evaluation(evaluation, str(where))
@@ -208,7 +211,10 @@ def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style:
         return
     steps = curve.steps / one
     colour = _colour(number)
-    marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
+    if len(steps) == 1 or (style != "-" and len(steps) <= _FEW):
+        marker = "."
+    else:
+        marker = None
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:
         axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)

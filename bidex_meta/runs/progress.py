@@ -52,9 +52,10 @@ class Progress:
         self._last_line = -math.inf
         self._step = start_step
         self._shown: dict[str, float] = {}
-        self._live = (
-            Live(console=self._console, auto_refresh=False, transient=True) if self._console.is_terminal else None
-        )
+        if self._console.is_terminal:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        else:
+            self._live = None
 
     def start(self) -> None:
         """Begin the display; speed counts from here."""
@@ -118,12 +119,20 @@ class Progress:
         """Return the seconds until the steps are done or the time is up, whichever comes first."""
         steps = self._total - step
         rate = self._rate(step)
-        by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
+        if steps <= 0:
+            by_steps = 0.0
+        elif rate > 0:
+            by_steps = steps / rate
+        else:
+            by_steps = math.inf
         return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
 
     def _overall(self, step: int) -> list[str]:
         seconds = self._seconds_left(step)
-        left = _duration(seconds) if seconds < math.inf else "?"
+        if seconds < math.inf:
+            left = _duration(seconds)
+        else:
+            left = "?"
         done = [f"{step:,} / {self._total:,} steps"]
         if self._total_seconds < math.inf:
             spent = self._shown.get("Perf/training_time", 0.0)
@@ -132,7 +141,10 @@ class Progress:
         mean_return = self._shown.get("Train/mean_return")
         success = self._shown.get("Train/success_rate")
         teacher = self._shown.get("Policy/teacher_share", 0.0)
-        plays = [f"teacher plays {_percent(teacher)}"] if teacher else []
+        if teacher:
+            plays = [f"teacher plays {_percent(teacher)}"]
+        else:
+            plays = []
         return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
@@ -175,4 +187,6 @@ def _number(value: float | None) -> str:
 def _duration(seconds: float) -> str:
     minutes, seconds = divmod(round(max(seconds, 0)), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+    if hours:
+        return f"{hours}:{minutes:02d}:{seconds:02d}"
+    return f"{minutes}:{seconds:02d}"

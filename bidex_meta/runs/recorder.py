@@ -39,7 +39,10 @@ class Recorder:
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:
             self._metrics.writer.config(portable(folder.config().to_json()))
-        self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0) if show_progress else None
+        if show_progress:
+            self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
+        else:
+            self._progress = None
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Write metrics by tag after ``step`` environment steps, and update the progress display."""

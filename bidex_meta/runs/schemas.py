@@ -63,7 +63,9 @@ class _Versions(_Made):
 def read_versions(folder: Path) -> Json:
     """Return a run's ``versions.json``, checked; empty if the file is missing."""
     path = folder / "versions.json"
-    return check_versions(read_json(path, "a run's versions"), str(path)) if exists(path) else {}
+    if exists(path):
+        return check_versions(read_json(path, "a run's versions"), str(path))
+    return {}
 
 
 def check_versions(content: Json, where: str) -> Json:

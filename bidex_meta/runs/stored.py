@@ -87,7 +87,9 @@ class StoredRun:
         """Return the steps that the run trained for; only finished runs are collected, so all its steps count."""
         config = self.config()
         steps = self.content["steps"]
-        return steps if config.minutes is not None else min(steps, config.steps)
+        if config.minutes is not None:
+            return steps
+        return min(steps, config.steps)
 
     def versions(self) -> Json:
         """Return packages, machine and git state."""

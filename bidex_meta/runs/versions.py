@@ -43,7 +43,9 @@ def git_state(folder: Path) -> Json | None:
     if not _git(folder, "ls-files", "."):
         return None
     commit = _git(folder, "rev-parse", "HEAD")
-    return {"commit": commit, "dirty": bool(_git(folder, "status", "--porcelain"))} if commit else None
+    if commit:
+        return {"commit": commit, "dirty": bool(_git(folder, "status", "--porcelain"))}
+    return None
 
 
 def _git(folder: Path, *arguments: str) -> str:
@@ -51,4 +53,6 @@ def _git(folder: Path, *arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
+    if done.returncode == 0:
+        return done.stdout.strip()
+    return ""

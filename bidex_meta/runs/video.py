@@ -39,7 +39,9 @@ def write_image(path: Path, frame: np.ndarray) -> None:
 
 def film_suffix() -> str:
     """Return the default suffix of a film: .mp4 if MP4 can be written, else .webp."""
-    return ".mp4" if find_spec("imageio_ffmpeg") else ".webp"
+    if find_spec("imageio_ffmpeg"):
+        return ".mp4"
+    return ".webp"
 
 
 def check_films() -> None:
@@ -54,14 +56,20 @@ def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
 
     out = io.BytesIO()
     pictures = (Image.fromarray(frame) for frame in frames)
-    animation = {} if kind == "PNG" else {"save_all": True, "append_images": pictures, "loop": 0}
+    if kind == "PNG":
+        animation = {}
+    else:
+        animation = {"save_all": True, "append_images": pictures, "loop": 0}
     next(pictures).save(out, kind, **animation, **options)
     return out.getvalue()
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Write frames as a film in the format of the path's suffix, one of ``FILMS``."""
-    write = write_video if path.suffix.lower() == ".mp4" else write_animation
+    if path.suffix.lower() == ".mp4":
+        write = write_video
+    else:
+        write = write_animation
     write(path, frames, fps)
 
 

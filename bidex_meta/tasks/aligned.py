@@ -21,7 +21,9 @@ class Hidden(NamedTuple):
         """Return the components with their ranges, and the tolerance, as text."""
         ends = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
         ranges = ", ".join(f"{name} {ends[name][0]:.3g} … {ends[name][1]:.3g}" for name in self.names)
-        return ranges if self.kind == "sign" else f"{ranges} (within {self.tolerance:.3g})"
+        if self.kind == "sign":
+            return ranges
+        return f"{ranges} (within {self.tolerance:.3g})"
 
 
 class Error(NamedTuple):

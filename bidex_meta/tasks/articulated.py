@@ -100,7 +100,10 @@ class OpenScissors(ReachTask):
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
         """Return the goal of the right handle; in version 1 with the shears at the task's start."""
-        pose = self.observe(state)["goal_pose"] if self.rules.wide else state.frozen["ghost"]
+        if self.rules.wide:
+            pose = self.observe(state)["goal_pose"]
+        else:
+            pose = state.frozen["ghost"]
         return [Ghost(pose, (0.02, 0.02, 0.01))]
 
 
@@ -162,7 +165,10 @@ class OpenPenCap(ReachTask):
         pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
         place(pen, variation[:, :3])
         rotation = xyzw(pen[:, 3:])
-        gap = variation[:, 3:] if self.rules.wide else torch.full_like(variation[:, :1], _OPEN)
+        if self.rules.wide:
+            gap = variation[:, 3:]
+        else:
+            gap = torch.full_like(variation[:, :1], _OPEN)
         cap = pen[:, :3] + rotate(rotation, pad(_BODY_POINT - gap, (2, 0)))
         return {"pen": variation[:, :3], "gap": gap, **frozen_goal(torch.cat((cap, rotation), dim=1))}
 
@@ -178,7 +184,9 @@ class OpenPenCap(ReachTask):
         return [Ghost(posed(cap, pen), (0.018, 0.018, 0.06))]
 
     def hides(self) -> tuple[Hidden, ...]:
-        return (Hidden(("gap",), _GAP),) if self.rules.wide else ()
+        if self.rules.wide:
+            return (Hidden(("gap",), _GAP),)
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         gap = apart(state, *self.points)
@@ -187,7 +195,9 @@ class OpenPenCap(ReachTask):
         ]
 
     def success(self, state: TaskState) -> Tensor:
-        return within(self.errors(state)) if self.rules.wide else apart(state, *self.points) > _OPEN
+        if self.rules.wide:
+            return within(self.errors(state))
+        return apart(state, *self.points) > _OPEN
 
 
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
@@ -255,7 +265,10 @@ class Switch(ReachTask):
             position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
             frozen |= {switch.name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
         turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
-        angles = {"angles": variation[:, 4:]} if self.rules.wide else {}
+        if self.rules.wide:
+            angles = {"angles": variation[:, 4:]}
+        else:
+            angles = {}
         return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1)) | angles
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
@@ -270,7 +283,9 @@ class Switch(ReachTask):
         return {"goal_pose": pad(angles, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
 
     def hides(self) -> tuple[Hidden, ...]:
-        return tuple(Hidden((f"switch{i}_angle",), 0.08) for i in (1, 2)) if self.rules.wide else ()
+        if self.rules.wide:
+            return tuple(Hidden((f"switch{i}_angle",), 0.08) for i in (1, 2))
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         rockers = _rockers(state)
@@ -299,7 +314,9 @@ class Switch(ReachTask):
         return 50.0 * (1.4 - (first + second))
 
     def success(self, state: TaskState) -> Tensor:
-        return within(self.errors(state)) if self.rules.wide else (_rockers(state) > 0.8 * _TRAVEL).all(dim=1)
+        if self.rules.wide:
+            return within(self.errors(state))
+        return (_rockers(state) > 0.8 * _TRAVEL).all(dim=1)
 
 
 def _rockers(state: TaskState) -> Tensor:

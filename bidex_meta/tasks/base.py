@@ -138,7 +138,10 @@ class TaskClass(ABC):
     depth_camera: ClassVar[tuple[Point, Point] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
-        default = self.moves_by_default if moving_base is None else moving_base
+        if moving_base is None:
+            default = self.moves_by_default
+        else:
+            default = moving_base
         self.moving_base = true_or_false("moving_base", default)
 
     def adopt(self, rules: Rules) -> None:

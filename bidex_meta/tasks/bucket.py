@@ -98,7 +98,9 @@ class GraspAndPlace(ReachTask):
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
 
     def hides(self) -> tuple[Hidden, ...]:
-        return (Hidden(("goal_x", "goal_y"), 0.04),) if self.rules.wide else ()
+        if self.rules.wide:
+            return (Hidden(("goal_x", "goal_y"), 0.04),)
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
@@ -114,7 +116,9 @@ class GraspAndPlace(ReachTask):
         block = state["block/position"][:, None]
         turn = state.quaternion("bucket/quaternion")
         inside = inside_bucket(block, state["bucket/position"], turn)[:, 0] & stands(turn)
-        return inside & within(_bucket_error(state)) if self.rules.wide else inside
+        if self.rules.wide:
+            return inside & within(_bucket_error(state))
+        return inside
 
 
 def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
@@ -128,13 +132,17 @@ def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
 def _bucket_error(state: TaskState) -> list[Error]:
     """Return the bucket's distance from its goal, if it has one."""
     goal = state.frozen.get("goal")
-    return [] if goal is None else [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
+    if goal is None:
+        return []
+    return [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
 
 
 def _bucket_ghosts(state: TaskState) -> list[Ghost]:
     """Return the goal of the bucket, if it has one."""
     goal = state.frozen.get("goal")
-    return [] if goal is None else [Ghost(goal, (0.065, 0.065, 0.06))]
+    if goal is None:
+        return []
+    return [Ghost(goal, (0.065, 0.065, 0.06))]
 
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
@@ -252,7 +260,10 @@ class PourWater(ReachTask):
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         frozen = state.frozen
         difference = multiply(state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"])
-        position = frozen["goal"][:, :3] if self.rules.wide else _goal(state)
+        if self.rules.wide:
+            position = frozen["goal"][:, :3]
+        else:
+            position = _goal(state)
         pose = torch.cat((position, frozen["goal_rotation"]), dim=1)
         return {"goal_pose": pose, "goal_rotation_difference": difference}
 
@@ -263,7 +274,9 @@ class PourWater(ReachTask):
         return 2.0 * (0.5 - _spout_off(state))
 
     def hides(self) -> tuple[Hidden, ...]:
-        return (Hidden(("goal_x", "goal_y"), 0.04),) if self.rules.wide else ()
+        if self.rules.wide:
+            return (Hidden(("goal_x", "goal_y"), 0.04),)
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         return [at_least(self._inside(state) / self.water, 1.0 / 3.0, 1.0 / 12.0), *_bucket_error(state)]
@@ -273,7 +286,9 @@ class PourWater(ReachTask):
 
     def success(self, state: TaskState) -> Tensor:
         poured = (3 * self._inside(state) >= self.water) & stands(state.quaternion("bucket/quaternion"))
-        return poured & within(_bucket_error(state)) if self.rules.wide else poured
+        if self.rules.wide:
+            return poured & within(_bucket_error(state))
+        return poured
 
     def _inside(self, state: TaskState) -> Tensor:
         """Return the number of drops in the bucket, (n,)."""

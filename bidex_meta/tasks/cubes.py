@@ -68,7 +68,10 @@ class _TwoBlocks(ReachTask):
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
         """Return the targets, with wide variation in the colours of their blocks."""
-        colours = (_RED, _BLUE) if self.rules.wide else (GREEN, GREEN)
+        if self.rules.wide:
+            colours = (_RED, _BLUE)
+        else:
+            colours = (GREEN, GREEN)
         return [Ghost(_unturned(state.frozen[f"goal{i}"]), _HALF, colours[i - 1]) for i in (1, 2)]
 
 
@@ -127,7 +130,9 @@ class PushBlock(_TwoBlocks):
         return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
 
     def hides(self) -> tuple[Hidden, ...]:
-        return tuple(Hidden((f"goal{i}_x", f"goal{i}_y"), 0.05) for i in (1, 2)) if self.rules.wide else ()
+        if self.rules.wide:
+            return tuple(Hidden((f"goal{i}_x", f"goal{i}_y"), 0.05) for i in (1, 2))
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.05 if self.rules.wide else 0.1)
@@ -212,7 +217,9 @@ class StackBlock(_TwoBlocks):
 
     def hides(self) -> tuple[Hidden, ...]:
         target = Hidden(("target_x", "target_y"), 0.03)
-        return (target, Hidden(("order",), math.inf, "sign")) if self.rules.wide else (target,)
+        if self.rules.wide:
+            return (target, Hidden(("order",), math.inf, "sign"))
+        return (target,)
 
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.03)

@@ -108,7 +108,9 @@ class _Door(ReachTask):
         return {"goal_pose": pad(leaves, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
 
     def hides(self) -> tuple[Hidden, ...]:
-        return tuple(Hidden((f"{side}_angle",), 0.15) for side in SIDES) if self.rules.wide else ()
+        if self.rules.wide:
+            return tuple(Hidden((f"{side}_angle",), 0.15) for side in SIDES)
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         if not self.rules.wide:

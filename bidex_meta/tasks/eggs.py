@@ -179,7 +179,10 @@ class EggTask(TaskClass):
         noise = self.position_noise or JITTER * jittered
         start_hands(draws[:, :JOINT_DRAWS], self.joint_noise or JOINT_NOISE * jittered, qpos)
         for i, side, pose in zip(self.numbers, SIDES, (self.right, self.left), strict=False):
-            joints = qpos[f"{side}/joints"] if self.lies_on_hand else None
+            if self.lies_on_hand:
+                joints = qpos[f"{side}/joints"]
+            else:
+                joints = None
             put_down(qpos[f"object{i}"], self.held, draws[:, JOINT_DRAWS:], noise, joints, pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -211,5 +214,8 @@ class EggTask(TaskClass):
         return torch.stack(ends).any(dim=0)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        size = SEMI_AXES if self.held is None else self.held.half_extents
+        if self.held is None:
+            size = SEMI_AXES
+        else:
+            size = self.held.half_extents
         return [Ghost(state.frozen[f"goal{i}"], size) for i in self.numbers]

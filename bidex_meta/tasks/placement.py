@@ -44,7 +44,10 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
     ``draws`` in [-1, 1], (n, 3), give the episodes' jitter; None for a fixture, which has no jitter.
     """
-    shift = frozen if draws is None else frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
+    if draws is None:
+        shift = frozen
+    else:
+        shift = frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
     pose[:, :2] += shift[:, :2]
     pose[:, 3:] = wxyz(multiply(yaw_quaternion(shift[:, 2]), xyzw(pose[:, 3:])))
 

@@ -68,7 +68,9 @@ class ReachTask(TaskClass):
         place_all((each.name for each in self.objects), qpos, frozen, draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, f"{self.objects[0].name}/quaternion") if "goal" in state.frozen else {}
+        if "goal" in state.frozen:
+            return observe_goal(state, f"{self.objects[0].name}/quaternion")
+        return {}
 
     @abstractmethod
     def target(self, state: TaskState) -> Tensor:
@@ -86,4 +88,6 @@ class ReachTask(TaskClass):
         return [reach(state, side, point) for side, point in zip(("left", "right"), self.points, strict=True)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        return [Ghost(state.frozen["goal"], self.ghost)] if self.ghost else []
+        if self.ghost:
+            return [Ghost(state.frozen["goal"], self.ghost)]
+        return []

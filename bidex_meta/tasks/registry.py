@@ -39,7 +39,9 @@ def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
     """Return a class's name in a suite: ``Switch-v2`` is ``Switch`` in a suite of version 2."""
     plain = plain_name(name)
     written = list(classes)
-    return plain if name not in written and plain in written and classes[plain].rules == V2 else name
+    if name not in written and plain in written and classes[plain].rules == V2:
+        return plain
+    return name
 
 
 def resolve(name: str, kind: str = "task class") -> str:
@@ -55,7 +57,9 @@ def resolve(name: str, kind: str = "task class") -> str:
         _outside(plain)
     else:
         plain = known_name(kind, plain, names())
-    return versioned_name(plain, V2) if has_version else plain
+    if has_version:
+        return versioned_name(plain, V2)
+    return plain
 
 
 def with_object(name: str | None) -> dict[str, str]:

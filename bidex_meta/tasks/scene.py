@@ -135,7 +135,10 @@ class Scene:
             joint = self.model.joint(i)
             if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
                 part = joint.name.removesuffix("/free")
-                name = f"{part}/base" if part in SIDES else part
+                if part in SIDES:
+                    name = f"{part}/base"
+                else:
+                    name = part
                 found[name] = slice(joint.qposadr[0], joint.qposadr[0] + 7)
             elif joint.name.partition("/")[0] not in SIDES:
                 found[joint.name] = slice(joint.qposadr[0], joint.qposadr[0] + 1)

@@ -162,7 +162,9 @@ class BottleCap(OwnObjectClass):
         }
 
     def hides(self) -> tuple[Hidden, ...]:
-        return (Hidden(("cap_slide",), 0.005),) if self.rules.wide else ()
+        if self.rules.wide:
+            return (Hidden(("cap_slide",), 0.005),)
+        return ()
 
     def errors(self, state: TaskState) -> list[Error]:
         slide = state["bottle/slide"][:, 0]
@@ -192,7 +194,9 @@ class BottleCap(OwnObjectClass):
         return 30.0 * apart(state, "bottle/position", "bottle/cap_position")
 
     def success(self, state: TaskState) -> Tensor:
-        return within(self.errors(state)) if self.rules.wide else state["bottle/slide"][:, 0] > 0.03
+        if self.rules.wide:
+            return within(self.errors(state))
+        return state["bottle/slide"][:, 0] > 0.03
 
     def failed(self, state: TaskState) -> Tensor:
         """Return, with wide variation, whether the bottle fell; on the table a fast spin may add energy to it."""

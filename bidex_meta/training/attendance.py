@@ -49,7 +49,9 @@ class Attendance(threading.Thread):
         self._closed.set()
         try:
             self._store.set(f"reported {self._rank}", "")
-            return self._missing() if self._store.add("reports", 1) == 1 else None
+            if self._store.add("reports", 1) == 1:
+                return self._missing()
+            return None
         except RuntimeError:
             return []  # the store is gone too
 

@@ -107,7 +107,9 @@ def _leave() -> None:
 
 def report_loss() -> list[int] | None:
     """Which processes are missing, after a :class:`LostProcess`; None where another process reports it."""
-    return [] if _attendance is None else _attendance.report()
+    if _attendance is None:
+        return []
+    return _attendance.report()
 
 
 def on_loss(function: Callable[[], None]) -> None:

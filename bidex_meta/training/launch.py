@@ -26,7 +26,9 @@ class Launch:
 
     def own_device(self, device: str) -> str:
         """The device of this process: of several on one machine, each takes the GPU of its number."""
-        return f"cuda:{self.local_rank}" if self.count > 1 and device == "cuda" else device
+        if self.count > 1 and device == "cuda":
+            return f"cuda:{self.local_rank}"
+        return device
 
 
 def launch() -> Launch:
@@ -48,7 +50,10 @@ def notices() -> tuple[signal.Signals, ...]:
     SIGHUP comes when the terminal closes (``nohup`` ignores it), the others are ``BATCH_SIGNALS``. Each may come
     several times: from the terminal and its shell, or from the batch system and the job that it runs.
     """
-    numbers = (signal.SIGHUP, *BATCH_SIGNALS) if os.name == "posix" else ()
+    if os.name == "posix":
+        numbers = (signal.SIGHUP, *BATCH_SIGNALS)
+    else:
+        numbers = ()
     return tuple(number for number in numbers if signal.getsignal(number) != signal.SIG_IGN)
 
 
@@ -57,6 +62,9 @@ def resume_command(path: Path, processes: int) -> str:
     if processes == 1:
         return f"bidex-meta run --resume {path}"
     here = launch()
-    nodes = processes // here.local_count if here.count == processes else 1
+    if here.count == processes:
+        nodes = processes // here.local_count
+    else:
+        nodes = 1
     machines = f"--nnodes {nodes} " if nodes > 1 else ""
     return f"torchrun {machines}--nproc-per-node {processes // nodes} -m bidex_meta.cli run --resume {path}"

@@ -104,12 +104,16 @@ class Learner(ABC):
     @classmethod
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
         """Approximate memory; see :meth:`LearnerConfig.bytes_held`."""
-        return config.bytes_held(num_envs, width) if isinstance(config, LearnerConfig) else 0
+        if isinstance(config, LearnerConfig):
+            return config.bytes_held(num_envs, width)
+        return 0
 
     @classmethod
     def bytes_stored(cls, config: Any, num_envs: int, width: int) -> int:
         """Return the most bytes of experience in a checkpoint; see :meth:`LearnerConfig.bytes_stored`."""
-        return config.bytes_stored(num_envs, width) if isinstance(config, LearnerConfig) else 0
+        if isinstance(config, LearnerConfig):
+            return config.bytes_stored(num_envs, width)
+        return 0
 
     @abstractmethod
     def iterate(self) -> dict[str, float]:

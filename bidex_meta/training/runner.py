@@ -70,7 +70,10 @@ def train(
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
         return 0  # it was stopped between its last iteration and the end of its evaluation
     # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
-    saved_at = time.monotonic() if world_size() == 1 else -math.inf
+    if world_size() == 1:
+        saved_at = time.monotonic()
+    else:
+        saved_at = -math.inf
     saved_step = learner.env_steps
     pause = checkpoint_seconds
     began_at = time.monotonic() - spent_seconds
@@ -133,7 +136,9 @@ def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
         return state
     own = {"learner": {name: state["learner"][name] for name in learner.per_process}, "env": state["env"]}
     parts = gather(own)
-    return None if parts is None else {**state, "others": parts[1:]}
+    if parts is None:
+        return None
+    return {**state, "others": parts[1:]}
 
 
 def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps: int) -> int:

@@ -87,8 +87,14 @@ def check_argument(name: str, value: object, hint: object) -> None:
     """Raise BidexError where a value is not of an annotation; ``name`` begins the message."""
     if _fits(value, hint):
         return
-    lacking = _lacking(value, hint) if _is_protocol(hint) else []
-    without = f", which has no {', '.join(lacking[:6])}" if lacking else ""
+    if _is_protocol(hint):
+        lacking = _lacking(value, hint)
+    else:
+        lacking = []
+    if lacking:
+        without = f", which has no {', '.join(lacking[:6])}"
+    else:
+        without = ""
     raise BidexError(f"{name}: expected {_expected(hint)}, got {shortened(value)}{without}.")
 
 
@@ -115,7 +121,9 @@ def _fits(value: object, hint: object) -> bool:
         return isinstance(value, numbers.Real) and not isinstance(value, bool) and value == value
     if _is_protocol(hint):
         return not _lacking(value, hint)
-    return isinstance(value, hint) if isinstance(hint, type) else True
+    if isinstance(hint, type):
+        return isinstance(value, hint)
+    return True
 
 
 def _fits_generic(value: object, origin: Any, parts: tuple[Any, ...]) -> bool:
@@ -142,7 +150,10 @@ def _is_whole(value: object) -> bool:
 
 
 def _within(value: Any, bound: Meta) -> bool:
-    length = len(value) if hasattr(value, "__len__") else math.inf
+    if hasattr(value, "__len__"):
+        length = len(value)
+    else:
+        length = math.inf
     return (
         (bound.ge is None or value >= bound.ge)
         and (bound.gt is None or value > bound.gt)

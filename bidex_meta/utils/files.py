@@ -88,7 +88,10 @@ def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
     try:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode):
-            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
+            if stat.S_ISDIR(found.st_mode):
+                kind = "a folder"
+            else:
+                kind = "a pipe or a device"
             raise BidexError(f"Expected {what} at {path}, got {kind}. Name a file.")
         if most is not None and found.st_size > most:
             raise BidexError(f"Expected {what} of at most {most:,} bytes at {path}, got {found.st_size:,}.")

@@ -25,7 +25,10 @@ def usable_cores() -> int:
 
     A quota of one core and a half counts as two: the last thread then waits for a part of its time.
     """
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if sys.platform == "linux":
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
     return max(1, min([cores, *map(math.ceil, _cpu_quotas())]))
 
 
@@ -87,7 +90,9 @@ def _groups(controller: str) -> Iterator[Path]:
 def _numbers(path: Path) -> list[int]:
     """Read the numbers of a file; none where it is missing, or says ``max``."""
     words = _text(path).split()
-    return [int(word) for word in words] if all(word.lstrip("-").isdigit() for word in words) else []
+    if all(word.lstrip("-").isdigit() for word in words):
+        return [int(word) for word in words]
+    return []
 
 
 def _entries(path: Path) -> dict[str, int]:

@@ -27,7 +27,9 @@ def short_name(name: str) -> str:
 def name_with_object(name: str, thing: str | None) -> str:
     """The name of a task class with another object: ``CatchUnderarm-block``; of a file without ``.xml``."""
     # Names of the shelf are taken in any case, and written in one.
-    return name if thing is None else f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing.lower()}"
+    if thing is None:
+        return name
+    return f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing.lower()}"
 
 
 def name_without_object(name: str) -> str:
@@ -76,7 +78,9 @@ def own_fault(error: BaseException) -> str | None:
     # Wrong arguments are refused by Python before the function has a line of its own.
     asked = [(short_name(name), file, name) for file, name in _files.items()]
     found = [(file, name) for each, file, name in asked if isinstance(error, TypeError) and f"{each}." in str(error)]
-    return f"{found[-1][1]}: {_said(error)} ({found[-1][0]})." if found else None
+    if found:
+        return f"{found[-1][1]}: {_said(error)} ({found[-1][0]})."
+    return None
 
 
 def _said(error: BaseException) -> str:

@@ -69,7 +69,10 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
         try:
             msgspec.convert(value, hint)
         except msgspec.ValidationError as error:
-            shown = f"--{field.replace('_', '-')}" if as_flags else field
+            if as_flags:
+                shown = f"--{field.replace('_', '-')}"
+            else:
+                shown = field
             raise BidexError(f"{name}: {_message(error, value, hint, shown)}") from None
 
 
@@ -105,7 +108,10 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
     except TypeError:
         number = None
     if number is None or number < least or (most is not None and number > most):
-        bounds = f"from {least} on" if most is None else f"from {least} to {most}"
+        if most is None:
+            bounds = f"from {least} on"
+        else:
+            bounds = f"from {least} to {most}"
         raise BidexError(f"{name}: expected a whole number {bounds}, got {shortened(value)}.")
     return number
 
@@ -127,7 +133,10 @@ def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors of an accelerator
         array = np.array(None)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
-        got = f"shape {array.shape}" if array.dtype.kind in "fiu" else shortened(value)
+        if array.dtype.kind in "fiu":
+            got = f"shape {array.shape}"
+        else:
+            got = shortened(value)
         raise BidexError(
             f"{name}: expected an array of numbers of {dimensions} dimension{'s' * (dimensions > 1)}, got {got}."
         )
@@ -161,7 +170,10 @@ def _refuse_unknown(content: object, kind: object, where: str, place: str = "") 
         for name, value in content.items():
             if name not in known:
                 near = nearest(str(name), known)
-                hint = f"did you mean {near!r}?" if near else f"known: {', '.join(known)}."
+                if near:
+                    hint = f"did you mean {near!r}?"
+                else:
+                    hint = f"known: {', '.join(known)}."
                 raise BidexError(f"{where}: {place}{name}: unknown entry, {hint}")
             _refuse_unknown(value, hints[name], where, f"{place}{name}.")
     elif get_origin(kind) in (Union, types.UnionType):
@@ -195,7 +207,10 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
         for ours, theirs in _WORDS.items():
             expected = re.sub(rf"\b{theirs}\b", ours, expected)
         expected = expected.replace(f" <= {_LARGE:.0e}", "")
-    got = "" if value is dataclasses.MISSING else f", got {shortened(value)}"
+    if value is dataclasses.MISSING:
+        got = ""
+    else:
+        got = f", got {shortened(value)}"
     return f"{place or 'content'}: {expected}{got}."
 
 
@@ -232,7 +247,13 @@ def _annotation_at(kind: object, path: str) -> object:
         while parts and name and not (dataclasses.is_dataclass(parts[0]) or is_typeddict(parts[0])):
             parts = [*parts[1:], *(each for each in get_args(parts[0]) if not isinstance(each, Meta))]
         if name:
-            kind = get_type_hints(parts[0], include_extras=True).get(name) if parts else None
+            if parts:
+                kind = get_type_hints(parts[0], include_extras=True).get(name)
+            else:
+                kind = None
         else:
-            kind = get_args(kind)[-1 if get_origin(kind) is dict else 0] if get_args(kind) else None
+            if get_args(kind):
+                kind = get_args(kind)[-1 if get_origin(kind) is dict else 0]
+            else:
+                kind = None
     return kind

@@ -30,7 +30,10 @@ class _Watch:
         """Print a line if the last one is too old."""
         now = self.clock()
         if self.what and now - self.told_at >= self.patience:
-            detail = f", {self.detail}" if self.detail else ""
+            if self.detail:
+                detail = f", {self.detail}"
+            else:
+                detail = ""
             tell(f"{self.what}{detail}: {now - self.since:.0f} s so far.")
 
 

@@ -37,7 +37,10 @@ class Desktop:
                 self._model, self._data, key_callback=self._asked.append, show_left_ui=False, show_right_ui=False
             )
         except Exception as error:  # the window library raises errors of many kinds
-            hint = " On macOS start it by mjpython -m bidex_meta.cli play." if sys.platform == "darwin" else ""
+            if sys.platform == "darwin":
+                hint = " On macOS start it by mjpython -m bidex_meta.cli play."
+            else:
+                hint = ""
             raise BidexError(f"No window can be opened ({error}).{hint} Add --browser.") from error
         target, distance, angle = stage.camera()
         with self._viewer.lock():

@@ -85,7 +85,8 @@ class Scripted:
         self._world = world
         self._noise = noise
         self._generator = torch.Generator().manual_seed(seed)
-        names = world.task_names if names is None else names
+        if names is None:
+            names = world.task_names
         self._classes = [
             _Class(world, part, k, member, int(misled))
             for part in world.parts

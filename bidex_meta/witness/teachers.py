@@ -55,7 +55,10 @@ class Teachers:
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
-        labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
+        if self._scripted is None:
+            labels = obs.new_zeros(self._shape)
+        else:
+            labels = self._scripted.eval_action(obs)
         if self.privileged is not None and self._tutors:
             obs = self.privileged.with_goals(obs)
         for tutor in self._tutors:

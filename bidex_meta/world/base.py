@@ -199,7 +199,10 @@ class BatchedWorld(VectorEnv, ABC):
         """Count new episodes in the environments of a mask, of these tasks; a share of the time limit may be over."""
         self.episodes.number = self.episodes.number + mask
         self.task_index = torch.where(mask, task_index, self.task_index)
-        elapsed = (share * self.max_episode_steps).long() if stagger else torch.zeros_like(self.episodes.elapsed)
+        if stagger:
+            elapsed = (share * self.max_episode_steps).long()
+        else:
+            elapsed = torch.zeros_like(self.episodes.elapsed)
         self.episodes.begin(mask, elapsed)
 
     def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -299,7 +302,9 @@ class BatchedWorld(VectorEnv, ABC):
         """Return an attribute for each environment: its own entry if there is one for each, else the world's value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
-        return tuple(value) if has_entries else (value,) * self.num_envs
+        if has_entries:
+            return tuple(value)
+        return (value,) * self.num_envs
 
     @checked_arguments
     def set_attr(self, name: Text, values: Any) -> None:
@@ -310,7 +315,9 @@ class BatchedWorld(VectorEnv, ABC):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of the world (or read an attribute) and return the result for each environment."""
         value = getattr(self, name)
-        return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
+        if callable(value):
+            return (value(*args, **kwargs),) * self.num_envs
+        return self.get_attr(name)
 
 
 class Spaces(NamedTuple):

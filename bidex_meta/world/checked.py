@@ -112,7 +112,10 @@ def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
     The entry ``made`` of a world's state must be equal. ``inside``: where in a larger state both stand.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
-        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+        if isinstance(given, Mapping):
+            got = sorted(map(str, given))
+        else:
+            got = type(given).__name__
         where = inside or "it"
         raise BidexError(f"Expected the state of a world with {sorted(own)} in {where}, got {shortened(got)}; {_AGAIN}")
     if "made" in own:
@@ -152,7 +155,10 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
     what = f"{name} of a world's state"
     usable = isinstance(given, Tensor) and given.layout == torch.strided and not given.is_meta
     if not isinstance(given, Tensor) or not usable or given.shape != own.shape or given.dtype != own.dtype:
-        got = f"{given.dtype} {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
+        if isinstance(given, Tensor):
+            got = f"{given.dtype} {tuple(given.shape)}"
+        else:
+            got = type(given).__name__
         raise BidexError(f"Expected {what} as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
     if given.requires_grad:
         raise BidexError(f"Expected {what} without gradients; detach it.")
@@ -234,7 +240,10 @@ def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtyp
         got = f"{_shown(tuple(value.shape))} of {str(value.dtype).removeprefix('torch.')}"
     else:
         got = shortened(value)
-    kinds = "" if kind is None else f" of {str(kind).removeprefix('torch.')}"
+    if kind is None:
+        kinds = ""
+    else:
+        kinds = f" of {str(kind).removeprefix('torch.')}"
     raise BidexError(f"{where}: expected a tensor of shape {_shown(expected)}{kinds}, where n counts rows, got {got}.")
 
 

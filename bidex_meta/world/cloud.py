@@ -107,7 +107,10 @@ class Cloud:
         self._faces = [tensor(np.concatenate((normals, -along))[:, part]) for part in self._parts]
         self._axes = tensor(camera.axes)
         self._eye = tensor(np.array(camera.eye))
-        self._kinds = tensor(surfaces.kinds) if kinds else None
+        if kinds:
+            self._kinds = tensor(surfaces.kinds)
+        else:
+            self._kinds = None
         self._slots = torch.arange(count, device=device)
         self._size = len(surfaces.points)
 

@@ -76,7 +76,10 @@ class Episodes:
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
         """Return statistics of the running episodes, as in ``info["running"]``; ``success`` at the end or once."""
-        success = self.solved_at_end if at_end else self.success
+        if at_end:
+            success = self.solved_at_end
+        else:
+            success = self.success
         values = {"r": self.reward, "l": self.length, "success": success, "unscaled": self.unscaled}
         return {name: value.clone() for name, value in values.items()}
 
@@ -130,7 +133,10 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
     check_precision()
     if mode is None:
         return AutoresetMode.SAME_STEP
-    name = mode.name if isinstance(mode, AutoresetMode) else str(mode)
+    if isinstance(mode, AutoresetMode):
+        name = mode.name
+    else:
+        name = str(mode)
     for known, value in _MODES.items():
         if name.upper().replace("-", "").replace("_", "") == known.replace("_", ""):
             return value
@@ -168,7 +174,10 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
         return torch.ones(num_envs, dtype=torch.bool, device=device)
     mask = dense(given, device)
     if mask is None or mask.shape != (num_envs,) or mask.dtype != torch.bool:
-        got = shortened(given) if mask is None else f"{mask.dtype} {tuple(mask.shape)}"
+        if mask is None:
+            got = shortened(given)
+        else:
+            got = f"{mask.dtype} {tuple(mask.shape)}"
         raise BidexError(f"Expected a bool reset_mask of shape ({num_envs},), got {got}. Without it all start.")
     if not ready and not mask.all():
         raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")

@@ -165,7 +165,10 @@ class SideBySide:
     def __init__(self, jobs: int, device: torch.device) -> None:
         """``jobs``: the most at a time."""
         several = device.type == "cuda" and jobs > 1
-        self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
+        if several:
+            self._streams = [torch.cuda.Stream(device) for _ in range(jobs)]
+        else:
+            self._streams = []
 
     def run(self, jobs: Sequence[Callable[[], None]]) -> None:
         """Do the jobs.

@@ -62,7 +62,9 @@ class Group:
 
     def take(self, values: Tensor) -> Tensor:
         """Return this group's part of a tensor over all environments (a view if they are contiguous)."""
-        return values[self.span] if self.span is not None else values[self.env_ids]
+        if self.span is not None:
+            return values[self.span]
+        return values[self.env_ids]
 
 
 def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
@@ -155,6 +157,9 @@ def _build_group(slots: list[tuple[int, Scene, slice]], make_engine: EngineMaker
     env_ids = torch.cat([torch.arange(m.env_ids.start, m.env_ids.stop) for m in members])
     first = int(env_ids[0])
     last = int(env_ids[-1])
-    span = slice(first, last + 1) if last - first + 1 == len(env_ids) else None
+    if last - first + 1 == len(env_ids):
+        span = slice(first, last + 1)
+    else:
+        span = None
     engine = make_engine(models, model_of_row, room_for([scene.task.needs for _, scene, _ in slots]))
     return Group(engine, tuple(members), env_ids.to(engine.device), span)

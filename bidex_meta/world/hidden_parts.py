@@ -54,7 +54,10 @@ class HiddenParts:
         """See ``PrivilegedWorld.rewards_if``."""
         shape = (world.num_envs, world.hidden_size)
         if not isinstance(goals, Tensor) or goals.shape[-2:] != shape:
-            got = tuple(goals.shape) if isinstance(goals, Tensor) else shortened(goals)
+            if isinstance(goals, Tensor):
+                got = tuple(goals.shape)
+            else:
+                got = shortened(goals)
             raise BidexError(f"World.rewards_if: expected goals of shape (..., {shape[0]}, {shape[1]}), got {got}.")
         given = goals.reshape(-1, *shape)
         rewards = torch.zeros(given.shape[:2], device=world.device)

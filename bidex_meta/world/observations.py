@@ -36,7 +36,10 @@ class Observer:
         device = start_mounts.device
         sensors = scene.model.nsensordata
         actions = sensors + scene.task.action_size
-        turns = 3 * len(SIDES) if scene.task.moving_base else 0
+        if scene.task.moving_base:
+            turns = 3 * len(SIDES)
+        else:
+            turns = 0
         # Columns: sensors, actions, rotations. Fresh memory for every step would cost more than what is written to it.
         self._values = torch.empty(len(start_mounts), actions + turns, device=device)
         self._columns = slice(0, sensors), slice(sensors, actions), slice(actions, actions + turns)
@@ -116,7 +119,9 @@ def _indices(scene: Scene, name: str) -> Tensor:
     """Return the indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
-    return xyzw(indices) if name.endswith("quaternion") else indices
+    if name.endswith("quaternion"):
+        return xyzw(indices)
+    return indices
 
 
 def observation_groups(
@@ -131,7 +136,8 @@ def observation_groups(
     ``width``: entries before the task id, at least those of each layout; ``hidden``: entries of each layout that are
     zero, as padding is; ``points``: name and entries of the cloud between the padded observation and the task id.
     """
-    hidden = [()] * len(layouts) if hidden is None else hidden
+    if hidden is None:
+        hidden = [()] * len(layouts)
     by_class = zip(*(_kinds(layout, width, zero) for layout, zero in zip(layouts, hidden, strict=True)), strict=True)
     kinds = [kinds[0] if len(set(kinds)) == 1 else "task" for kinds in by_class]
     if points is not None:

@@ -156,12 +156,16 @@ class Part:
 
         Counting the entries of a mask would make the host wait for an accelerator.
         """
-        return None if self._engine.masked else self.group.take(mask).nonzero().squeeze(1)
+        if self._engine.masked:
+            return None
+        return self.group.take(mask).nonzero().squeeze(1)
 
     def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
         """See ``Observer.mounts``; of engine rows, None: all. Returns None if the bases are fixed."""
         chosen = slice(None) if rows is None else rows
-        return self._observer.mounts(self._engine.sensordata[chosen], chosen) if self._observer.moving else None
+        if self._observer.moving:
+            return self._observer.mounts(self._engine.sensordata[chosen], chosen)
+        return None
 
     def observe(
         self,
@@ -184,7 +188,10 @@ class Part:
         if self._sights is not None:
             position, rotation = self._engine.body_poses()
             for member, where, _ in states:
-                own = member.engine_rows if rows is None else rows[where]
+                if rows is None:
+                    own = member.engine_rows
+                else:
+                    own = rows[where]
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
         return values.clamp_(-CLIP, CLIP)
 
@@ -194,7 +201,10 @@ class Part:
         for member, where, state in states:
             blocks = member.scene.task.observe(state)
             if self.looks:
-                engine_rows = member.engine_rows if rows is None else rows[where]
+                if rows is None:
+                    engine_rows = member.engine_rows
+                else:
+                    engine_rows = rows[where]
                 checked.own_numbers(member.scene.task, "observe", blocks, self.unstable, engine_rows)
             for name, block in blocks.items():
                 values[where, self._observer.layout.range(name)] = block.float()
@@ -223,7 +233,10 @@ class Part:
         numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,).
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
-        each = len(draws) // self._engine.num if rows is None else 1
+        if rows is None:
+            each = len(draws) // self._engine.num
+        else:
+            each = 1
         for i, member, place, _ in self.members(rows):
             where = slice(each * place.start, each * place.stop)
             qpos[where] = self._start[i]
@@ -282,7 +295,10 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
     """Return reward, success and true ends of the step just made."""
     terms = task.rewards(state)
     values = list(terms.values())
-    reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
+    if len(values) > 1:
+        reward = torch.stack(values).sum(dim=0)
+    else:
+        reward = values[0]
     return Judgement(terms, reward, task.solved_in(state), task.failed(state))
 
 
@@ -302,7 +318,10 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
     def look(part: Part, rotation: Tensor | None) -> None:
         group = part.group
         states = list(part.states(group.take(task_index)))
-        out = None if group.span is None else obs[group.span]
+        if group.span is None:
+            out = None
+        else:
+            out = obs[group.span]
         values = part.observe(states, group.take(action), rotation, out=out)
         broke = part.unstable()
         for member, where, state in states:

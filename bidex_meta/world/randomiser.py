@@ -57,13 +57,19 @@ class Randomiser:
     def begin(self, mask: Tensor, number: Tensor) -> None:
         """Draw for the episodes ``number`` (n,) of the environments of a mask (n,), and change their models."""
         masked = self._parts[0].group.engine.masked
-        env_ids = torch.arange(len(mask), device=mask.device) if masked else mask.nonzero().squeeze(1)
+        if masked:
+            env_ids = torch.arange(len(mask), device=mask.device)
+        else:
+            env_ids = mask.nonzero().squeeze(1)
         keys = self._keys[env_ids]
         episode = number[env_ids]
         new = mask[env_ids]
         for i, stream in enumerate(self._streams):
             stream[env_ids] = torch.where(new[:, None], derived(keys, episode, i), stream[env_ids])
-        counter = episode if self._rule.draw == "episode" else torch.zeros_like(episode)
+        if self._rule.draw == "episode":
+            counter = episode
+        else:
+            counter = torch.zeros_like(episode)
         share = uniform(keys, counter, len(FACTORS) + 1)
         for name, drawn in self.drawn.items():
             low, high = getattr(self._rule, name)
@@ -121,7 +127,10 @@ class _Models:
         members = part.group.members
         self._part = part
         rules = [exponents(member.scene, varied, engine.device) for member in members]
-        self._fields = engine.expand(rules[0]) if rules[0] else {}
+        if rules[0]:
+            self._fields = engine.expand(rules[0])
+        else:
+            self._fields = {}
         self._rules = [{name: rule[name] for name in self._fields} for rule in rules]
         self._bases = [{n: f[m.engine_rows.start].clone() for n, f in self._fields.items()} for m in members]
         self._first = [int(object_bodies(member.scene.model).argmax()) for member in members]
@@ -159,7 +168,10 @@ class _Models:
         for member, first, nominal in zip(self._part.group.members, self._first, self._masses, strict=True):
             rows = member.engine_rows
             force = self._part.group.engine.xfrc_applied
-            mass = nominal[:, None] if masses is None else masses[rows, first:]
+            if masses is None:
+                mass = nominal[:, None]
+            else:
+                mass = masses[rows, first:]
             force[rows, first:, :3] = (acceleration[rows, None] * mass).to(force.dtype)
 
 

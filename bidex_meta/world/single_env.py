@@ -230,7 +230,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Return a picture, shape (height, width, 3), uint8; None without a render mode."""
         width, height, camera = self._picture
-        return None if self.render_mode is None else self._world.render(0, width, height, camera)
+        if self.render_mode is None:
+            return None
+        return self._world.render(0, width, height, camera)
 
     def close(self) -> None:
         """Free the world."""

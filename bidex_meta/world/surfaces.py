@@ -60,7 +60,9 @@ def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) ->
     if kind in (_SPHERE, _ELLIPSOID):
         return _ellipsoid(size, count, offset)
     u = even_numbers(count, offset)
-    return _OF_UNIT[kind](size, u) if kind in _OF_UNIT else _mesh(model, geom, u)
+    if kind in _OF_UNIT:
+        return _OF_UNIT[kind](size, u)
+    return _mesh(model, geom, u)
 
 
 def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) -> np.ndarray:

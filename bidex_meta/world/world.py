@@ -113,7 +113,10 @@ class World(BatchedWorld):
         names = [slot.name for slot in slots]
         num_envs = checked.num_envs(_DEFAULT_SIZES[device.type] if config.num_envs is None else config.num_envs, names)
         if device.type == "cpu":
-            points = config.points.count if config.points else 0
+            if config.points:
+                points = config.points.count
+            else:
+                points = 0
             needed = num_envs * (ROW_BYTES + points * POINT_BYTES + 3 * config.pixels**2)
             check_memory(needed, f"{num_envs:,} environments", "Lower num_envs.")
         keep_freed_memory()
@@ -138,8 +141,14 @@ class World(BatchedWorld):
             Part(group, self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
             for group in groups
         ]
-        self._randomiser = None if config.randomisation is None else self._randomised(config.randomisation)
-        remembered = self._randomiser.remembered if self._randomiser else 0
+        if config.randomisation is None:
+            self._randomiser = None
+        else:
+            self._randomiser = self._randomised(config.randomisation)
+        if self._randomiser:
+            remembered = self._randomiser.remembered
+        else:
+            remembered = 0
         self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
         self._side_by_side = SideBySide(len(groups), self.device)
         if self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -165,22 +174,40 @@ class World(BatchedWorld):
     def _describe_observations(self, groups: list[Group]) -> None:
         points = self.points
         widest = max(slot.task_class.observation_size for slot in self.slots)
-        width = widest if self._config.pad_to is None else self._config.pad_to
+        if self._config.pad_to is None:
+            width = widest
+        else:
+            width = self._config.pad_to
         if whole_number("pad_to", width, 0, _MOST_COLUMNS) < widest:
             raise BidexError(f"Expected pad_to of at least {widest}, the widest class, got {width}.")
-        self.num_id_columns = self.num_tasks if self._config.observation == "one-hot" else 0
+        if self._config.observation == "one-hot":
+            self.num_id_columns = self.num_tasks
+        else:
+            self.num_id_columns = 0
         self._one_hot = torch.eye(self.num_tasks, device=self.device)[self.task_id]
         layouts = [slot.task_class.layout for slot in self.slots]
-        self._sights = None if points is None else sights(groups, points, width)
-        hidden = None if self._sights is None else [sight.hidden for sight in self._sights]
-        cloud = None if points is None else (points.group, points.entries)
+        if points is None:
+            self._sights = None
+        else:
+            self._sights = sights(groups, points, width)
+        if self._sights is None:
+            hidden = None
+        else:
+            hidden = [sight.hidden for sight in self._sights]
+        if points is None:
+            cloud = None
+        else:
+            cloud = (points.group, points.entries)
         self.observation_groups = observation_groups(layouts, width, self.num_id_columns, hidden, cloud)
         size = sum(group.size for group in self.observation_groups)
         actions = max(slot.task_class.action_size for slot in self.slots)
         self._set_spaces(Box(-CLIP, CLIP, (size,), np.float32), actions)
 
     def _randomised(self, rule: Randomisation) -> Randomiser:
-        hidden = [sight.hidden for sight in self._sights] if self._sights else [()] * self.num_tasks
+        if self._sights:
+            hidden = [sight.hidden for sight in self._sights]
+        else:
+            hidden = [()] * self.num_tasks
         table = deviations(rule, [slot.task_class.layout for slot in self.slots], hidden).to(self.device)
         return Randomiser(rule, self.parts, self.action_size, table[self.task_id])
 
@@ -188,7 +215,10 @@ class World(BatchedWorld):
         if self._randomiser:
             self._randomiser.seed(self._random_keys(", randomised"))
         draws = max(slot.task_class.draws for slot in self.slots)
-        pool_size = self._pool_size if self._config.task_sampling == "uniform" else None
+        if self._config.task_sampling == "uniform":
+            pool_size = self._pool_size
+        else:
+            pool_size = None
         self._starts = Starts(self.parts, self._keys, draws, pool_size, self._side_by_side.run)
         self._stepper.forget()  # recordings hold the old starts and pools
 
@@ -213,7 +243,10 @@ class World(BatchedWorld):
 
     def _write_action(self, action: Tensor, active: Tensor) -> None:
         frozen = self._frozen_if(active) is not None
-        self._action = torch.where(active[:, None], action, self._action) if frozen else action
+        if frozen:
+            self._action = torch.where(active[:, None], action, self._action)
+        else:
+            self._action = action
         applied = self._action
         if self._randomiser:
             applied, self._past = self._randomiser.act(self._action, self._past, self.episodes.elapsed)
@@ -225,7 +258,9 @@ class World(BatchedWorld):
 
     def _frozen_if(self, active: Tensor) -> Tensor | None:
         """Return the mask for the engines: in SAME_STEP mode no environment is ever frozen."""
-        return None if self.autoreset_mode == AutoresetMode.SAME_STEP else active
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            return None
+        return active
 
     def step_engines(self, active: Tensor | None = None) -> None:
         """Advance the physics by a control step, of all environments or those of a mask (num_envs,)."""
@@ -242,7 +277,10 @@ class World(BatchedWorld):
     def _start(self, mask: Tensor, stagger: bool) -> None:
         self._starts.prepare(self._stepper, mask, self.episodes.number + 1, self.task_index)
         # Only first resets are staggered, too few for a recording.
-        starts = self._take_starts(mask, stagger=True) if stagger else self._stepper.run(self._take_starts, mask)
+        if stagger:
+            starts = self._take_starts(mask, stagger=True)
+        else:
+            starts = self._stepper.run(self._take_starts, mask)
         self._reset_engines(mask, starts)
         self._stepper.run(self._refresh, mask)
 
@@ -268,7 +306,10 @@ class World(BatchedWorld):
     def _refresh(self, mask: Tensor) -> None:
         """Write the first observations of the episodes in the environments of a mask."""
         # Masked engines observe all environments: shapes must not depend on the mask.
-        obs = torch.empty_like(self._obs) if self._masked else self._obs
+        if self._masked:
+            obs = torch.empty_like(self._obs)
+        else:
+            obs = self._obs
         parts = []
         rows_by_part = []
         for part in self.parts:
@@ -279,9 +320,15 @@ class World(BatchedWorld):
 
         def look(part: Part, rows: Tensor | None, rotation: Tensor | None) -> None:
             group = part.group
-            env_ids = group.env_ids if rows is None else group.env_ids[rows]
+            if rows is None:
+                env_ids = group.env_ids
+            else:
+                env_ids = group.env_ids[rows]
             states = list(part.states(group.take(self.task_index), rows))
-            action = group.take(self._action) if rows is None else self._action[env_ids]
+            if rows is None:
+                action = group.take(self._action)
+            else:
+                action = self._action[env_ids]
             seen = part.observe(states, action, rotation, rows)
             obs[env_ids] = self._noisy(seen, self.episodes.elapsed[env_ids], env_ids)
 
@@ -292,7 +339,9 @@ class World(BatchedWorld):
             self._obs = torch.where(mask[:, None], obs, self._obs)
 
     def _noisy(self, obs: Tensor, elapsed: Tensor, env_ids: Tensor | slice = slice(None)) -> Tensor:
-        return self._randomiser.observe(obs, elapsed, env_ids) if self._randomiser else obs
+        if self._randomiser:
+            return self._randomiser.observe(obs, elapsed, env_ids)
+        return obs
 
     def _write_ids(self, obs: Tensor) -> None:
         if self.num_id_columns:
@@ -365,7 +414,9 @@ class World(BatchedWorld):
     @property
     def hidden_size(self) -> int:
         """See ``PrivilegedWorld``."""
-        return self._hidden_parts.size if self.hides_goals else 0
+        if self.hides_goals:
+            return self._hidden_parts.size
+        return 0
 
     @property
     def hidden_columns(self) -> dict[str, list[int]]:
@@ -395,4 +446,6 @@ class World(BatchedWorld):
 
 def _option(value: float | str) -> str:
     """Return an option of a class as text; of an object's file only the name, because a run may move."""
-    return Path(value).stem if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return Path(value).stem
+    return str(value)

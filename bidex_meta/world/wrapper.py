@@ -155,4 +155,6 @@ def _arrays(value: Any) -> Any:
     """Tensors, and those of a dict, as arrays."""
     if isinstance(value, dict):
         return {name: _arrays(each) for name, each in value.items()}
-    return value.cpu().numpy() if isinstance(value, torch.Tensor) else value
+    if isinstance(value, torch.Tensor):
+        return value.cpu().numpy()
+    return value

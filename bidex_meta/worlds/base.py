@@ -79,12 +79,18 @@ class Worlds(ABC):
     def __init__(self, name: str, config: WorldsConfig) -> None:
         self.name = name
         self.config = config
-        self.seed = config.seed if config.task_seed is None else config.task_seed
+        if config.task_seed is None:
+            self.seed = config.seed
+        else:
+            self.seed = config.task_seed
         self.device = config.device
         self.threads = config.threads
         self.engine = config.engine
         self.points = config.points
-        self.randomisation = None if config.randomisation is None else load_randomisation(config.randomisation)
+        if config.randomisation is None:
+            self.randomisation = None
+        else:
+            self.randomisation = load_randomisation(config.randomisation)
 
     @staticmethod
     def open(config: Json | WorldsConfig) -> "Worlds":
@@ -141,7 +147,9 @@ class Worlds(ABC):
         """Environments of a training world, and steps of a run over all of them, of a learner that adapts or not."""
         if not device.startswith("cpu"):
             return _SIZES_AND_STEPS["gpu"]
-        return _ADAPTING_SIZE_AND_STEPS if adapts else _SIZES_AND_STEPS["cpu"]
+        if adapts:
+            return _ADAPTING_SIZE_AND_STEPS
+        return _SIZES_AND_STEPS["cpu"]
 
     @property
     def moving_bases(self) -> bool:
@@ -159,7 +167,9 @@ class Worlds(ABC):
     def references(self) -> dict[str, Reference]:
         """References of the normalised score and of broken episodes; none where bases, tasks or reward are others."""
         as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
-        return references() if self.moving_bases and as_printed else {}
+        if self.moving_bases and as_printed:
+            return references()
+        return {}
 
     def protocol(self, split: str, episodes: int | None = None, seed: int = EVALUATION_SEED) -> Protocol:
         """What an evaluation of a policy plays: ``default_episodes``, or so many, of each task of a split."""

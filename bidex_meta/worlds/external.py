@@ -40,7 +40,10 @@ class Foreign(Worlds):
         if split != "train":
             raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
         if not self.device.startswith("cpu") or self.engine == "warp":
-            wrong = "--engine warp" if self.engine == "warp" else f"--device {self.device}"
+            if self.engine == "warp":
+                wrong = "--engine warp"
+            else:
+                wrong = f"--device {self.device}"
             raise BidexError(f"{self.name} runs on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
         check_memory(rows * self.bytes_per_environment, f"{rows:,} environments", "Lower --num-envs.")
 
@@ -80,7 +83,9 @@ class MetaWorldSuite(Foreign):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
-        return {name: list(map(str, range(_TASKS))) for name in self.class_names} if split == "train" else {}
+        if split == "train":
+            return {name: list(map(str, range(_TASKS))) for name in self.class_names}
+        return {}
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """As in ``Worlds``."""
@@ -117,4 +122,6 @@ class HumanoidTask(Foreign):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
-        return {"Humanoid-v5": ["0"]} if split == "train" else {}
+        if split == "train":
+            return {"Humanoid-v5": ["0"]}
+        return {}

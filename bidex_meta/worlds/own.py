@@ -24,7 +24,10 @@ class OwnSuite(Worlds):
     def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         suite = load_suite(name)
-        self.suite = replace(suite, points=self.points) if self.points else suite
+        if self.points:
+            self.suite = replace(suite, points=self.points)
+        else:
+            self.suite = suite
         if self.suite.rules.success == "at-end":
             self.preset = V2_PRESET
         self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
@@ -99,7 +102,9 @@ class SingleClass(Worlds):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
-        return {self.name: list(map(str, range(_TASKS_ALONE)))} if split == "train" else {}
+        if split == "train":
+            return {self.name: list(map(str, range(_TASKS_ALONE)))}
+        return {}
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Worlds``."""
@@ -108,4 +113,6 @@ class SingleClass(Worlds):
     @property
     def rules(self) -> Rules:
         """As in ``Worlds``: those that the class's name asks for."""
-        return V1 if self.class_name == plain_name(self.class_name) else V2
+        if self.class_name == plain_name(self.class_name):
+            return V1
+        return V2

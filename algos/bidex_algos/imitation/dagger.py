@@ -100,10 +100,15 @@ class DAgger(Learner):
     def _teachers_share(self) -> float:
         """Return the share of the episodes beginning now that the teacher plays."""
         steps = self.config.teacher_steps
-        return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
+        if steps:
+            return max(0.0, 1.0 - self.env_steps / steps)
+        return 0.0
 
     def _learning_rate(self) -> float:
-        done = min(1.0, self.env_steps / self.config.decay_steps) if self.config.decay_steps else 0.0
+        if self.config.decay_steps:
+            done = min(1.0, self.env_steps / self.config.decay_steps)
+        else:
+            done = 0.0
         return self.config.learning_rate * (1.0 - 0.95 * done)
 
     def _begin_all(self, obs: Tensor, share: float) -> None:

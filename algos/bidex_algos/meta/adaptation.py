@@ -83,10 +83,16 @@ class Adapter:
         self.learning_rate = learning_rate
         self.objective = objective
         self.first_order = first_order
-        self._prefix = "mean.head." if adapted == "head" else ""
+        if adapted == "head":
+            self._prefix = "mean.head."
+        else:
+            self._prefix = ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
         moved = self._moved([name for name, _ in actor.named_parameters()])
-        self.step_sizes = None if step_sizes == "fixed" else StepSizes(actor, moved, step_sizes)
+        if step_sizes == "fixed":
+            self.step_sizes = None
+        else:
+            self.step_sizes = StepSizes(actor, moved, step_sizes)
 
     @torch.no_grad()
     def project(self) -> None:
@@ -124,7 +130,10 @@ class Adapter:
         def loss(moved: Params) -> Tensor:
             means, log_stds = self.distribution(params | moved, batch.obs)
             log_prob = gaussian_log_prob(batch.actions, means, log_stds[:, None])
-            followed = torch.exp(log_prob - _old_log_prob(batch)) if self.objective == "ratio" else log_prob
+            if self.objective == "ratio":
+                followed = torch.exp(log_prob - _old_log_prob(batch))
+            else:
+                followed = log_prob
             return -weighted_mean(followed * batch.advantages, batch.weights).sum()
 
         return grad(loss)({name: params[name] for name in own})
@@ -143,7 +152,10 @@ def _old_log_prob(b: TaskBatch) -> Tensor:
 
 def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch]]:
     tasks, transitions = batch.weights.shape
-    size = max(1, _TRANSITIONS_AT_ONCE // transitions) if batch.obs.device.type == "cpu" else tasks
+    if batch.obs.device.type == "cpu":
+        size = max(1, _TRANSITIONS_AT_ONCE // transitions)
+    else:
+        size = tasks
     for k in range(0, tasks, size):
         part = slice(k, k + size)
         yield {name: p[part] for name, p in params.items()}, TaskBatch(*(x[part] for x in batch.tensors()))

@@ -56,7 +56,10 @@ class MetaPolicy(nn.Module):
 
     def assign(self, task_of_row: Tensor | None) -> None:
         """Set the task (N,) of each environment; environments of one task adapt together. None: each adapts alone."""
-        self.rows = None if task_of_row is None else TaskRows(task_of_row)
+        if task_of_row is None:
+            self.rows = None
+        else:
+            self.rows = TaskRows(task_of_row)
         self.init()
 
     def init(self) -> None:
@@ -79,8 +82,14 @@ class MetaPolicy(nn.Module):
         """Store one transition of every environment."""
         terminated = timestep.terminated.bool()
         truncated = timestep.truncated.bool()
-        valid = torch.ones_like(terminated) if timestep.valid is None else timestep.valid
-        elapsed = torch.zeros_like(terminated, dtype=torch.int64) if self.elapsed is None else self.elapsed
+        if timestep.valid is None:
+            valid = torch.ones_like(terminated)
+        else:
+            valid = timestep.valid
+        if self.elapsed is None:
+            elapsed = torch.zeros_like(terminated, dtype=torch.int64)
+        else:
+            elapsed = self.elapsed
         ended = terminated | truncated | ~valid
         self.stage.add(
             obs=self.observations(timestep.observation.float()), actions=timestep.action.float(),
@@ -94,7 +103,10 @@ class MetaPolicy(nn.Module):
         if len(self.stage) == 0:
             return
         rows = self._rows(self.stage.obs[0])
-        params = self.adapter.meta(rows.count) if self.adapted is None else self.adapted
+        if self.adapted is None:
+            params = self.adapter.meta(rows.count)
+        else:
+            params = self.adapted
         params = detached(params)  # this step is not differentiated
         log_std = params["log_std"].clamp(*self.adapter.log_std_range)
         batch = task_batch(self.stage, rows, log_std, self.config)
@@ -171,7 +183,9 @@ class MetaLearner(Learner):
     @classmethod
     def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
         """Return the autoreset mode: whole episodes wait for each other, and slices of episodes go on."""
-        return "DISABLED" if config.slice_steps is None else "SAME_STEP"
+        if config.slice_steps is None:
+            return "DISABLED"
+        return "SAME_STEP"
 
     @abstractmethod
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
@@ -242,7 +256,10 @@ class MetaLearner(Learner):
         if obs is None or self.config.slice_steps is None:
             self.elapsed = torch.zeros_like(self.elapsed)
             first = self.env_steps == 0 and self.steps_with_tasks == 0
-            obs = self._first_observations() if first else self.world.reset()[0]
+            if first:
+                obs = self._first_observations()
+            else:
+                obs = self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned = torch.zeros(len(running), device=self.device)
         # A slice is a success if the suite's rule holds at the end of the slice or an episode, and the goal was met in

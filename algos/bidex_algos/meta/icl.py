@@ -164,7 +164,10 @@ class ICL(TrialLearner):
         Otherwise a memory would memorise the fifty train tasks by the starting positions of their objects.
         """
         privileged = self.teachers.privileged
-        hidden = {} if privileged is None else privileged.hidden_columns
+        if privileged is None:
+            hidden = {}
+        else:
+            hidden = privileged.hidden_columns
         mixed = {}
         for name, pool in self.every_pool.items():
             rest, goals = (torch.randperm(len(pool), generator=self.generator, device=self.device) for _ in range(2))
@@ -176,7 +179,9 @@ class ICL(TrialLearner):
     def teachers_share(self) -> float:
         """Return the share of the episodes beginning now that the teacher plays."""
         steps = self.config.teacher_steps
-        return max(0.0, 1.0 - self.env_steps / steps) if steps else 0.0
+        if steps:
+            return max(0.0, 1.0 - self.env_steps / steps)
+        return 0.0
 
     @torch.no_grad()
     def _take_moments(self, data: TaughtTrials) -> None:

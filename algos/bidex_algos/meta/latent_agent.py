@@ -51,8 +51,14 @@ class LatentAgent:
     def step(self, timestep: Timestep) -> None:
         """Add the evidence of one transition of every valid environment."""
         # Meta-World's evaluation passes neither next observations nor valid environments.
-        following = timestep.observation if timestep.next_observation is None else timestep.next_observation
-        valid = torch.ones_like(timestep.terminated) if timestep.valid is None else timestep.valid
+        if timestep.next_observation is None:
+            following = timestep.observation
+        else:
+            following = timestep.next_observation
+        if timestep.valid is None:
+            valid = torch.ones_like(timestep.terminated)
+        else:
+            valid = timestep.valid
         reward = timestep.reward.masked_fill(~valid, 0.0)
         added = self.policy.evidence(timestep.observation, timestep.action, reward, following)
         self._sums = self._sums + added.masked_fill(~valid[:, None], 0.0)

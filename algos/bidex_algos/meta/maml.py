@@ -52,7 +52,9 @@ class MAML(MetaLearner):
     config: MAMLConfig
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        return super()._optimisers() if self.config.outer == "adam" else {}
+        if self.config.outer == "adam":
+            return super()._optimisers()
+        return {}
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         surrogate, kl = self._objective(batches)

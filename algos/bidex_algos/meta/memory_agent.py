@@ -55,8 +55,14 @@ class MemoryAgent:
         valid = timestep.valid
         ended = timestep.terminated | timestep.truncated
         # Meta-World's evaluation does not pass valid rows: all are valid.
-        known = torch.ones_like(ended) if valid is None else valid
-        moved = torch.ones_like(ended) if valid is None else ~self._over
+        if valid is None:
+            known = torch.ones_like(ended)
+        else:
+            known = valid
+        if valid is None:
+            moved = torch.ones_like(ended)
+        else:
+            moved = ~self._over
         after = Memory(self._next_state, timestep.action, timestep.reward.masked_fill(~known, 0.0), known, ended)
         self._learned = self._learned.replaced(moved, after)
         self._begun = self._begun | moved

@@ -70,7 +70,9 @@ class TrialLearner(Learner):
             # The pool rotates, so all tasks of a class are played equally often.
             turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}
             self.world.set_tasks(turned)
-        return self._first_observations() if self.trials_played == 0 else self.world.reset()[0]
+        if self.trials_played == 0:
+            return self._first_observations()
+        return self.world.reset()[0]
 
     def _count(self, trials: Trials) -> None:
         self.env_steps += int(all_sum(trials.lengths.sum()))

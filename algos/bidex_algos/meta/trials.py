@@ -53,7 +53,10 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 
     One slot is added for the last observation. The number of slots is a multiple of the chunk size.
     """
-    size = steps + 1 if chunk is None or chunk >= steps else chunk
+    if chunk is None or chunk >= steps:
+        size = steps + 1
+    else:
+        size = chunk
     return (steps // size + 1) * size, size
 
 

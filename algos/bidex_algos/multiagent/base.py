@@ -165,7 +165,10 @@ class MultiAgent(OnPolicy):
     ) -> TeamPolicy:
         views = agent_views(shape.groups, shape.actions, config.agents)
         inputs = Inputs(shape.groups)
-        heads = shape.num_id_columns if config.policy_heads else 1
+        if config.policy_heads:
+            heads = shape.num_id_columns
+        else:
+            heads = 1
         share = vars(config).get("share_parameters", False)
         actor = TeamActor(views, config, inputs, init, heads, share)
         return TeamPolicy.made_of(actor, config, inputs, shape, device).to(device)

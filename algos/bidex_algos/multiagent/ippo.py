@@ -61,5 +61,8 @@ class IPPO(MAPPO):
         """Return values (B, agents); with a single agent (B,)."""
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
-        out = of_head(out, task_id) if self.config.value_heads else out.squeeze(1)
+        if self.config.value_heads:
+            out = of_head(out, task_id)
+        else:
+            out = out.squeeze(1)
         return out if self.num_critics > 1 else out.view(-1)

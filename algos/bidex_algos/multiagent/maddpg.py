@@ -102,6 +102,9 @@ class MADDPG(DDPG):
     ) -> DeterministicPolicy:
         views = agent_views(shape.groups, shape.actions, config.agents)
         inputs = Inputs(shape.groups)
-        heads = shape.num_id_columns if config.policy_heads else 1
+        if config.policy_heads:
+            heads = shape.num_id_columns
+        else:
+            heads = 1
         actor = DeterministicTeam(views, config, inputs, init, heads)
         return DeterministicPolicy.made_of(actor, config, inputs, shape, device).to(device)

@@ -94,7 +94,10 @@ class MAPPO(OwnAdams):
         task = self.policy.actor.one_hot(b.obs)
         with autocast(self.device, self.low_precision):
             means = actor.means(b.obs)
-        advantages = b.advantages if b.advantages.dim() == 2 else b.advantages[:, None].expand(-1, len(self.views))
+        if b.advantages.dim() == 2:
+            advantages = b.advantages
+        else:
+            advantages = b.advantages[:, None].expand(-1, len(self.views))
         given = zip(*(actor.parts(x) for x in (b.actions, b.old_means, old_log_std)), strict=True)
         losses = []
         for agent, (actions, old_means, old_std) in enumerate(given):

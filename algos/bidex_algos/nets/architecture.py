@@ -85,7 +85,9 @@ class NetworkConfig(ArchitectureConfig):
 def network_of(config: ArchitectureConfig) -> MakeNetwork:
     """Return the constructor of a config's networks."""
     trunk = _TRUNKS.get(config.architecture)
-    return MLP if trunk is None else partial(trunk, modules=config.modules)
+    if trunk is None:
+        return MLP
+    return partial(trunk, modules=config.modules)
 
 
 def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:

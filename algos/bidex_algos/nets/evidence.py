@@ -186,7 +186,9 @@ class BeliefPolicy(RecurrentPolicy):
         """
         device = self.log_std.device
         new, again = torch.rand(2, rows, 1, generator=generator, device=device)
-        return new if last is None else torch.where(again < 1.0 / self.try_steps, new, last)
+        if last is None:
+            return new
+        return torch.where(again < 1.0 / self.try_steps, new, last)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -21,13 +21,18 @@ class Columns(nn.Module):
         self.size = len(index)
         first = index[0] if index else 0
         # A slice is a view; columns with gaps have to be copied.
-        self.range = slice(first, first + self.size) if index == list(range(first, first + self.size)) else None
+        if index == list(range(first, first + self.size)):
+            self.range = slice(first, first + self.size)
+        else:
+            self.range = None
         self.index: Tensor
         self.register_buffer("index", torch.tensor(index, dtype=torch.int64), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the columns (..., size) of ``x`` (..., d); a view if the columns are adjacent."""
-        return x.index_select(-1, self.index) if self.range is None else x[..., self.range]
+        if self.range is None:
+            return x.index_select(-1, self.index)
+        return x[..., self.range]
 
     def write(self, x: Tensor, values: Tensor) -> None:
         """Write ``values`` (..., size) into the columns of ``x`` (..., d)."""
@@ -58,7 +63,9 @@ class Inputs:
     @classmethod
     def of(cls, inputs: "int | Inputs") -> "Inputs":
         """Return ``inputs``; an integer becomes a single kind of that many columns."""
-        return cls(plain_groups(inputs, 0)) if isinstance(inputs, int) else inputs
+        if isinstance(inputs, int):
+            return cls(plain_groups(inputs, 0))
+        return inputs
 
     @property
     def width(self) -> int:
@@ -79,7 +86,10 @@ class Inputs:
 
     def encoded(self, name: str, make: MakeEncoder, scaled: bool = True) -> "Inputs":
         """Add an encoder for a group; if not ``scaled``, running statistics leave its columns unchanged."""
-        unscaled = self.unscaled if scaled else self.unscaled | {name}
+        if scaled:
+            unscaled = self.unscaled
+        else:
+            unscaled = self.unscaled | {name}
         return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
 
     def without(self, *names: str) -> "Inputs":
@@ -131,10 +141,15 @@ class TaskEmbedding(nn.Module):
 
     def forward(self, one_hot: Tensor) -> Tensor:
         """Return the vectors of the tasks."""
-        vectors = nn.functional.normalize(self.vectors, dim=1) if self.unit else self.vectors
+        if self.unit:
+            vectors = nn.functional.normalize(self.vectors, dim=1)
+        else:
+            vectors = self.vectors
         return one_hot @ vectors
 
 
 def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
     """Encode the task by an embedding of ``size`` entries, of length 1 if ``unit``; 0 leaves ``inputs`` unchanged."""
-    return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit)) if size else inputs
+    if size:
+        return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit))
+    return inputs

@@ -23,19 +23,28 @@ class StackedLinear(nn.Module):
     ):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(count, outputs, inputs))
-        self.bias = nn.Parameter(torch.zeros(count, outputs)) if bias else None
+        if bias:
+            self.bias = nn.Parameter(torch.zeros(count, outputs))
+        else:
+            self.bias = None
         for layer in self.weight.detach():
             nn.init.orthogonal_(layer, gain, generator=generator)
 
     def each(self) -> list[Callable[[Tensor], Tensor]]:
         """Return the layers one by one: (batch, inputs) to (batch, outputs)."""
-        biases = [None] * len(self.weight) if self.bias is None else self.bias.unbind()
+        if self.bias is None:
+            biases = [None] * len(self.weight)
+        else:
+            biases = self.bias.unbind()
         return [partial(affine, weight=w, bias=b) for w, b in zip(self.weight.unbind(), biases, strict=True)]
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (batch, inputs), shared by all layers, or (K, batch, inputs), one per layer, to (K, batch, outputs)."""
         if x.dim() == 2:
-            bias = None if self.bias is None else self.bias.flatten()
+            if self.bias is None:
+                bias = None
+            else:
+                bias = self.bias.flatten()
             out = affine(x, self.weight.flatten(0, 1), bias)
             return out.unflatten(-1, self.weight.shape[:2]).transpose(0, 1)
         return stacked_affine(x, self.weight, self.bias)
@@ -73,7 +82,9 @@ class PlainNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise the last axis."""
-        return nn.functional.layer_norm(x, x.shape[-1:]) if self.enabled else x
+        if self.enabled:
+            return nn.functional.layer_norm(x, x.shape[-1:])
+        return x
 
 
 def gram_schmidt(vectors: Tensor) -> Tensor:

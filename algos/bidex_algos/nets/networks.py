@@ -112,7 +112,10 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
     for name, layer in network.body.named_children():
         if isinstance(layer, nn.LayerNorm):
             raise TypeError("stacked_forward knows no layer norm")
-        x = stacked(f"body.{name}", x) if isinstance(layer, nn.Linear) else layer(x)
+        if isinstance(layer, nn.Linear):
+            x = stacked(f"body.{name}", x)
+        else:
+            x = layer(x)
     with torch.autocast(x.device.type, enabled=False):
         return stacked("head", x.to(params[f"{prefix}head.weight"].dtype))
 

@@ -32,7 +32,10 @@ class PointNet(nn.Module):
         self.channels = channels
         self.size = widths[-1] + 3
         points = entries // channels
-        self.step = 1 if read == 0 else max(1, points // read)
+        if read == 0:
+            self.step = 1
+        else:
+            self.step = max(1, points // read)
         layers: list[nn.Module] = []
         for before, after in zip((channels, *widths[:-1]), widths, strict=True):
             layer = Linear(before, after)

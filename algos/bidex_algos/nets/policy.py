@@ -115,7 +115,10 @@ def gaussian_policy(
     make: type[GaussianActor] = GaussianActor
 ) -> GaussianPolicy:  # fmt: skip
     """Make a policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
-    heads = shape.num_id_columns if config.policy_heads else 1
+    if config.policy_heads:
+        heads = shape.num_id_columns
+    else:
+        heads = 1
     network = network_of(config)
     actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
     return GaussianPolicy.made_of(actor, config, inputs, shape, device)
@@ -125,7 +128,10 @@ def deterministic_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device
 ) -> DeterministicPolicy:
     """Make a deterministic policy as in :func:`gaussian_policy`."""
-    heads = shape.num_id_columns if config.policy_heads else 1
+    if config.policy_heads:
+        heads = shape.num_id_columns
+    else:
+        heads = 1
     network = network_of(config)
     actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
     return DeterministicPolicy.made_of(actor, config, inputs, shape, device)
@@ -208,7 +214,10 @@ def squashed_policy(
     network: MakeNetwork | None = None
 ) -> SquashedPolicy:  # fmt: skip
     """Make a squashed policy as in :func:`gaussian_policy`."""
-    heads = shape.num_id_columns if config.policy_heads else 1
+    if config.policy_heads:
+        heads = shape.num_id_columns
+    else:
+        heads = 1
     network = network or network_of(config)
     sizes = config.hidden, shape.actions, heads
     actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)

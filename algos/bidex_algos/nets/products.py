@@ -23,7 +23,10 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
             x, weight = _in_eights(x, weight)
         return nn.functional.linear(x, weight, bias)
     rows = x.reshape(-1, x.shape[-1])
-    out = cast(Tensor, _Affine.apply(rows, weight, bias)) if torch.is_grad_enabled() else _onednn(rows, weight, bias)
+    if torch.is_grad_enabled():
+        out = cast(Tensor, _Affine.apply(rows, weight, bias))
+    else:
+        out = _onednn(rows, weight, bias)
     return out.view(*x.shape[:-1], -1)
 
 
@@ -34,13 +37,18 @@ def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     the multiplications.
     """
     missing = -x.shape[-1] % 8
-    return (nn.functional.pad(x, (0, missing)), nn.functional.pad(weight, (0, missing))) if missing else (x, weight)
+    if missing:
+        return (nn.functional.pad(x, (0, missing)), nn.functional.pad(weight, (0, missing)))
+    return (x, weight)
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Apply layers of one form to a batch each: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
     if _pays(x[0], weight[0]):
-        biases = [None] * len(x) if bias is None else bias.unbind()
+        if bias is None:
+            biases = [None] * len(x)
+        else:
+            biases = bias.unbind()
         return torch.stack([affine(*each) for each in zip(x.unbind(), weight.unbind(), biases, strict=True)])
     if bias is None:
         return torch.bmm(x, weight.transpose(1, 2))
@@ -51,10 +59,15 @@ def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]
     """Apply to each row (B, inputs) the one of ``layers`` at ``index``, int64 (B,): (B, outputs); needs a host sync."""
     sizes = torch.bincount(index, minlength=len(layers)).tolist()
     in_order = bool((index[1:] >= index[:-1]).all())  # batches drawn task by task need no reordering
-    order = slice(None) if in_order else index.argsort(stable=True)
+    if in_order:
+        order = slice(None)
+    else:
+        order = index.argsort(stable=True)
     parts = x[order].split(sizes)
     out = torch.cat([layer(part) for layer, part in zip(layers, parts, strict=True) if len(part)])
-    return out if isinstance(order, slice) else out[order.argsort()]
+    if isinstance(order, slice):
+        return out
+    return out[order.argsort()]
 
 
 def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int) -> Tensor:
@@ -106,7 +119,9 @@ def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 def _dense(x: Tensor) -> Tensor:
     """Make the tensor contiguous by rows or by columns; oneDNN multiplies other layouts by its slowest code."""
-    return x if x.is_contiguous() or x.t().is_contiguous() else x.contiguous()
+    if x.is_contiguous() or x.t().is_contiguous():
+        return x
+    return x.contiguous()
 
 
 def _pays(x: Tensor, weight: Tensor) -> bool:

@@ -27,7 +27,10 @@ class Shape:
         actions = world.single_action_space
         hidden = int(getattr(world, "hidden_size", 0))
         groups = tuple(world.observation_groups)
-        classes = 1 if any(group.name == "task_id" for group in groups) else world.num_tasks
+        if any(group.name == "task_id" for group in groups):
+            classes = 1
+        else:
+            classes = world.num_tasks
         return cls(int(observations.shape[0]), int(actions.shape[0]), groups, hidden, classes)
 
     @property
@@ -41,8 +44,14 @@ class Shape:
 
     def state_dict(self) -> State:
         """Return plain values for a checkpoint."""
-        hidden = {"hidden": self.hidden} if self.hidden else {}
-        classes = {"classes": self.classes} if self.classes > 1 else {}
+        if self.hidden:
+            hidden = {"hidden": self.hidden}
+        else:
+            hidden = {}
+        if self.classes > 1:
+            classes = {"classes": self.classes}
+        else:
+            classes = {}
         groups = {group.name: [[where.start, where.stop] for where in group.where] for group in self.groups}
         return self.sizes() | hidden | classes | {"groups": groups}
 

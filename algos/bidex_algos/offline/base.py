@@ -168,7 +168,10 @@ class Offline(Learner):
         """Update all networks once with a batch, task after task; return scalars to be logged, as means."""
 
     def _make_critics(self) -> Critics:
-        heads = self.world.num_tasks if self.config.value_heads else 1
+        if self.config.value_heads:
+            heads = self.world.num_tasks
+        else:
+            heads = 1
         judged = self.inputs.extended("action", self.shape.actions)
         return self._critics(judged, heads, self.num_critics)
 
@@ -222,7 +225,10 @@ class Offline(Learner):
         return torch.randn(like.shape, generator=self.noise, device=self.device)
 
     def _parts(self) -> Parts:
-        critics = {"critic": self.critic, "target_critic": self.target_critic} if self.num_critics else {}
+        if self.num_critics:
+            critics = {"critic": self.critic, "target_critic": self.target_critic}
+        else:
+            critics = {}
         rest = {"generator": self.generator, "noise": self.noise, "reward_scale": self.reward_scale}
         return {**critics, **self._own_parts(), "adams": self.adams, **rest}
 

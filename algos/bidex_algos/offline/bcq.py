@@ -104,7 +104,10 @@ class BCQPolicy(nn.Module):
             network_of(config)
         )  # fmt: skip
         # A policy knows its task only by the one-hot; without a one-hot, one value serves all tasks.
-        judges = heads if config.value_heads and heads else 1
+        if config.value_heads and heads:
+            judges = heads
+        else:
+            judges = 1
         self.critic = Critics(judged, judges, config, config.critic_layer_norm, generator)
         self.model = ActionModel(inputs, config, shape.actions, generator)
         self.task = inputs.columns(*["task_id"] * (self.critic.heads > 1))
@@ -131,7 +134,10 @@ class BCQPolicy(nn.Module):
         many = self.observations(obs).repeat_interleave(count, 0)
         with autocast(obs.device, self.low_precision):
             actions = self.propose(self.actor, many, self.codes.repeat(rows, 1))
-            task = self.task(many).argmax(1) if self.critic.heads > 1 else many.new_zeros(len(many), dtype=torch.int64)
+            if self.critic.heads > 1:
+                task = self.task(many).argmax(1)
+            else:
+                task = many.new_zeros(len(many), dtype=torch.int64)
             values = self.critic(many, actions, task)[0]
         best = values.view(rows, count).argmax(1)
         return actions.view(rows, count, -1)[torch.arange(rows, device=obs.device), best]

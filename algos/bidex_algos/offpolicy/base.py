@@ -142,8 +142,12 @@ class OffPolicy(Learner):
         return Critics(inputs, heads, self.config, layer_norm, self.initial, self.num_critics)
 
     def _adam(self, parameters: Iterable[nn.Parameter], rate: float, decay: float | None = None) -> torch.optim.Adam:
-        decay = self.config.weight_decay if decay is None else decay
-        kind = torch.optim.AdamW if decay else torch.optim.Adam
+        if decay is None:
+            decay = self.config.weight_decay
+        if decay:
+            kind = torch.optim.AdamW
+        else:
+            kind = torch.optim.Adam
         return kind(parameters, lr=rate, eps=self.config.adam_eps, weight_decay=decay, fused=True)
 
     @abstractmethod
@@ -202,7 +206,9 @@ class OffPolicy(Learner):
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()
-        return scale if self.config.per_task_rewards else torch.ones_like(scale)
+        if self.config.per_task_rewards:
+            return scale
+        return torch.ones_like(scale)
 
     def _learn(self) -> list[dict[str, Tensor]]:
         updates = self.config.updates_per_step

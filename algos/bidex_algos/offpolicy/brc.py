@@ -122,4 +122,6 @@ class BRC(Categorical, MTSAC):
         return (self.returns.bound / room).clamp_min(1e-8)
 
     def _gap_that_counts(self, gap: Tensor) -> Tensor:
-        return gap.mean().expand_as(gap) if self.config.one_temperature else gap
+        if self.config.one_temperature:
+            return gap.mean().expand_as(gap)
+        return gap

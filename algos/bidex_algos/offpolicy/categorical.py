@@ -185,7 +185,9 @@ class Categorical(OffPolicy):
             return critic.log_probs(obs, actions, tasks)
 
     def _pooled(self, values: Tensor) -> Tensor:
-        return values.amin(0) if self.config.clipped_double_q else values.mean(0)
+        if self.config.clipped_double_q:
+            return values.amin(0)
+        return values.mean(0)
 
     def _following(self, next_obs: Tensor, next_actions: Tensor) -> Tensor:
         probs = self._log_probs(self.target_critic, next_obs, next_actions).exp()
@@ -205,11 +207,9 @@ class Categorical(OffPolicy):
 
     def _reward_scale(self) -> Tensor:
         scale = super()._reward_scale()
-        return (
-            torch.maximum(scale, self.returns.bound / self.config.value_bound)
-            if self.config.per_task_rewards
-            else scale
-        )
+        if self.config.per_task_rewards:
+            return torch.maximum(scale, self.returns.bound / self.config.value_bound)
+        return scale
 
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         log_probs = self._log_probs(self.critic, obs, actions)[:, : len(target)]

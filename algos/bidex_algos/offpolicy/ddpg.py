@@ -99,7 +99,10 @@ class DDPG(OffPolicy):
         return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        actor = self.target_actor if self.delayed_targets else self.policy.actor
+        if self.delayed_targets:
+            actor = self.target_actor
+        else:
+            actor = self.policy.actor
         with autocast(self.device, self.low_precision):
             return actor(next_obs)
 
@@ -118,7 +121,10 @@ class DDPG(OffPolicy):
         return {"Loss/actor": self.actor_loss}
 
     def _own_parts(self) -> Parts:
-        follows = {"target_actor": self.target_actor} if self.delayed_targets else {}
+        if self.delayed_targets:
+            follows = {"target_actor": self.target_actor}
+        else:
+            follows = {}
         return {**follows, "actor_loss": self.actor_loss}
 
 
@@ -130,6 +136,9 @@ def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
     numbers = torch.empty(len(task_id), device=task_id.device)
     for task in range(num_tasks):
         rows = (task_id == task).nonzero().squeeze(1)
-        share = torch.linspace(0.0, 1.0, len(rows)) if len(rows) > 1 else torch.ones(len(rows))
+        if len(rows) > 1:
+            share = torch.linspace(0.0, 1.0, len(rows))
+        else:
+            share = torch.ones(len(rows))
         numbers[rows] = (low + (high - low) * share).to(task_id.device)
     return numbers

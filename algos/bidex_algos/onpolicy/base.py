@@ -149,7 +149,9 @@ class OnPolicy(Learner):
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
-        return of_head(out, task_id) if self.config.value_heads else out.squeeze(1)
+        if self.config.value_heads:
+            return of_head(out, task_id)
+        return out.squeeze(1)
 
     def _element(self, task_id: Tensor) -> Tensor:
         if self.num_critics == 1:
@@ -157,10 +159,14 @@ class OnPolicy(Learner):
         return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
 
     def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
-        return self.return_stats.restore(values, self._element(task_id)) if self.config.per_task_values else values
+        if self.config.per_task_values:
+            return self.return_stats.restore(values, self._element(task_id))
+        return values
 
     def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
-        return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
+        if self.config.per_task_values:
+            return self.return_stats.normalise(returns, self._element(task_id))
+        return returns
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         self.return_stats.merge(mean, var, count)
@@ -182,7 +188,9 @@ class OnPolicy(Learner):
 
         # Several critics make several columns per row, each treated as a separate row.
         def each(x: Tensor) -> Tensor:
-            return x if self.num_critics == 1 else x.repeat_interleave(self.num_critics, 1)
+            if self.num_critics == 1:
+                return x
+            return x.repeat_interleave(self.num_critics, 1)
 
         judged = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id)
         values = judged.view(steps, -1)
@@ -191,12 +199,18 @@ class OnPolicy(Learner):
         element = self._element(task_id).reshape(-1)
         elements = self.num_critics * num_tasks
         next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
-        gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
+        if isinstance(self.gamma, Tensor):
+            gamma = each(self.gamma[None])
+        else:
+            gamma = self.gamma
         advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
         explained = estimates.explained_variance(values, returns, element, elements, valid)
         self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
-        group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
+        if cfg.per_task_advantages:
+            group = element
+        else:
+            group = element // num_tasks * num_tasks
         advantages = estimates.normalise_per_task(advantages, group, elements, valid)
         actions = r.actions.flatten(0, 1)
         old_means = r.means.flatten(0, 1)

@@ -191,7 +191,10 @@ class MTPPO(OnPolicy):
         }
         self.balance = balances[config.gradient_surgery]()
         alone = self.device.type == "cuda" and self.balance is None and world_size() == 1
-        self._graphs = GraphCache(dict, lambda _: None, cuda_graph) if alone else None
+        if alone:
+            self._graphs = GraphCache(dict, lambda _: None, cuda_graph)
+        else:
+            self._graphs = None
         if sources.demonstrations is not None:
             self._graphs = None  # the weight of demonstrations is no tensor
             self.demonstrations = Demonstrations(sources.demonstrations, config, seed, self.device)
@@ -237,7 +240,9 @@ class MTPPO(OnPolicy):
         return super()._sample(obs)
 
     def _imitated(self) -> float:
-        return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
+        if self.demonstrations is None:
+            return 0.0
+        return self.demonstrations.weight(self.env_steps)
 
     def _critic_alone(self) -> bool:
         return self.env_steps < self.config.critic_first
@@ -287,8 +292,14 @@ class MTPPO(OnPolicy):
         tasks = lessons.data.tasks
         needs = self._needs()
         most = needs[tasks].max()
-        updates = 0 if self._critic_alone() else round(self.config.teacher_updates * float(most))
-        losses = lessons.learn(updates, self.generator, needs[tasks] / most) if updates else {}
+        if self._critic_alone():
+            updates = 0
+        else:
+            updates = round(self.config.teacher_updates * float(most))
+        if updates:
+            losses = lessons.learn(updates, self.generator, needs[tasks] / most)
+        else:
+            losses = {}
         weights = {f"Policy/teacher_weight/{self.world.task_names[task]}": needs[task] for task in tasks.tolist()}
         return losses | weights
 
@@ -340,7 +351,10 @@ class MTPPO(OnPolicy):
     def _parts(self) -> Parts:
         own = self.demonstrations
         lessons = self.lessons
-        parts = {} if lessons is None else {"teacher_adam": lessons.adam, "label_stats": lessons.label_stats}
+        if lessons is None:
+            parts = {}
+        else:
+            parts = {"teacher_adam": lessons.adam, "label_stats": lessons.label_stats}
         return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
 
     def _place(self) -> State:
@@ -349,7 +363,10 @@ class MTPPO(OnPolicy):
 
     def state_dict(self) -> State:
         """Return the state as in the base class; the labels copy themselves, because two copies at once may not fit."""
-        data = None if self.lessons is None else self.lessons.data
+        if self.lessons is None:
+            data = None
+        else:
+            data = self.lessons.data
         return super().state_dict() | ({} if data is None else {"data": data.state_dict()})
 
     def load_state_dict(self, state: State) -> None:

@@ -116,7 +116,10 @@ class AdaptiveAdam:
         self, parameters: Iterable[nn.Parameter], config: PPOConfig, device: torch.device, eps: float = 1e-8,
         share: float = 1.0
     ):  # fmt: skip
-        self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
+        if config.adaptive_learning_rate:
+            self.desired_kl = share * config.desired_kl
+        else:
+            self.desired_kl = None
         self.bounds = config.learning_rate_range
         self.weights = list(parameters)
         self.rate = torch.tensor(config.learning_rate, device=device)
@@ -150,7 +153,10 @@ class AdaptiveAdams(AdaptiveAdam):
     ):
         super().__init__(actor, config, device)
         fixed = config.critic_learning_rate
-        self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
+        if fixed is None:
+            self.critic_rate = self.rate
+        else:
+            self.critic_rate = torch.tensor(fixed, device=device)
         self.critic_weights = list(critic)
         self.critic = _Adam(self.critic_weights, self.critic_rate)
 

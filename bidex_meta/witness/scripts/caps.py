@@ -38,7 +38,10 @@ def pull_cap(hands: HandController) -> Actions:
     still = 0
     while hands.steps_left:
         left = slide - float(hands.where("bottle/slide"))
-        still = still + 1 if abs(left) < 0.0015 or still > 3 else 0
+        if abs(left) < 0.0015 or still > 3:
+            still = still + 1
+        else:
+            still = 0
         if still > 3:
             yield from hands.lead(stay, point(hands.at("left") - 0.01 * ahead), speed=0.2)
             continue

@@ -41,5 +41,8 @@ def stack_in_order(hands: HandController) -> Actions:
 def _between(hands: HandController, block: str, other: str) -> Between:
     """The hands and a block; there is little room where the other one is near."""
     x, y, _ = (hands.where(f"{other}/position") - hands.where(f"{block}/position")).tolist()
-    room = max(0.08, min(_TAKE.apart, abs(y) - 0.025)) if abs(x) < 0.075 else _TAKE.apart
+    if abs(x) < 0.075:
+        room = max(0.08, min(_TAKE.apart, abs(y) - 0.025))
+    else:
+        room = _TAKE.apart
     return Between(hands, block, _TAKE, (room, _TAKE.apart) if y > 0.0 else (_TAKE.apart, room))

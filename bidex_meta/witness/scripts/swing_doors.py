@@ -123,7 +123,9 @@ def push(hands: HandController) -> Actions:
 
 def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
     """Angles of a task for the right and the left leaf, rad, ``less`` so much; ``usual`` where it has none."""
-    return (hands.frozen("leaves") - less).tolist() if hands.wide else [usual, usual]
+    if hands.wide:
+        return (hands.frozen("leaves") - less).tolist()
+    return [usual, usual]
 
 
 def _angles(hands: HandController) -> list[float]:
