@@ -164,7 +164,7 @@ def masked(task: TaskClass) -> tuple[list[str], list[str]]:
     sensors = torch.from_numpy(data.sensordata.copy())[None]
     low, high = (torch.tensor(ends, dtype=torch.float64) for ends in (space.low, space.high))
     base = low + 0.2 * (high - low)
-    frozen = task.freeze(torch.cat((base[None], base + 0.35 * torch.diag(high - low))))
+    frozen = task.frozen(torch.cat((base[None], base + 0.35 * torch.diag(high - low))))
     starts = torch.from_numpy(np.tile(scene.start_qpos, (1 + space.size, 1)))
     draws = torch.zeros(len(starts), task.start_draws, dtype=starts.dtype)
     task.start(draws, frozen, {part: starts[:, where] for part, where in scene.qpos.items()})

@@ -147,7 +147,7 @@ class _Formulas:
         task, shown = known
         variation = torch.from_numpy(np.array(episode.variation, np.float64)).expand(len(episode), -1)
         observations = torch.from_numpy(episode.observations[1:].astype(np.float64))
-        state = _ShownState(shown, observations, task.freeze(variation))
+        state = _ShownState(shown, observations, task.frozen(variation))
         try:
             reward = torch.stack(list(task.rewards(state).values())).sum(0)
         except _NotShown as error:

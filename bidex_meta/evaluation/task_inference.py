@@ -183,7 +183,7 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
         """What hidden values (k, d) miss of the rewards, (k, T)."""
         variations = truth.repeat(len(tried), 1)
         variations[:, columns] = tried
-        state = _EachWith(sensors, scene, task.freeze(variations), len(tried))
+        state = _EachWith(sensors, scene, task.frozen(variations), len(tried))
         given = torch.stack(list(task.rewards(state).values())).sum(dim=0).view(len(sensors), -1)
         return (given - rewards[:, None]).T
 

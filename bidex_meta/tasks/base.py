@@ -20,7 +20,7 @@ from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.tasks.variation import NO_COMPONENTS, VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Positive, Text, Whole, true_or_false
@@ -87,8 +87,10 @@ class TaskClass(ABC):
         right: Start pose of the right hand; ``left`` of the left one.
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
-        variation_space: What a task of this class freezes; an attribute or a property.
-        wide_space: The same with wide variation; None: a class without version 2.
+        variation_space: What a task of this class freezes; an attribute or a property. With wide variation a task
+            freezes only what it hides: ``adopt`` divides ``wide_space``.
+        episode_space: What every episode draws in addition, with wide variation: the components that nothing hides.
+        wide_space: Both together, in the order that ``freeze`` reads; None: a class without version 2.
         wide_solved: ``solved`` with wide variation.
         wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
         jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
@@ -121,6 +123,7 @@ class TaskClass(ABC):
     orientation_scale: ClassVar[NonNegative]
     start_draws: ClassVar[Whole]
     variation_space: VariationSpace
+    episode_space: VariationSpace = NO_COMPONENTS
     wide_space: VariationSpace | None = None
     wide_solved: ClassVar[str] = ""
     wide_blocks: ClassVar[tuple[Block, ...]] = ()
@@ -163,10 +166,34 @@ class TaskClass(ABC):
             self.widen()
 
     def widen(self) -> None:
-        """Use the wide variation: ``wide_space``."""
+        """Use the wide variation: tasks freeze the hidden components of ``wide_space``, episodes draw the others.
+
+        A memory could otherwise tell tasks apart by where things stand. A class that hides nothing keeps all
+        components in its tasks.
+        """
         if self.wide_space is None:
             raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
-        self.variation_space = self.wide_space
+        hidden = [name for part in self.hides() for name in part.names] or self.wide_space.names
+        self.variation_space = self.wide_space.only(hidden)
+        self.episode_space = self.wide_space.only([name for name in self.wide_space.names if name not in hidden])
+        drawn = (*self.variation_space.names, *self.episode_space.names)
+        self._order = [drawn.index(name) for name in self.wide_space.names]
+
+    def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
+        """Return ``freeze`` of tasks' variations (n, variation_space.size), completed by ``episode_space``.
+
+        ``draws`` in [-1, 1], (n, at least episode_space.size), are those of episodes: their starts depend on them.
+        None stands for the middle of the space: rewards, success and observations depend on the task alone.
+        """
+        space = self.episode_space
+        if not space.size:
+            return self.freeze(variation)
+        low = constant(space.low, variation)
+        high = constant(space.high, variation)
+        placement = (0.5 * (low + high)).expand(len(variation), space.size)
+        if draws is not None:
+            placement = placement + 0.5 * (high - low) * draws[:, : space.size].to(variation)
+        return self.freeze(torch.cat((variation, placement), dim=1)[:, self._order])
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
@@ -195,7 +222,10 @@ class TaskClass(ABC):
 
     @abstractmethod
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Compute frozen values, each (n, k), for reward and observation from variations (n, variation_space.size)."""
+        """Compute frozen values, each (n, k), for reward and observation from variations (n, variation_space.size).
+
+        With wide variation from vectors of ``wide_space``, of which only ``start`` may read what episodes draw.
+        """
 
     @abstractmethod
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
@@ -209,10 +239,14 @@ class TaskClass(ABC):
     def draws(self) -> int:
         """Return the number of uniform numbers that ``begin`` takes."""
         more = 24 * len(self.jittered_hands) + 2 * len(self.jittered_fixtures)
-        return self.start_draws + (more if self.rules.jittered else 0)
+        return self.episode_space.size + self.start_draws + (more if self.rules.jittered else 0)
 
     def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Run ``start``, then apply the additions of the suite's rules; ``draws`` are (n, self.draws)."""
+        """Run ``start``, then apply the additions of the suite's rules; ``draws`` are (n, self.draws).
+
+        The first draws are those of ``episode_space``, which ``frozen`` contains already.
+        """
+        draws = draws[:, self.episode_space.size :]
         self.start(draws[:, : self.start_draws], frozen, qpos)
         if not self.rules.jittered:
             return

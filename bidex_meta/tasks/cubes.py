@@ -285,7 +285,8 @@ class ReOrientation(TaskClass):
         for i, side, pose in ((1, "left", self.left), (2, "right", self.right)):
             cube = qpos[f"object{i}"]
             eggs.start_egg(cube, draws[:, eggs.JOINT_DRAWS :], 0.01)
-            _turn_away(cube, frozen[f"goal{i}_inverse"])
+            if not self.rules.wide:  # there a start would tell something about the hidden goal
+                _turn_away(cube, frozen[f"goal{i}_inverse"])
             eggs.lay_egg_on_hand(cube, qpos[f"{side}/joints"], pose, radius, radius)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:

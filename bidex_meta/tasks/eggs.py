@@ -141,6 +141,8 @@ class EggTask(TaskClass):
         Raises BidexError if there is no such object, or its file holds no object for a hand.
         """
         super().__init__(moving_base)
+        self.variation_space = self._goals_within(0.03)
+        self.wide_space = self._goals_within(0.06)
         self.held = held_object(object)
         if self.held is not None:
             self.needs = self.held.needs(self.needs, len(self.starts))
@@ -149,15 +151,10 @@ class EggTask(TaskClass):
     def scene_key(self) -> tuple[Hashable, ...]:
         return (*super().scene_key, self.held)
 
-    @property
-    def variation_space(self) -> VariationSpace:
+    def _goals_within(self, half: float) -> VariationSpace:
         """Return the space of goal positions (world, metres) and the two draws of the goals' orientation."""
-        half = 0.06 if self.rules.wide else 0.03
         boxes = (box(f"goal{i}", centre, half) for i, centre in zip(self.numbers, self.goals, strict=True))
         return join(*boxes, orientation("goal"))
-
-    def widen(self) -> None:
-        """Accept wide variation; the goals' boxes follow the rules (``variation_space``)."""
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         green = (0.45, 0.62, 0.30, 1.0)

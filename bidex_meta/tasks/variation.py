@@ -1,5 +1,6 @@
 """The variation of a task: a vector of named numbers that the task freezes."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,10 +45,24 @@ class VariationSpace:
         """Draw ``n`` variations, uniform in the box. Shape (n, size), float64."""
         return rng.uniform(self.low, self.high, size=(n, self.size))
 
+    @checked_arguments
+    def only(self, names: Collection[Text]) -> "VariationSpace":
+        """Return the space of the components with these names, in the order of this space."""
+        columns = [i for i, name in enumerate(self.names) if name in names]
+        return VariationSpace(
+            tuple(self.names[i] for i in columns),
+            tuple(self.low[i] for i in columns),
+            tuple(self.high[i] for i in columns),
+        )
+
     def contains(self, vector: np.ndarray) -> bool:
         """Return whether a vector of shape (size,) lies in the box."""
         vector = np.asarray(vector)
         return vector.shape == (self.size,) and bool(np.all((vector >= self.low) & (vector <= self.high)))
+
+
+NO_COMPONENTS = VariationSpace((), (), ())
+"""The space without components."""
 
 
 @checked_arguments

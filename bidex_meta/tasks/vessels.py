@@ -28,7 +28,7 @@ class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
     Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's own start and up to 5 cm
-    to its sides, and has the start's orientation, yaw included. The pot starts at rest on the table; at the original's
+    to its sides, and has the start's orientation, yaw included; in version 2 it lies relative to the nominal start. The pot starts at rest on the table; at the original's
     height it would start 1.5 cm inside. Friction: 3 on the table, 2 between wall and hand.
     """
 
@@ -72,9 +72,11 @@ class LiftUnderarm(OwnObjectClass):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``object``: pot's place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
+        if self.rules.wide:
+            placement = torch.zeros_like(placement)  # episodes draw it, so a goal may not depend on it
         start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + placement.new_tensor(_START)
         goal = torch.cat((start + variation[:, 3:], yaw_quaternion(placement[:, 2])), dim=1)
-        return {"object": placement, **frozen_goal(goal)}
+        return {"object": variation[:, :3], **frozen_goal(goal)}
 
     def target(self, state: TaskState) -> Tensor:
         return 3.0 * (0.985 - self._distance(state))
@@ -241,7 +243,7 @@ class SwingCup(OwnObjectClass):
     camera_angle = (20.0, -42.0)
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
     wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # a small table
-    wide_solved = "cup within 8 degrees of its goal and within 20 cm of its start"
+    wide_solved = "cup within 8 degrees of its goal and within 20 cm of its nominal start"
     blocks = (
         *object_blocks("cup"),
         *goal_blocks("goal"),
@@ -251,7 +253,8 @@ class SwingCup(OwnObjectClass):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
         position = variation.new_tensor(_CUP.position).repeat(len(variation), 1)
-        position[:, :2] += variation[:, :2]
+        if not self.rules.wide:
+            position[:, :2] += variation[:, :2]
         rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))
         return super().freeze(variation) | frozen_goal(torch.cat((position, rotation), dim=1))
 

@@ -181,7 +181,7 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
         if block.sensors and size != block.size:
             raise BidexError(f"{name}.layout: block {block.name!r} has size {block.size}, its sensors give {size}.")
     variations = torch.as_tensor(tasks[:1]).to(sensors).repeat(_ROWS, 1)
-    frozen = _named(f"{name}.freeze", task.freeze(variations))
+    frozen = _named(f"{name}.freeze", task.frozen(variations))
     for key, value in frozen.items():
         _check_shape(f"{name}.freeze: {key!r}", value, None)
     state = TaskState(sensors.new_zeros(_ROWS, scene.model.nsensordata), scene.sensors, frozen)

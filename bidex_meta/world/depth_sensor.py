@@ -97,4 +97,4 @@ def _without_objects(scene: Scene) -> TaskState:
             sensors[:, where] = torch.nan
     space = scene.task.variation_space
     low, high = (torch.tensor(ends, dtype=torch.float64) for ends in (space.low, space.high))
-    return TaskState(sensors, scene.sensors, scene.task.freeze((0.5 * (low + high))[None]))
+    return TaskState(sensors, scene.sensors, scene.task.frozen((0.5 * (low + high))[None]))

@@ -73,7 +73,7 @@ class HiddenParts:
                 tasks[:, columns] = hidden.to(sensors) * half.to(sensors) + middle.to(sensors)
                 task = member.scene.task
                 sensed = sensors[member.engine_rows].repeat(len(given), 1)
-                state = TaskState(sensed, member.scene.sensors, task.freeze(tasks))
+                state = TaskState(sensed, member.scene.sensors, task.frozen(tasks))
                 paid = judge(task, state).reward * slot.reward_scale
                 rewards[:, env_ids] = paid.float().unflatten(0, (len(given), -1))
         return rewards.view(goals.shape[:-1])

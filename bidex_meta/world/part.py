@@ -105,10 +105,8 @@ class Part:
         return mounts
 
     def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
-        self._pools = [
-            m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata))
-            for m in self.group.members
-        ]
+        self._tasks = [torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata) for m in self.group.members]
+        self._pools = [m.scene.task.frozen(tasks) for m, tasks in zip(self.group.members, self._tasks, strict=True)]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
         """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
@@ -242,7 +240,12 @@ class Part:
             qpos[where] = self._start[i]
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
-            task.begin(draws[where, : task.draws], self.frozen(i, task_index[where]), views)
+            own = draws[where, : task.draws]
+            if task.episode_space.size:
+                frozen = task.frozen(self._tasks[i][task_index[where]], own)
+            else:
+                frozen = self.frozen(i, task_index[where])
+            task.begin(own, frozen, views)
             if self.looks:
                 checked.own_numbers(task, "start", views)
         return qpos

@@ -8,7 +8,7 @@ from torch import Tensor
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from tests.tasks.formulas import FORMULAS
-from tests.tasks.wide import ENTERING, HIDDEN
+from tests.tasks.wide import HIDDEN
 from tests.tasks.worlds import each_version, engine_of, mixed_world, world_of
 from tools.gallery import masked
 
@@ -50,7 +50,8 @@ def entering(name: str) -> tuple[set[str], set[str]]:
     plain = name.removesuffix("-v2")
     task, oracle = registry.get(name, True), FORMULAS[plain]
     of_reward = set(task.variation_space.names) if oracle.entering is None else oracle.entering
-    return (ENTERING[plain] if plain != name else of_reward) - FIXTURES.get(plain, set()), set(oracle.deciding)
+    names = set(task.variation_space.names)
+    return (HIDDEN[plain] if plain != name else of_reward) - FIXTURES.get(plain, set()), names & set(oracle.deciding)
 
 
 @each_version

@@ -190,7 +190,9 @@ def test_joints_of_objects_start_shut(started: Started, name: str, moving: bool)
 
 @worlds.each_version
 def test_no_start_is_a_success(started: Started, name: str, moving: bool) -> None:
-    assert not started.solved.any(), f"{int(started.solved.sum())} of {RESETS} starts"
+    # Version 2 does not turn cubes away from a hidden goal: a start could tell it. Success is asked for at the end.
+    most = 5 if name == "ReOrientation-v2" else 0
+    assert started.solved.sum() <= most, f"{int(started.solved.sum())} of {RESETS} starts"
     if name.endswith("-v2"):
         return
     lens = worlds.Lens(scene(name, moving).model)
@@ -219,22 +221,30 @@ def test_starts_differ_and_depend_on_the_seed_alone(qpos: np.ndarray, name: str,
 
 
 @worlds.each_moving
-def test_episodes_of_one_task_are_jittered(name: str) -> None:
-    """What stands or lies moves by up to 5 mm, joints by a tenth of their ranges, where version 1 has no more noise."""
+def test_episodes_of_one_task_draw_placements_and_are_jittered(name: str) -> None:
+    """What stands or lies is placed anew and jittered by up to 5 mm, joints by a tenth of their ranges, or as in
+    version 1."""
     world = worlds.world_of(f"{name}-v2", True, 200, tasks=1)
+    drawn = world.slots[0].task_class.episode_space
+    half = dict(zip(drawn.names, 0.5 * np.subtract(drawn.high, drawn.low), strict=True))
     world.reset(seed=0)
     places, found = scene(name, True), worlds.engine_of(world).placement().numpy()
     shift, noise = np.maximum(NOISE.get(name, (0.0, 0.0)), (JITTER, 0.1))
     assert len(np.unique(found, axis=0)) == len(found)
     for body in PLACES[name]:
         widths = np.ptp(found[:, places.qpos[body]][:, :2], axis=0)
-        assert (widths > 1.8 * shift).sum() >= (1 if name == "BottleCap" else 2)
-        assert widths.max() <= 2 * shift + (_LIFT if name in NOISE else 1e-6)
-    drawn = [i for i, joint in enumerate(figures.NAMES) if joint.endswith(("J1", "J2", "J3")) and joint[:2] != "TH"]
+        placed = [half.get(f"{body}_{axis}", half.get(f"base_{axis}", 0.0)) for axis in "xy"]
+        if name == "BottleCap":  # shifted in the palm's plane, which is tilted
+            assert widths.max() > 1.8 * shift
+            continue
+        reach = 2 * (shift + np.array(placed))
+        assert (widths > 0.8 * reach).all()
+        assert (widths <= reach + (_LIFT if name in NOISE else 1e-6)).all()
+    moved = [i for i, joint in enumerate(figures.NAMES) if joint.endswith(("J1", "J2", "J3")) and joint[:2] != "TH"]
     for side in SIDES:
         joints = found[:, places.qpos[f"{side}/joints"]]
         moves = np.ptp(joints, axis=0) > 0.5 * noise * (figures.HIGH - figures.LOW)
-        assert moves[drawn].all() if (name, side) != ("BottleCap", "right") else not moves.any(), side
+        assert moves[moved].all() if (name, side) != ("BottleCap", "right") else not moves.any(), side
         assert ((joints >= figures.LOW) & (joints <= figures.HIGH)).all()
         for joint, value in figures.DEFAULT_JOINTS.get(name, {}).items():
             assert np.abs(joints[:, figures.NAMES.index(joint)] - value).max() < 0.25, joint

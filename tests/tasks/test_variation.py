@@ -90,10 +90,12 @@ WIDER |= dict.fromkeys(("DoorOpenOutward", "DoorOpenInward"), 1.6)
 
 
 @each_case
-def test_version_2_varies_as_much_or_more_and_adds_what_it_hides(name: str, moving: bool) -> None:
-    space = registry.get(f"{name}-v2", moving).variation_space
+def test_version_2_freezes_what_it_hides_and_draws_the_rest_in_every_episode(name: str, moving: bool) -> None:
+    task = registry.get(f"{name}-v2", moving)
+    assert set(task.variation_space.names) == HIDDEN[name]
+    assert set(task.episode_space.names) == SPACES[name].keys() - HIDDEN[name]
+    space = variation.join(task.variation_space, task.episode_space)
     found = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
-    assert found.keys() == SPACES[name].keys() | HIDDEN[name]
     for component, (low, high) in SPACES[name].items():
         assert found[component][0] <= low and found[component][1] >= high, component
         if component not in {*HIDDEN[name], "start_angle"} and "goal" not in component:
@@ -105,7 +107,7 @@ def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
     """Each (n, k) in the variation's precision, and the rows of tasks independent of each other."""
     task = registry.get(name, moving)
     pool = torch.from_numpy(task.variation_space.sample(np.random.default_rng(1), 7))
-    frozen, alone = task.freeze(pool), task.freeze(pool[2:3])
+    frozen, alone = task.frozen(pool), task.frozen(pool[2:3])
     assert frozen
     for label, value in frozen.items():
         assert value.ndim == 2 and len(value) == 7 and value.dtype == torch.float64, label

@@ -30,8 +30,6 @@ HIDDEN = {
     "PourWater": {"goal_x", "goal_y"},
     "GraspAndPlace": {"goal_x", "goal_y"},
 }
-ENTERING = HIDDEN | {"LiftUnderarm": {*HIDDEN["LiftUnderarm"], "object_x", "object_y"}}
-"""What enters the reward: of the pot its place at the start too, which observations show."""
 BUCKETS = {"PourWater": (0.0, -0.3, 0.457), "GraspAndPlace": (0.0, 0.2, 0.657)}
 
 

@@ -72,10 +72,12 @@ def object_joints_of(scene: Scene) -> list[str]:
 
 
 def task_of(world: World, row: int) -> Task:
-    """The numbers that a row's task froze, by component name."""
+    """The numbers that a row's task froze, by component name; of what its episode drew the middles."""
     owner = world.slots[int(world.task_id[row])]
+    drawn = owner.task_class.episode_space
+    middles = {name: 0.5 * (a + b) for name, a, b in zip(drawn.names, drawn.low, drawn.high, strict=True)}
     names = owner.task_class.variation_space.names
-    return dict(zip(names, owner.tasks[int(world.task_index[row])].tolist(), strict=True))
+    return middles | dict(zip(names, owner.tasks[int(world.task_index[row])].tolist(), strict=True))
 
 
 def observe(world: World, action: Tensor | None = None) -> np.ndarray:

@@ -121,7 +121,7 @@ def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
     space = task.variation_space
     middle = 0.5 * (torch.tensor([space.low]) + torch.tensor([space.high]))
     views = {name: start[:, columns] for name, columns in scene.qpos.items()}
-    task.start(torch.zeros(1, task.start_draws, dtype=start.dtype), task.freeze(middle.to(start)), views)
+    task.start(torch.zeros(1, task.start_draws, dtype=start.dtype), task.frozen(middle.to(start)), views)
     model = scene.model
     data = mujoco.MjData(scene.model)
     data.qpos[:] = start[0, : model.nq].numpy()
