@@ -10,10 +10,12 @@ from bidex_meta import make_task_world
 from bidex_meta.data.checking import verify
 from bidex_meta.evaluation.references import references_of
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.state import TaskState
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.agent_views import agent_views
+from bidex_meta.world.part import judge
 from tests.data.test_commands import recorded
-from tests.tasks.worlds import slot
+from tests.tasks.worlds import MOVING, engine_of, slot
 from tests.world.play import flat, suite_world
 
 
@@ -88,3 +90,23 @@ def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
     one.reset(seed=0)
     torch.testing.assert_close(one.step(action)[1], earned, rtol=0, atol=1e-5)
     assert not torch.allclose(earned, own)
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_no_start_tells_the_task_and_placements_enter_no_reward(name: str) -> None:
+    """Equal seeds start alike whatever the tasks; and what an episode draws changes neither reward nor success."""
+    task = registry.get(f"{name}-v2", True)
+    masked = WorldConfig(6, observation="masked", autoreset_mode="DISABLED", threads=1)
+    pools = [task.variation_space.sample(np.random.default_rng(seed), 6) for seed in (0, 1)]
+    worlds = [World([slot(task, pool)], masked) for pool in pools]
+    starts = [world.reset(seed=3)[0] for world in worlds]
+    placements = [engine_of(world).placement() for world in worlds]
+    assert torch.equal(*starts) and torch.equal(*placements)
+    assert task.episode_space.size == 0 or len(placements[0].unique(dim=0)) == 6
+
+    ((member, _, state),) = worlds[0].parts[0].states(worlds[0].task_index)
+    draws = 2.0 * torch.rand(6, max(1, task.episode_space.size), generator=torch.Generator().manual_seed(0)) - 1.0
+    drawn = task.frozen(torch.from_numpy(pools[0]), draws)
+    other = TaskState(engine_of(worlds[0]).sensordata, member.scene.sensors, drawn)
+    assert torch.equal(judge(task, other).reward, judge(task, state).reward)
+    assert torch.equal(judge(task, other).success, judge(task, state).success)

@@ -88,8 +88,6 @@ class ICL(TrialLearner):
     def __init__(self, world: PooledWorld, config: ICLConfig, seed: int, sources: Sources = NO_SOURCES):
         sources.check(self.name, "teachers", needed="teachers")
         super().__init__(world, config, seed)
-        self.every_pool = dict(zip(world.task_names, world.pools, strict=True))
-        self.pools.clear()  # tasks are mixed instead of taking turns
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
         assert sources.teachers is not None
@@ -157,24 +155,6 @@ class ICL(TrialLearner):
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
         return self._episodes_metrics() | as_numbers(tensors)
-
-    def _begin(self) -> Tensor:
-        """Start the next trial, in which each task combines the hidden part of one train task with the rest of another.
-
-        Otherwise a memory would memorise the fifty train tasks by the starting positions of their objects.
-        """
-        privileged = self.teachers.privileged
-        if privileged is None:
-            hidden = {}
-        else:
-            hidden = privileged.hidden_columns
-        mixed = {}
-        for name, pool in self.every_pool.items():
-            rest, goals = (torch.randperm(len(pool), generator=self.generator, device=self.device) for _ in range(2))
-            mixed[name] = pool[rest.tolist()]
-            mixed[name][:, hidden.get(name, [])] = pool[goals.tolist()][:, hidden.get(name, [])]
-        self.world.set_tasks(mixed)
-        return super()._begin()
 
     def teachers_share(self) -> float:
         """Return the share of the episodes beginning now that the teacher plays."""
