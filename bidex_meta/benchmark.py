@@ -137,7 +137,8 @@ class Benchmark:
             for split in SPLITS
         }
         overlap = set(self.train_tasks) & set(self.test_tasks)
-        if overlap:
+        choices = any(task.split == "both" for entry in self.suite.classes for task in entry.tasks)
+        if overlap and not choices:
             raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
         actions = {name: task_class.action_size for name, task_class in self._classes.items()}
         if len(set(actions.values())) > 1:
@@ -275,7 +276,7 @@ class Benchmark:
         space = self._classes[entry.name].variation_space
         key = entry.class_name
         if entry.tasks:
-            variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.split == split]
+            variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.of(split)]
         else:
             variations = _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0)
         env_name = versioned_name(entry.name, self.suite.rules)
@@ -311,7 +312,7 @@ class Benchmark:
             if self.suite.task_id == "class":
                 slots.append(Slot(entry.name, task_class, np.stack(variations), entry.reward_scale, entry.gamma))
                 continue
-            names = [f"{entry.name}/{task.name}" for task in entry.tasks if task.split == split]
+            names = [f"{entry.name}/{task.name}" for task in entry.tasks if task.of(split)]
             for name, variation in zip(names, variations, strict=True):
                 slots.append(Slot(name, task_class, variation[None], entry.reward_scale, entry.gamma))
         return slots

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -147,9 +148,13 @@ class ListedTask:
 
     name: str
     """Unique within its class, e.g. `"left"`."""
-    split: Split
+    split: Split | Literal["both"]
     fixed: Mapping[str, float]
     """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
+
+    def of(self, split: Split) -> bool:
+        """Return whether the task is one of a split."""
+        return self.split in (split, "both")
 
 
 @checked_arguments
@@ -210,6 +215,8 @@ class Suite:
         Entries with their default value do not enter, so that a new kind of entry leaves old digests as they are.
         """
         content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
+        if self.rules.wide:
+            content["placements"] = "episode"  # before version 0.3.0 a task fixed them
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 
     @property
@@ -257,7 +264,15 @@ def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
 
 
 def suite_names() -> list[str]:
-    """Names of the suites that this installation ships, sorted."""
+    """Return the names of the suites that this installation ships: sorted, then those of a single class."""
+    from bidex_meta import ladder
+
+    classes = [entry.name for entry in _shipped("MT20-v2").classes]
+    return [*file_names(), *ladder.names_of(classes)]
+
+
+def file_names() -> list[str]:
+    """Return the names of the shipped suites that have a file of their own, sorted."""
     return sorted(path.stem for path in suites_dir().glob("*.toml"))
 
 
@@ -278,7 +293,19 @@ def load_suite(name_or_path: str | Path) -> Suite:
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
         return _parse(expanded(name_or_path))
-    return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
+    from bidex_meta import ladder
+
+    name = known_name("suite", text, suite_names())
+    template = ladder.template_of(name)
+    if template is None:
+        return _shipped(name)
+    return ladder.suite_of(name, _shipped(template))
+
+
+@cache
+def _shipped(name: str) -> Suite:
+    """Return the suite of a file."""
+    return _parse(suites_dir() / f"{name}.toml")
 
 
 @checked_arguments

@@ -201,7 +201,7 @@ def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
     if suite is None or suite.version != version:
         return None
     return {
-        each.name: sum(task.split == "train" for task in each.tasks) or suite.tasks_per_class or 0
+        each.name: sum(task.of("train") for task in each.tasks) or suite.tasks_per_class or 0
         for each in suite.split_classes("train")
     }
 

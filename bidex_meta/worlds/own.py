@@ -52,7 +52,7 @@ class OwnSuite(Worlds):
         """As in ``Worlds``: the names that the file lists, else numbers."""
         drawn = list(map(str, range(self.suite.tasks_per_class or 0)))
         classes = self.suite.split_classes(cast(Split, split))
-        pools = {c.name: [task.name for task in c.tasks if task.split == split] or [*drawn] for c in classes}
+        pools = {c.name: [task.name for task in c.tasks if task.of(split)] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
         return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
