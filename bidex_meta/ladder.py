@@ -29,7 +29,7 @@ def names_of(classes: Iterable[str]) -> list[str]:
     names = []
     for name in classes:
         names += [f"MT1-{name}-v2", f"ML1-{name}-v2"]
-        if name in CHOICES:
+        if name in CHOICES or name == "CLASS":  # how messages name any class
             names += [f"ML1-{name}-choice2", f"ML1-{name}-choice4"]
     return names
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
+from bidex_meta.errors import BidexError, known_name, nearest, one_line, shortened, unknown_name
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
@@ -295,7 +295,11 @@ def load_suite(name_or_path: str | Path) -> Suite:
         return _parse(expanded(name_or_path))
     from bidex_meta import ladder
 
-    name = known_name("suite", text, suite_names())
+    names = suite_names()
+    if text.casefold() not in {name.casefold() for name in names}:
+        meant = {text.casefold(): nearest(text, names) or "MT4"}
+        raise unknown_name("suite", text, [*file_names(), *ladder.names_of(["CLASS"])], meant)
+    name = known_name("suite", text, names)
     template = ladder.template_of(name)
     if template is None:
         return _shipped(name)
@@ -331,7 +335,7 @@ _Tables = Meta(min_length=1, max_length=1000)
 class _TaskEntry:
     name: _Text
     fixed: dict[str, _Number]
-    split: Split = "train"
+    split: Split | Literal["both"] = "train"
 
 
 @dataclass
@@ -457,7 +461,7 @@ def _check(suite: Suite) -> None:
 
 def _check_listed(file: Path, place: str, entry: SuiteClass) -> None:
     _check_unique(file, place, [task.name for task in entry.tasks])
-    splits = tuple(split for split in SPLITS if any(task.split == split for task in entry.tasks))
+    splits = tuple(split for split in SPLITS if any(task.of(split) for task in entry.tasks))
     if splits != entry.splits:
         mend = f"Make split of {entry.name} and of its tasks agree."
         raise _error(file, place, f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(splits)}", mend)

@@ -59,9 +59,10 @@ def test_shipped_suite_is_sound(name: str) -> None:
     suite = load_suite(name)
     assert suite.name == name
     assert {entry.class_name for entry in suite.classes} <= set(registry.names())
-    shown = "plain" if name == "MT1-v2" else "one-hot"  # there is one class, and no list of tasks
+    v2 = name.endswith("-v2") or "-choice" in name
+    shown = "plain" if v2 and name.startswith("MT1-") else "one-hot"  # there is one class, and no list of tasks
     assert suite.observation == ("masked" if suite.kind == "meta" else shown)
-    assert suite.rules == (V2 if name.endswith("-v2") else V1) and suite.version == 1 + name.endswith("-v2")
+    assert suite.rules == (V2 if v2 else V1) and suite.version == 1 + v2
     assert suite.splits == (("train", "test") if suite.kind == "meta" else ("train",))
 
 
@@ -95,9 +96,13 @@ def test_names_and_paths(tmp_path: Path) -> None:
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
     with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
         load_suite(tmp_path / "absent.toml")
-    known = "ML1, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, MT1, MT1-objects, MT1-v2, MT20, MT20-v2"
+    choices = "ML1-CLASS-choice2, ML1-CLASS-choice4, ML1-CLASS-v2"
+    known = f"ML1, {choices}, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, ML5-v2, MT1, MT1-CLASS-v2"
     with pytest.raises(BidexError, match=rf"Did you mean 'MT4'\? Known: {known}"):
         load_suite("MT44")
+    with pytest.raises(BidexError, match=r"Did you mean 'ML1-Switch-choice2'\?"):
+        load_suite("ml1-switch-choice")
+    assert load_suite("ml1-switch-CHOICE2").name == "ML1-Switch-choice2"
 
 
 BOTH = 'split = "test"', 'objects = ["egg"]\noptions = {object = "egg"}'

@@ -28,8 +28,9 @@ class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
     Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's own start and up to 5 cm
-    to its sides, and has the start's orientation, yaw included; in version 2 it lies relative to the nominal start. The pot starts at rest on the table; at the original's
-    height it would start 1.5 cm inside. Friction: 3 on the table, 2 between wall and hand.
+    to its sides, and has the start's orientation, yaw included; in version 2 it lies relative to the nominal start. The
+    pot starts at rest on the table; at the original's height it would start 1.5 cm inside. Friction: 3 on the table, 2
+    between wall and hand.
     """
 
     needs = Capacity(36, 4, 82)

@@ -19,13 +19,17 @@ from bidex_meta.tasks import registry
 ROOT = Path(__file__).parents[2]
 SUITES = "MT1 MT4 MT20 ML1-train ML1-test MT1-objects ML1-objects-train ML1-objects-test ML1-wide-train ML1-wide-test"
 SUITE_IDS = [f"bidex-meta/{name}-v1" for name in f"{SUITES} ML4-train ML4-test ML20-train ML20-test".split()]
-SUITE_IDS += [f"bidex-meta/MT{n}-v2" for n in (1, 4, 20)]
-SUITE_IDS += [f"bidex-meta/ML{n}-{split}-v2" for n in (1, 4, 20) for split in ("train", "test")]
+SUITE_IDS += [f"bidex-meta/MT{n}-v2" for n in (1, 4, 5, 20)]
+SUITE_IDS += [f"bidex-meta/ML{n}-{split}-v2" for n in (1, 4, 5, 20) for split in ("train", "test")]
 
 
 def test_every_suite_has_its_ids() -> None:
     ids = [env_id for name in bidex_meta.suite_names() for env_id in suite_ids(bidex_meta.load_suite(name))]
-    assert sorted(ids) == sorted(SUITE_IDS)
+    of_class = [env_id for env_id in ids if any(name in env_id for name in registry.names())]
+    assert sorted(set(ids) - set(of_class)) == sorted(SUITE_IDS)
+    kinds = [f"MT1-{name}-v2" for name in registry.names()]
+    kinds += [f"ML1-{name}-{split}-v2" for name in registry.names() for split in ("train", "test")]
+    assert {f"bidex-meta/{kind}" for kind in kinds} <= set(of_class) and len(of_class) == len(kinds) + 20
 
 
 @pytest.mark.parametrize("env_id", [*SUITE_IDS, *map(task_id, registry.names())])
