@@ -1,11 +1,10 @@
 """``bidex-meta submit``: write an entry of the leaderboard, verified by playing the runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
@@ -17,6 +16,7 @@ from bidex_meta.experiments.policies import checkpoint, fitting, policy_of
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
+from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
 from bidex_meta.utils.files import exists
@@ -77,10 +77,10 @@ def main(arguments: Sequence[str]) -> None:
         "commit": [row[2] for row in facts],
     }  # fmt: skip
     entry = {
-        "format": FORMAT, "name": name, "suite": suite, "version": verified["suite_version"], "algorithm": first.algo,
+        "format": FORMAT, "name": name, "suite": suite, "version": verified.suite_version, "algorithm": first.algo,
         "weights": weights, "steps": [row[2] for row in played], "episodes": flags.episodes,
         "own": class_rows([row[0] for row in played]), "others": class_rows([row[1] for row in played]),
-        "verified": verified, "stated": stated,
+        "verified": asdict(verified), "stated": stated,
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, entry)
@@ -129,7 +129,7 @@ def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
     return round(training_seconds(folder.metrics()) / 3600.0, 3), device, commit
 
 
-def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Evaluation, Evaluation, int, Json]:
+def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Evaluation, Evaluation, int, Conditions]:
     """Return the evaluations on own and on other tasks, the policy's steps, and the conditions."""
     config = stored.to_json()
     config |= {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": "auto"}

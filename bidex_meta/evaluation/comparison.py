@@ -2,8 +2,8 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
 from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, iqm_difference, iqm_over_seeds
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
@@ -54,7 +55,7 @@ def read_groups(runs: Sequence[Run]) -> list[Group]:
 
     Raises BidexError if one is not evaluated, two are the same, or a group's seeds cover different classes.
     """
-    kinds = [run_kind(run.config(), run.evaluation().get("split", "train")) for run in runs]
+    kinds = [run_kind(run.config(), run.evaluation().split) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
 
 
@@ -152,34 +153,30 @@ def _comparable(group: Group, first: Group) -> bool:
     return group is not first and set(group.classes) == set(first.classes)
 
 
-def classes_of(evaluation: Json, convert: Callable[[Json], Json] = lambda rows: rows) -> Json:
-    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class.
-
-    ``convert`` takes the results of a split, by class.
-    """
-    if "splits" in evaluation:
-        after = {split: convert(part["after"]["classes"]) for split, part in evaluation["splits"].items()}
-        return {f"{name} ({split})": row for split, rows in after.items() for name, row in rows.items()}
-    return convert(evaluation.get("policy", evaluation)["classes"])
-
-
-def scored_classes(run: Run) -> Json:
-    """Return :func:`classes_of` of the run's evaluation, with scores by the current references."""
+def scored_classes(run: Run) -> dict[str, ClassSummary]:
+    """Return the ``results`` of the run's evaluation, with scores by the present references."""
     config = run.config()
-    return classes_of(run.evaluation(), lambda rows: rescored(rows, config))
+    evaluation = run.evaluation()
+    if isinstance(evaluation, PolicyEvaluation):
+        return rescored(evaluation.policy.classes, config)
+    splits = {}
+    for split, part in evaluation.splits.items():
+        after = replace(part.after, classes=rescored(part.after.classes, config))
+        splits[split] = replace(part, after=after)
+    return replace(evaluation, splits=splits).results
 
 
 def group_of(label: str, runs: Sequence[Run]) -> Group:
     """Evaluated runs that the caller takes as seeds of one group; errors as of :func:`read_groups`."""
-    by_seed: dict[int, dict[str, Json]] = {}
+    by_seed: dict[int, dict[str, ClassSummary]] = {}
     seconds = defaultdict[int, float](float)
     steps = defaultdict[int, int](int)
     for run in runs:
         seed = run.config().seed
         goal = run.goal
         own = scored_classes(run)
-        evaluated = run.evaluation().get("steps", goal)
-        if evaluated < goal:
+        evaluated = run.evaluation().steps
+        if evaluated is not None and evaluated < goal:
             raise BidexError(
                 f"The evaluation of {run.path} is of {evaluated:,} steps, but the run goes on to {goal:,}. Let it end, "
                 f"or write it anew: {run.again}"
@@ -199,12 +196,13 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
                 f"and seed {seed} {', '.join(by_seed[seed])}. Leave out what is not complete."
             )
 
-    def table(name: str) -> np.ndarray:
-        return np.array([[by_seed[seed][c][name] for c in classes] for seed in seeds], dtype=float)
+    def table(measure: str) -> np.ndarray:
+        rows = [[getattr(by_seed[seed][name], measure) for name in classes] for seed in seeds]
+        return np.array(rows, dtype=float)
 
     scores = table("score")
     return Group(
-        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("return"),
+        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("mean_return"),
         scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
         steps_range=(min(steps.values()), max(steps.values())),
         hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],

@@ -7,13 +7,12 @@ not differ it is rather too wide. With a single one the interval does not cover 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
 from bidex_meta.evaluation.statistics import estimate_from, generator_of_resamples, resampled_means
-from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Gains
 
 MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
     "return": lambda result: result.returns,
@@ -21,19 +20,6 @@ MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
     "score": lambda result: result.scores,
 }
 """Measures by name: per episode, None where a class does not have it."""
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Differences of means by measure (``return``, ``success``, ``score``); None where a measure is missing."""
-
-    classes: dict[str, dict[str, Difference | None]]  # per class
-    aggregate: dict[str, Difference | None]
-    """Mean over classes. Returns of different classes have different scales: of several classes quote the score."""
-
-    def to_json(self) -> Json:
-        """Return the gains, ready for JSON."""
-        return asdict(self)
 
 
 def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str, np.ndarray]) -> Gains:

@@ -17,12 +17,13 @@ from torch import Tensor
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import Protocol
-from bidex_meta.evaluation.gains import Gains, paired_gains
+from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.play import DEFAULT, check_world, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Gains, SplitSummary, summary_json
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import TaskWorld
@@ -59,15 +60,18 @@ class MetaEvaluation:
         """The evaluation after some shot above that without adaptation; the last shot by default."""
         return paired_gains(self.by_shot[shot], self.before, self.adaptations)
 
+    def summary(self) -> SplitSummary:
+        """Return the results without the single episodes."""
+        by_shot = [evaluation.summary() for evaluation in self.by_shot]
+        return SplitSummary(
+            split=self.protocol.split, shots=len(self.adapt_steps), rollouts=self.rollouts,
+            trials=self.protocol.trials, max_adapt_steps=self.protocol.max_adapt_steps,
+            adapt_steps=self.adapt_steps, before=by_shot[0], after=by_shot[-1], gain=self.gains(), by_shot=by_shot,
+        )  # fmt: skip
+
     def to_json(self) -> Json:
-        """Everything but the single episodes, ready for JSON."""
-        by_shot = [found.to_json() for found in self.by_shot]
-        return {
-            "split": self.protocol.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts,
-            "trials": self.protocol.trials, "max_adapt_steps": self.protocol.max_adapt_steps,
-            "adapt_steps": self.adapt_steps, "before": by_shot[0], "after": by_shot[-1],
-            "gain": self.gains().to_json(), "by_shot": by_shot,
-        }  # fmt: skip
+        """Return the results without the single episodes, ready for JSON."""
+        return summary_json(self.summary())
 
 
 @checked_arguments

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict
 
+import msgspec
 import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json, write_json
+from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import exists, read_json
@@ -112,17 +114,17 @@ def references_of(world: object) -> dict[str, Reference]:
     return {}
 
 
-def rescored(classes: Json, config: AnyConfig) -> Json:
-    """An evaluation's results by class, with scores by today's references: others would compare nothing.
+def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, ClassSummary]:
+    """Return an evaluation's results by class with scores by the present references, so that runs can be compared.
 
-    References hold for classes of these names with moving bases, by the run's config or since it was scored when it was
-    evaluated; other results stay as they are.
+    References exist for classes with moving bases. The bases moved if the run's config says so, or if the evaluation
+    has a score. Other results are returned unchanged.
     """
-    if config.base != "moving" and all(row["score"] is None for row in classes.values()):
+    if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes
     known = references()
     rows = dict(classes)
     for name in known.keys() & classes.keys():
-        scores = known[name].scores(np.array([classes[name]["return"]]))
-        rows[name] = {**classes[name], "score": None if scores is None else float(scores[0])}
+        scores = known[name].scores(np.array([classes[name].mean_return]))
+        rows[name] = msgspec.structs.replace(classes[name], score=None if scores is None else float(scores[0]))
     return rows

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bidex_meta.evaluation.references import Reference, counted_returns
-from bidex_meta.evaluation.statistics import Estimate, aggregate, estimate, mean, mean_difference
+from bidex_meta.evaluation.statistics import aggregate, estimate, mean, mean_difference
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary, summary_json
 from bidex_meta.utils.arguments import checked_arguments
 
 MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
@@ -66,15 +67,15 @@ class ClassResult:
             return values
         return np.bincount(task, values) / np.bincount(task)
 
-    def to_json(self) -> Json:
-        """Return the numbers of this class, ready for JSON."""
-        return {
-            "success": self.success, "success_interval": estimate(mean, self.drawn(self.successes)).interval,
-            "success_once": self.once, "success_at_end": self.at_end,
-            "return": self.mean_return, "return_interval": estimate(mean, self.drawn(self.returns)).interval,
-            "length": float(self.lengths.mean()), "score": self.score, "episodes": self.episodes,
-            "tasks": len(np.unique(self.tasks)), "unstable": self.unstable,
-        }  # fmt: skip
+    def summary(self) -> ClassSummary:
+        """Return the results without the single episodes."""
+        return ClassSummary(
+            success=self.success, success_interval=estimate(mean, self.drawn(self.successes)).interval,
+            success_once=self.once, success_at_end=self.at_end,
+            mean_return=self.mean_return, return_interval=estimate(mean, self.drawn(self.returns)).interval,
+            length=float(self.lengths.mean()), score=self.score, episodes=self.episodes,
+            tasks=len(np.unique(self.tasks)), unstable=self.unstable,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,16 +85,21 @@ class Evaluation:
     classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
     episodes_per_task: int  # episodes of every task
 
-    def to_json(self) -> Json:
-        """Return everything but the single episodes, ready for JSON."""
-        return {
-            "episodes_per_task": self.episodes_per_task,
-            "classes": {name: result.to_json() for name, result in self.classes.items()},
-            "aggregate": {
-                "success": aggregate([result.drawn(result.successes) for result in self.classes.values()]),
-                "score": aggregate([_drawn_scores(result) for result in self.classes.values()]),
+    def summary(self) -> Summary:
+        """Return the results without the single episodes."""
+        results = self.classes.values()
+        return Summary(
+            episodes_per_task=self.episodes_per_task,
+            classes={name: result.summary() for name, result in self.classes.items()},
+            aggregate={
+                "success": aggregate([result.drawn(result.successes) for result in results]),
+                "score": aggregate([_drawn_scores(result) for result in results]),
             },
-        }
+        )
+
+    def to_json(self) -> Json:
+        """Return the results without the single episodes, ready for JSON."""
+        return summary_json(self.summary())
 
 
 Difference = Estimate  # mean return of one policy above another's in a class; tasks of both (few: episodes) resampled

@@ -43,11 +43,13 @@ def median_steps(found: Sequence[int | None]) -> int | None:
 
 def at_the_end(folders: Sequence[RunFolder]) -> Json:
     """Return success and return in the final evaluation (4 episodes per task) of runs that differ only in the seed."""
-    classes = [folder.evaluation()["policy"]["classes"].values() for folder in folders]
-    measured = {}
-    for name in ("success", "return"):
-        measured[name] = over_seeds([float(np.mean([row[name] for row in rows])) for rows in classes])
-    return measured
+    success = []
+    returns = []
+    for folder in folders:
+        rows = folder.evaluation().results.values()
+        success.append(float(np.mean([row.success for row in rows])))
+        returns.append(float(np.mean([row.mean_return for row in rows])))
+    return {"success": over_seeds(success), "return": over_seeds(returns)}
 
 
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:

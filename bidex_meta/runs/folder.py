@@ -25,9 +25,9 @@ from bidex_meta.config import RunConfig, read_config
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, Json, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.runs.checkpoints import Checkpoints
+from bidex_meta.runs.evaluations import Evaluated, read_evaluation
 from bidex_meta.runs.metrics import last_rows, read_metrics
-from bidex_meta.runs.schemas import read_evaluation, read_versions
-from bidex_meta.runs.versions import collect_versions
+from bidex_meta.runs.versions import collect_versions, read_versions
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
@@ -136,7 +136,7 @@ class RunFolder:
         """Return the content of ``versions.json``; empty if there is none."""
         return read_versions(self.path)
 
-    def evaluation(self) -> Json:
+    def evaluation(self) -> Evaluated:
         """Return the final evaluation, or the meta-test of learners that adapt; raises BidexError if there is none."""
         if not exists(self.evaluation_path):
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")

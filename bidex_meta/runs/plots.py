@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import Json, write_atomic
-from bidex_meta.runs.schemas import check_evaluation
-from bidex_meta.utils.files import exists, read_json
+from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.evaluations import ClassSummary, Evaluated, Interval, MetaTestEvaluation
 
 Figure = Any  # matplotlib's, which is only imported for drawing
 Axes = Any
@@ -39,7 +38,6 @@ _FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
 _MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
-_AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
 def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "Eval")) -> Figure:
@@ -113,47 +111,42 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
     return figure
 
 
-def draw_adaptation(evaluation: Json, where: object) -> Figure:
+def draw_adaptation(evaluation: Evaluated, where: object) -> Figure:
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if ``evaluation`` (of evaluation.json or
-    of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names the source in messages) holds no meta-test.
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is no meta-test;
+    ``where`` names its source.
     """
-    if isinstance(evaluation, dict):
-        splits = evaluation.get("splits")
-    else:
-        splits = None
-    if not splits:
-        raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {_AGAIN.format(where)}")
-    check_evaluation(evaluation, str(where))
-    figure, blocks = _task_panels([list(part["before"]["classes"]) for part in splits.values()])
+    if not isinstance(evaluation, MetaTestEvaluation):
+        again = f"Write one: bidex-meta evaluate RUN --shots 3 --json > {where}"
+        raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {again}")
+    splits = evaluation.splits
+    figure, blocks = _task_panels([list(part.before.classes) for part in splits.values()])
     for (split, part), axes in zip(splits.items(), blocks, strict=True):
-        for name, panels in zip(part["before"]["classes"], axes, strict=True):
-            rows = [shot["classes"][name] for shot in part["by_shot"]]
-            for axis, measure in zip(panels, _MEASURES, strict=True):
-                _draw_shots(axis, rows, measure, _COLOURS.get(split))
+        for name, panels in zip(part.before.classes, axes, strict=True):
+            rows = [shot.classes[name] for shot in part.by_shot]
+            _draw_shots(panels, rows, _COLOURS.get(split))
             panels[0].set_title(_plain(f"{split}: {name}"), fontsize=10)
     return figure
 
 
-def read_evaluation(path: Path) -> Json:
-    """Return the content of an evaluation's file; raises BidexError if it is missing or not JSON."""
-    if not exists(path):
-        raise BidexError(f"There is no {path}. {_AGAIN.format(path)}")
-    return read_json(path, "an evaluation")
+def _draw_shots(panels: tuple[Axes, Axes], rows: list[ClassSummary], colour: str | None) -> None:
+    """Draw the return after each shot into the upper panel, and the success rate into the lower one."""
+    upper, lower = panels
+    _draw_band(upper, [row.mean_return for row in rows], [row.return_interval for row in rows], colour)
+    _draw_band(lower, [row.success for row in rows], [row.success_interval for row in rows], colour)
+    lower.set_ylim(-0.02, 1.02)
+    lower.set_xlabel("shots")
 
 
-def _draw_shots(axis: Axes, rows: list[Json], measure: str, colour: str | None) -> None:
-    shots = list(range(len(rows)))
-    axis.plot(shots, [row[measure] for row in rows], marker="o", markersize=3, linewidth=1.2, color=colour)
-    ends = [row[f"{measure}_interval"] for row in rows]
-    if all(ends):
-        axis.fill_between(shots, [low for low, _ in ends], [high for _, high in ends], alpha=0.2, color=colour)
+def _draw_band(axis: Axes, values: list[float], intervals: list[Interval | None], colour: str | None) -> None:
+    shots = list(range(len(values)))
+    axis.plot(shots, values, marker="o", markersize=3, linewidth=1.2, color=colour)
+    if all(intervals):
+        low, high = np.array(intervals).T
+        axis.fill_between(shots, low, high, alpha=0.2, color=colour)
     axis.grid(alpha=0.3)
     axis.set_xticks(shots)
-    if measure == "success":
-        axis.set_ylim(-0.02, 1.02)
-        axis.set_xlabel("shots")
 
 
 def _matplotlib() -> Any:
