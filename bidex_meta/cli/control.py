@@ -120,11 +120,11 @@ def _play(folder: RunFolder, flags: ControlFlags) -> Control:
     say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
     test, train = (worlds.world(split, size) for split in ("test", "train"))
     protocol = Protocol(
-        "test", flags.seed, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
+        "test", flags.seed, shots=flags.shots, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
         max_adapt_steps=metatest.adapt_steps_of(config)
     )  # fmt: skip
     found = control(
-        policy_loader(folder, device)[0], test, train, flags.shots, say=say, protocol=protocol,
+        policy_loader(folder, device)[0], test, train, say=say, protocol=protocol,
         references=worlds.references(),
     )  # fmt: skip
     test.close()

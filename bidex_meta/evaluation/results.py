@@ -11,7 +11,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary, summary_json
 from bidex_meta.utils.arguments import checked_arguments
 
-MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
+MANY_TASKS = 10  # number of tasks from which intervals resample tasks instead of episodes
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Evaluation:
         return summary_json(self.summary())
 
 
-Difference = Estimate  # mean return of one policy above another's in a class; tasks of both (few: episodes) resampled
+Difference = Estimate  # of two policies' mean returns in a class; tasks of both (few: episodes) are resampled
 
 
 def results_by_class(
@@ -116,18 +116,25 @@ def results_by_class(
     classes = {}
     for slot, name in enumerate(names):
         own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}
-        finished = [
-            each["return"][(each["slot"] == slot) & ~each["unstable"].astype(bool)] for each in (episodes, *compared)
-        ]
+        finished = []
+        for played in (episodes, *compared):
+            finished.append(played["return"][(played["slot"] == slot) & ~played["unstable"].astype(bool)])
         broken = own["unstable"].astype(bool)
         reference = (references or {}).get(name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
-            unstable=int(broken.sum()), reference=reference,
-            **{kind: float((own[kind] & ~broken).mean()) for kind in ("once", "at_end") if kind in own},
+            unstable=int(broken.sum()), reference=reference, once=_share(own, "once", broken),
+            at_end=_share(own, "at_end", broken),
         )  # fmt: skip
     return classes
+
+
+def _share(episodes: dict[str, np.ndarray], name: str, broken: np.ndarray) -> float | None:
+    """Return the share of episodes that are solved and not broken; None if ``name`` was not recorded."""
+    if name not in episodes:
+        return None
+    return float((episodes[name] & ~broken).mean())
 
 
 @checked_arguments

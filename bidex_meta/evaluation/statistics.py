@@ -6,6 +6,7 @@ input gives an equal interval.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -198,7 +199,7 @@ def crossed_estimate(statistic: Callable[..., float], *entries: Sequence[np.ndar
     entries. The interval is None if no class has more than one value.
     """
     value = float(statistic(*entries))
-    if max(table.size for entry in entries for table in entry) < 2:
+    if all(table.size < 2 for table in chain.from_iterable(entries)):
         return Estimate(value, None)
     levels = []
     for entry in entries:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
@@ -55,19 +54,21 @@ def at_the_end(folders: Sequence[RunFolder]) -> Json:
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:
     """Return :func:`at_the_end` and measures of the evaluations during ``end`` environment steps of training."""
     curves = [series(folder.metrics(), TAG) for folder in folders]
-    curve: Any = over_runs(curves)
-    powers = [10**power for power in range(4, 15) if 10**power < end]
-    reached = [steps_to(*each) for each in curves]
+    at = {}
+    for power in range(4, 15):
+        step = 10**power
+        if step < end:
+            at[str(step)] = over_seeds([float(np.interp(step, *curve)) for curve in curves])
+    reached = [steps_to(*curve) for curve in curves]
+    curve = {}
+    for name, values in vars(over_runs(curves)).items():
+        curve[name] = None if values is None else values.tolist()
     return at_the_end(folders) | {
-        "curve": {name: None if values is None else values.tolist() for name, values in vars(curve).items()},
-        "at": {str(at): over_seeds(_success_at(at, curves)) for at in powers},
-        "area": over_seeds([area(*each, end) for each in curves]),
+        "curve": curve,
+        "at": at,
+        "area": over_seeds([area(*curve, end) for curve in curves]),
         "half": {"of_seeds": reached, "median": median_steps(reached)},
     }
-
-
-def _success_at(step: int, curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float]:
-    return [float(np.interp(step, *curve)) for curve in curves]
 
 
 def over_seeds(of_seeds: list[float]) -> Json:

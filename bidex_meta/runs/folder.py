@@ -206,16 +206,25 @@ def _torn_start(path: Path) -> bool:
     """Return whether a folder only holds files that a run makes before the end of its first iteration."""
     try:
         entries = list(path.iterdir())
-        found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
-        known = all(entry.name in _ENTRIES or entry.name.startswith(_EVENTS) for entry in found)
-        # A single temporary file belongs to the config: the check that the config can be written was killed.
-        known = known and (bool(found) or all(entry.name.startswith(".config.json.") for entry in entries))
-        known = known and not any(entry.is_symlink() for entry in found or entries)
-        inner = [each for entry in found if entry.name in _ENTRIES[:2] for each in entry.iterdir()]
-        empty = all(each.name.endswith(TEMPORARY_SUFFIX) for each in inner)  # such as the room of a checkpoint
-        return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
+        whole = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
+        if not whole:
+            # A single temporary file belongs to the config: the check that the config can be written was killed.
+            checked = [entry for entry in entries if entry.name.startswith(".config.json.")]
+            return bool(entries) and checked == entries and not any(entry.is_symlink() for entry in entries)
+        return all(_is_of_a_start(entry) for entry in whole)
     except OSError:
         return False
+
+
+def _is_of_a_start(entry: Path) -> bool:
+    """Return whether an entry of a run folder can be there before the end of the first iteration."""
+    if entry.is_symlink():
+        return False
+    if entry.name in ("checkpoints", "videos"):  # a checkpoint's room is reserved by temporary files
+        return all(inner.name.endswith(TEMPORARY_SUFFIX) for inner in entry.iterdir())
+    if entry.name == "metrics.jsonl":
+        return entry.stat().st_size == 0
+    return entry.name in _ENTRIES or entry.name.startswith(_EVENTS)
 
 
 def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:
