@@ -1,4 +1,4 @@
-"""What an evaluation asks of an agent. Names and order of calls are Meta-World's, so that an agent serves both."""
+"""The interface of agents to an evaluation. Names and order of calls are Meta-World's, so that an agent serves both."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -6,14 +6,17 @@ from torch import Tensor
 
 
 class Agent(Protocol):
-    """Whatever can be judged."""
+    """A policy that an evaluation can judge."""
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``; no exploration."""
+        """Return actions ``(num_envs, action)`` in [-1, 1], without exploration.
+
+        ``obs`` are the observations ``(num_envs, observation)``.
+        """
         ...
 
     def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the environments of a mask, bool ``(num_envs,)``: forget what was known of them."""
+        """Forget the episode in the environments of a mask, bool ``(num_envs,)``: a new one begins there."""
 
 
 class Timestep(NamedTuple):
@@ -45,20 +48,20 @@ class MetaLearningAgent(Agent, Protocol):
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Which environments play the same task and share what they learn: numbers from 0 on, int64 ``(num_envs,)``.
+        """Take which environments play the same task and share what they learn: int64 ``(num_envs,)``, from 0 on.
 
-        None: each has a task of its own, as in Meta-World's evaluation, which does not call this.
+        None: each environment has its own task, as in Meta-World's evaluation, which does not call this.
         """
 
     def init(self) -> None:
-        """Back to what was meta-learned; all adaptation and its data are forgotten."""
+        """Return to the meta-learned state: forget all adaptation and its data."""
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Exploring actions ``(num_envs, action)``, and what ``step`` shall be given back of the policy's outputs."""
+        """Return exploring actions ``(num_envs, action)``, and the policy's outputs that ``step`` is given back."""
         ...
 
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every environment."""
+        """Take in one transition of every environment."""
 
     def adapt(self) -> None:
-        """Learns from all transitions since the last ``adapt`` or ``init``."""
+        """Learn from all transitions since the last ``adapt`` or ``init``."""

@@ -57,13 +57,13 @@ class Task(NamedTuple):
     @classmethod
     @checked_arguments
     def from_variation(cls, env_name: Text, variation: np.ndarray | Sequence[float]) -> "Task":
-        """The task of a class with this variation, shape (size,)."""
+        """Return the task of a class with this variation, shape (size,)."""
         numbers = real_numbers("variation", variation, 1)
         return cls(env_name, numbers.astype(_NUMBERS).tobytes())
 
     @property
     def variation(self) -> np.ndarray:
-        """The numbers of `data`: shape (size,), float64, a copy; BidexError where it holds none."""
+        """Return the numbers of `data`: shape (size,), float64, a copy; raises BidexError if it holds none."""
         try:
             return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
         except (TypeError, ValueError):
@@ -151,12 +151,12 @@ class Benchmark:
 
     @property
     def name(self) -> str:
-        """The suite's name."""
+        """Return the suite's name."""
         return self.suite.name
 
     @property
     def train_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the train split by their tasks' `env_name`, in the order of the suite file.
+        """Return the environment classes of the train split by their tasks' `env_name`, in the order of the suite file.
 
         Classes of version 2 are also found by their name without `-v2`.
         """
@@ -164,27 +164,27 @@ class Benchmark:
 
     @property
     def test_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the test split, as `train_classes`; empty in a multi-task suite."""
+        """Return the environment classes of the test split, as `train_classes`; empty in a multi-task suite."""
         return self._env_classes("test")
 
     @checked_arguments
     def task_classes(self, split: Split = "train") -> dict[str, TaskClass]:
-        """What the classes of a split are (scene, observation, reward), by name."""
+        """Return the classes of a split (scene, observation, reward) by name."""
         classes = {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
         return ByClass(classes, self.suite.rules)
 
     @property
     def train_tasks(self) -> list[Task]:
-        """Tasks of the train split, class after class."""
+        """Return the tasks of the train split, class after class."""
         return list(chain.from_iterable(self._tasks["train"].values()))
 
     @property
     def test_tasks(self) -> list[Task]:
-        """Tasks of the test split, class after class; empty in a multi-task suite."""
+        """Return the tasks of the test split, class after class; empty in a multi-task suite."""
         return list(chain.from_iterable(self._tasks["test"].values()))
 
     def tasks_of(self, name: str, split: str = "train") -> list[Task]:
-        """Tasks of a class in a split; in version 2 the name may end in `-v2` or not.
+        """Return the tasks of a class in a split; in version 2 the name may end in `-v2` or not.
 
         Raises BidexError for a class that the split does not have.
         """
@@ -200,7 +200,10 @@ class Benchmark:
 
     @property
     def padded_size(self) -> int:
-        """Width to which every observation is padded, before a one-hot: the widest class of the suite, both splits."""
+        """Return the width to which every observation is padded, before a one-hot.
+
+        It is the width of the suite's widest class, of both splits.
+        """
         return max(task_class.observation_size for task_class in self._classes.values())
 
     def make_world(
@@ -216,7 +219,7 @@ class Benchmark:
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
     ) -> World:
-        """A batched world of one split.
+        """Make a batched world of one split.
 
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks; in a meta
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo their number.
@@ -334,7 +337,7 @@ def make_task_world(
     pixels: int = 0,
     task_seed: int | None = None,
 ) -> World:
-    """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
+    """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
     `task_name` is a task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
     `"package.module:Class"` of your own (docs/own-task.md). Beside the arguments of `Benchmark.make_world`:
