@@ -18,6 +18,7 @@ from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.provenance import differences
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
@@ -189,7 +190,7 @@ def _again(
 ) -> Json:
     """The recorded evaluation, made again."""
     load = partial(policy_of, folder, state, config.device)
-    if learner_kind(config.algo).make.adapts != ("splits" in recorded):
+    if (Capability.ADAPTS in learner_kind(config.algo).make.capabilities) != ("splits" in recorded):
         if "splits" in recorded:
             kind = "a meta-test"
         else:
