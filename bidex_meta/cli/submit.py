@@ -19,6 +19,7 @@ from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few
@@ -94,7 +95,7 @@ def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
     for folder, config in zip(folders, configs, strict=True):
         if config.suite is None:
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
-        if learner_kind(config.algo).make.adapts:
+        if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
             raise BidexError(f"{config.algo} adapts to tasks, and the leaderboard is of policies that do not (yet).")
         if run_kind(config) != run_kind(configs[0]):
             raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")

@@ -28,6 +28,7 @@ from bidex_meta.runs.evaluations import (
 )
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
@@ -161,7 +162,7 @@ def evaluate(
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
-    if learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
         raise BidexError(f"{config.algo} adapts to tasks: its policy alone says little. Use meta_test(run).")
     state, steps = load_checkpoint(folder, checkpoint)
     policy = policy_of(folder, state, config.device)
@@ -224,7 +225,7 @@ def meta_test(
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
-    if not learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
         raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
     metatest.check_worlds(worlds, config.algo)
     splits = metatest.splits_of(worlds, split)

@@ -26,6 +26,7 @@ from bidex_meta.runs.provenance import differences, versions_of
 from bidex_meta.runs.versions import Versions
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
 from bidex_meta.world.threads import set_up_torch
@@ -161,7 +162,8 @@ def _again(
     """Return the results of the recorded evaluation, made again."""
     load = partial(policy_of, folder, state, config.device)
     seed = recorded.seed or 0
-    if learner_kind(config.algo).make.adapts != isinstance(recorded, MetaTestEvaluation):
+    adapts = Capability.ADAPTS in learner_kind(config.algo).make.capabilities
+    if adapts != isinstance(recorded, MetaTestEvaluation):
         if isinstance(recorded, MetaTestEvaluation):
             kind = "a meta-test"
         else:
