@@ -61,17 +61,17 @@ class Rules:
 
     @property
     def wide(self) -> bool:
-        """Whether the variation is wide."""
+        """Return whether the variation is wide."""
         return self.variation == "wide"
 
     @property
     def as_printed(self) -> bool:
-        """Whether returns compare with those of version 1: the same tasks and reward."""
+        """Return whether returns can be compared with those of version 1: the same tasks and reward."""
         return self.reward == "paper" and not self.wide
 
     @property
     def jittered(self) -> bool:
-        """Whether starts are jittered."""
+        """Return whether starts are jittered."""
         return self.starts == "jittered"
 
 
@@ -104,7 +104,7 @@ _Range = tuple[_Factor, _Factor]
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What is drawn anew for an environment, uniformly from ranges, or added as noise; nothing by default.
+    """Factors drawn for an environment, uniformly from ranges, and added noise; nothing by default.
 
     Raises BidexError for values out of bounds or ranges that fall.
     """
@@ -163,7 +163,7 @@ class SuiteClass:
     """One task class of a suite."""
 
     name: str
-    """What it is called in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
+    """Name in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
     class_name: str
     splits: tuple[Split, ...]
     reward_scale: float
@@ -172,7 +172,7 @@ class SuiteClass:
     tasks: tuple[ListedTask, ...]
     """Listed tasks; empty where the tasks are drawn."""
     options: Mapping[str, float | str]
-    """What else the class lets one choose, by the names of its constructor's arguments."""
+    """Further options of the class, by the names of its constructor's arguments."""
 
 
 @checked_arguments
@@ -187,12 +187,12 @@ class Suite:
     """Multi-task suites have a train split only; meta suites both, without a task in common."""
     description: str
     observation: Literal["plain", "one-hot", "masked"]
-    """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
+    """Change of the padded observation: none, task id appended, goal entries zeroed."""
     task_id: Literal["class", "task"]
-    """What one entry of the one-hot stands for: a class or a listed task."""
+    """Meaning of one entry of the one-hot: a class or a listed task."""
     rules: Rules
     base: Literal["moving", "alone"]
-    """Whether every class gets the moving base, or each what it has on its own."""
+    """Moving bases for every class, or for each class the base that it has alone."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
@@ -200,9 +200,9 @@ class Suite:
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False
-    """Whether each point tells what it is of."""
+    """True if each point has its kind as a fourth entry."""
     randomisation: Randomisation | None = None
-    """Of training worlds."""
+    """Randomisation of training worlds."""
 
     def __post_init__(self) -> None:
         """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
@@ -210,9 +210,10 @@ class Suite:
 
     @property
     def digest(self) -> str:
-        """Twelve hexadecimal digits of all that decides tasks, rewards and observations, whatever the file's version.
+        """Return twelve hexadecimal digits of everything that decides tasks, rewards and observations.
 
-        Entries with their default value do not enter, so that a new kind of entry leaves old digests as they are.
+        The file's version does not enter. Entries with their default value do not enter either, so that a new kind of
+        entry leaves old digests as they are.
         """
         content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
         if self.rules.wide:
@@ -221,11 +222,11 @@ class Suite:
 
     @property
     def splits(self) -> tuple[Split, ...]:
-        """The splits that hold at least one class."""
+        """Return the splits that hold at least one class."""
         return tuple(split for split in SPLITS if self.split_classes(split))
 
     def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
-        """The classes of one split, in file order."""
+        """Return the classes of one split, in file order."""
         return tuple(entry for entry in self.classes if split in entry.splits)
 
 
@@ -233,7 +234,7 @@ _OF_THE_FILE = ("name", "version", "description", "file")
 
 
 def _chosen(value: Any) -> Any:
-    """A value ready for JSON: of dataclasses the fields that are no default, of paths the name."""
+    """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))
         return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
@@ -258,7 +259,7 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
 
 
 def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Return in words how other rules, by name, differ from some; empty where they are equal."""
+    """Return in words how other rules, by name, differ from ``rules``; empty if they are equal."""
     pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
     return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
@@ -278,7 +279,7 @@ def file_names() -> list[str]:
 
 @checked_arguments
 def metaworld_classes(suite: str) -> tuple[str, ...]:
-    """The classes of one of Meta-World's suites; BidexError where there is none, with the nearest name."""
+    """Return the classes of one of Meta-World's suites; raises BidexError for another, with the nearest name."""
     if suite not in METAWORLD_SUITES:
         raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
     return METAWORLD_SUITES[suite]
@@ -286,7 +287,7 @@ def metaworld_classes(suite: str) -> tuple[str, ...]:
 
 @checked_arguments
 def load_suite(name_or_path: str | Path) -> Suite:
-    """Reads a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
+    """Read a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
 
     Raises BidexError for a missing suite or file, or a file that is not as `suites/README.md` describes.
     """
@@ -314,9 +315,9 @@ def _shipped(name: str) -> Suite:
 
 @checked_arguments
 def load_randomisation(path: str | Path) -> Randomisation:
-    """The table ``[randomisation]`` of a TOML file: a suite's, or one that holds nothing else.
+    """Read the table ``[randomisation]`` of a TOML file: a suite's, or a file that holds nothing else.
 
-    Raises BidexError where there is none, or a faulty one.
+    Raises BidexError if the file has no such table, or a faulty one.
     """
     content = read_toml(expanded(path), "a file with a table [randomisation]")
     if "randomisation" not in content:
@@ -374,7 +375,7 @@ class _File:
     starts: Literal["plain", "jittered"] = "plain"
 
     def texts(self) -> Iterator[tuple[str, object]]:
-        """What comes to terminals, by its place in the file."""
+        """Yield every text that may be printed on a terminal, with its location in the file."""
         yield from (("name", self.name), ("description", self.description))
         for i, entry in enumerate(self.classes):
             yield f"classes[{i}].name", entry.name
@@ -400,7 +401,7 @@ def _parse(file: Path) -> Suite:
 
 
 def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]:
-    """A class, or with `objects` one for each of them."""
+    """Yield the class of an entry, or with `objects` one class per object."""
     options: dict[str, float | str] = dict(entry.options)
     for name, value in options.items():
         if isinstance(value, str) != (name == "object"):
@@ -426,7 +427,7 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
 
 
 def _object(file: Path, name: str) -> str:
-    """An object's name; of a file its path, which is relative to the suite file's folder."""
+    """Return an object's name; for a file its path, which is relative to the suite file's folder."""
     if name.endswith(".xml"):
         return str(absolute(file.parent / expanded(name)))
     return name

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from torch import nn
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.policies import load_policy
 from bidex_meta.experiments.sweep_plan import read_sweep
+from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation, evaluation_json
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
-from bidex_meta.runs.provenance import differences
+from bidex_meta.runs.provenance import differences, versions_of
 from bidex_meta.runs.stored import FORMAT, read_study, study_text
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.utils.files import portable, read_text
@@ -81,16 +83,17 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dic
         BidexError: The run is not evaluated, its evaluation is of another run or of fewer steps, or its commit is not
             known.
     """
-    config, evaluation = folder.config().to_json(), folder.evaluation()
-    rows, versions = folder.metrics(), folder.versions()
-    _check(folder, evaluation, rows, versions)
+    config = folder.config().to_json()
+    evaluation = folder.evaluation()
+    rows = folder.metrics()
+    _check(folder, evaluation, rows)
     return {
         "format": FORMAT,
         "name": folder.path.resolve().name,
         "arm": arm or arm_of(folder.path, config),
         "suite": _suite(config["suite"]),
         "config": portable(config),
-        "versions": versions,
+        "versions": folder.versions(),
         "engine": _engine(config),
         "steps": rows[-1]["step"],
         "seconds": _rounded(training_seconds(rows), 6),
@@ -133,32 +136,40 @@ def _parameters(folder: RunFolder) -> int | None:
     return sum(each.numel() for each in module.parameters()) if isinstance(module, nn.Module) else None
 
 
-def _check(
-    folder: RunFolder, evaluation: dict[str, Any], rows: Sequence[dict[str, Any]], versions: dict[str, Any]
-) -> None:
+def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[dict[str, Any]]) -> None:
     """Raise BidexError for a run whose table nobody could trust or repeat."""
     if not rows:
         raise BidexError(f"{folder.metrics_path} holds nothing: not a run that has trained. Name another.")
-    steps = min(evaluation.get("steps", rows[-1]["step"]), rows[-1]["step"])
+    steps = rows[-1]["step"]
+    if evaluation.steps is not None:
+        steps = min(steps, evaluation.steps)
     if steps < folder.goal:
         raise BidexError(
             f"{folder.path} is evaluated at {steps:,} steps, but goes on to {folder.goal:,}. "
             f"Let it end: bidex-meta run --resume {folder.path}"
         )
-    if not (versions.get("git") or {}).get("commit"):
+    versions = versions_of(folder)
+    if versions.git is None or not versions.git.commit:
         raise BidexError(f"{folder.path / 'versions.json'} names no commit: nobody could make this run again.")
-    if evaluation.get("split", "train") != "train":
-        raise BidexError(f"{folder.evaluation_path} is of {evaluation['split']} tasks. Write it anew: {folder.again}")
-    other = [str(each) for each in differences(versions, evaluation.get("conditions", {})) if each.is_of_worlds]
+    if evaluation.split != "train":
+        raise BidexError(f"{folder.evaluation_path} is of {evaluation.split} tasks. Write it anew: {folder.again}")
+    other = [str(each) for each in differences(versions, evaluation.conditions) if each.is_of_worlds]
     if other:
         raise BidexError(
             f"{folder.path} was trained with other worlds than its evaluation's: {', '.join(other)}. Evaluate it "
             "with the versions in versions.json."
         )
     trained = {tag.removeprefix(_TRAINED) for row in rows for tag in row if tag.startswith(_TRAINED)}
-    parts = evaluation.get("splits", {"train": {"after": evaluation.get("policy", evaluation)}})
-    missing = trained - {name for part in parts.values() for name in part["after"]["classes"]}
-    if "train" in parts and missing:  # a meta-test of test tasks alone (--split test) may have no class in common
+    if isinstance(evaluation, MetaTestEvaluation):
+        if "train" not in evaluation.splits:
+            return  # a meta-test of test tasks alone (--split test) may have no class in common
+        evaluated = set[str]()
+        for part in evaluation.splits.values():
+            evaluated |= part.after.classes.keys()
+    else:
+        evaluated = evaluation.policy.classes.keys()
+    missing = trained - evaluated
+    if missing:
         raise BidexError(
             f"{folder.evaluation_path} is of another run: it lacks {min(missing)}. Write it anew: {folder.again}"
         )
@@ -180,20 +191,22 @@ def _engine(config: dict[str, Any]) -> str:
     return engine if engine != "auto" else "warp" if str(config.get("device", "cpu")).startswith("cuda") else "c"
 
 
-def _evaluation(found: dict[str, Any]) -> dict[str, Any]:
-    kept = {name: value for name, value in found.items() if name != "run"}
-    if "random" in found:
-        kept["random"] = {"classes": _only(found["random"]["classes"], ("success", "return"))}
-    if "splits" in found:
-        kept["splits"] = {name: dict(part) for name, part in found["splits"].items()}
-        for part in kept["splits"].values():
-            if "by_shot" in part:
-                part["by_shot"] = [{"classes": _only(shot["classes"], _OF_SHOTS)} for shot in part["by_shot"]]
-    return _rounded(kept, 5)
+def _evaluation(evaluation: Evaluated) -> dict[str, Any]:
+    """Return the content of an evaluation with less about random actions, and about each shot."""
+    content = evaluation_json(replace(evaluation, run=None))
+    if "random" in content:
+        content["random"] = _only(content["random"], ("success", "return"))
+    for part in content.get("splits", {}).values():
+        part["by_shot"] = [_only(shot, _OF_SHOTS) for shot in part["by_shot"]]
+    return _rounded(content, 5)
 
 
-def _only(classes: dict[str, Any], measures: Sequence[str]) -> dict[str, Any]:
-    return {name: {measure: row.get(measure) for measure in measures} for name, row in classes.items()}
+def _only(summary: dict[str, Any], measures: Sequence[str]) -> dict[str, Any]:
+    """Return some measures of the classes of a summary."""
+    classes = {}
+    for name, row in summary["classes"].items():
+        classes[name] = {measure: row[measure] for measure in measures}
+    return {"classes": classes}
 
 
 def _curves(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:

@@ -8,6 +8,7 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Kind, load, store
+from bidex_meta.runs.evaluations import PolicyEvaluation
 from bidex_meta.runs.stored import Run, open_runs
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.worlds import Worlds
@@ -65,16 +66,19 @@ def _of_run(run: Run) -> list[tuple[str, dict[str, Any]]]:
         raise BidexError(
             f"Expected a run with moving bases, as in suites, but {run.path} plays {source.name} with fixed ones."
         )
-    found = run.evaluation()
-    if "policy" not in found:
+    evaluation = run.evaluation()
+    if not isinstance(evaluation, PolicyEvaluation):
         raise BidexError(
             f"Expected the evaluation of one policy, but that of {run.path} is a meta-test. Name a run of "
             "mtppo, mttrpo or mtsac."
         )
-    classes = found["policy"]["classes"]
-    steps = found.get("steps", config.steps)  # of what time, a return or a score has ended fewer than were asked for
+    # Time, a return or a score may have ended the run before the steps of its config.
+    steps = config.steps if evaluation.steps is None else evaluation.steps
     told = f"{config.algo} on {source.name}, {steps:,} steps, seed {config.seed}"
-    return [(name, row | {"source": told}) for name, row in classes.items()]
+    rows = []
+    for name, row in evaluation.policy.classes.items():
+        rows.append((name, {"return": row.mean_return, "success": row.success, "source": told}))
+    return rows
 
 
 if __name__ == "__main__":

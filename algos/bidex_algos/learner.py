@@ -20,8 +20,8 @@ from bidex_algos.rollout import check_autoreset
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import broadcast, own_seed
+from bidex_meta.training.learner import Capability, LearnerConfig, Parts, State
 from bidex_meta.training.learner import Learner as Contract
-from bidex_meta.training.learner import LearnerConfig, Parts, State
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -49,8 +49,6 @@ class Learner(Contract):
 
     remedy: ClassVar[str]  # advice when a loss is no longer finite
     config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
-    discounts_by_class: ClassVar[bool] = False
-    """True if the learner supports discounts per class (``world.gammas``)."""
     unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
@@ -66,7 +64,7 @@ class Learner(Contract):
         self.env_steps = 0
         self.shape = Shape.of(world)
         check_options(self.name, config, world, self.shape)
-        check_discounts(self.name, world, self.discounts_by_class)
+        check_discounts(self.name, world, Capability.DISCOUNTS_BY_CLASS in self.capabilities)
         self.inputs = self._inputs(config, self.shape)
         # Weights are drawn from a CPU generator, so that a seed gives the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)

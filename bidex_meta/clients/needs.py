@@ -26,8 +26,7 @@ def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = Auto
     check_argument("world", world, VectorWorld)
     given = world.metadata["autoreset_mode"]
     if given != mode:
-        usual = mode == AutoresetMode.SAME_STEP
-        if usual:
+        if mode == AutoresetMode.SAME_STEP:
             mend = "without autoreset_mode"
         else:
             mend = f"with autoreset_mode={mode.name!r}"

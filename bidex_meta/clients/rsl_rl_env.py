@@ -43,7 +43,9 @@ class RslRlVecEnv(VecEnv):
         groups = {group.name: group for group in world.observation_groups}
         for name in set(policy) - groups.keys():
             raise unknown_name("observation group", name, groups)
-        entries = [torch.arange(part.start, part.stop) for name in policy for part in groups[name].where]
+        entries = []
+        for name in policy:
+            entries += [torch.arange(part.start, part.stop) for part in groups[name].where]
         if entries:
             self._policy = torch.cat(entries).to(world.device)
         else:

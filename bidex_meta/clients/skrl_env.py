@@ -40,12 +40,12 @@ class SkrlEnv(Wrapper):
 
     @property
     def observation_space(self) -> Box:
-        """Observation space of one environment."""
+        """Return the observation space of one environment."""
         return self.world.single_observation_space
 
     @property
     def action_space(self) -> Box:
-        """Action space of one environment."""
+        """Return the action space of one environment."""
         return self.world.single_action_space
 
     def reset(self) -> tuple[Tensor, Info]:

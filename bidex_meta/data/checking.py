@@ -216,7 +216,7 @@ def _size(block: Block, sensor: str) -> int:
 
 
 @dataclass(frozen=True)
-class ClassSummary:
+class SlotSummary:
     """One slot of a data set."""
 
     name: str  # class, or class and task
@@ -230,7 +230,7 @@ class ClassSummary:
     broken: int  # episodes ended by broken physics
 
 
-def summary(dataset: Dataset) -> list[ClassSummary]:
+def summary(dataset: Dataset) -> list[SlotSummary]:
     """Summarise each slot that has episodes; read only the tables."""
     table = dataset.table
     summaries = []
@@ -244,7 +244,7 @@ def summary(dataset: Dataset) -> list[ClassSummary]:
         if known := dataset.metadata.get("references", {}).get(name.partition("/")[0]):
             scores = Reference(known["random"], known.get("expert"), known.get("zero")).scores(returns)
         summaries.append(
-            ClassSummary(
+            SlotSummary(
                 name=name,
                 episodes=int(own.sum()),
                 steps=int(steps.sum()),

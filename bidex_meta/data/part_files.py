@@ -26,11 +26,10 @@ import numpy as np
 
 from bidex_meta.data import seals
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.runs.atomic import sync_folder
+from bidex_meta.runs.atomic import Json, sync_folder
 from bidex_meta.utils.files import is_file
 
 H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no types
-Json = dict[str, Any]
 
 MAIN = "main_data.hdf5"
 METADATA = "metadata.json"

@@ -23,7 +23,7 @@ from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.training.launch import launch, say
-from bidex_meta.training.learner import Learner
+from bidex_meta.training.learner import Capability, Learner
 from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds
@@ -86,7 +86,7 @@ class Watch:
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        if self._kind.make.adapts:
+        if Capability.ADAPTS in self._kind.make.capabilities:
             metrics = self._meta_test()
         else:
             metrics = _metrics(self._judge())

@@ -144,8 +144,8 @@ def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = 
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
         raise BidexError(f"meta_batch_size and total_tasks_per_cls are of meta suites; {benchmark.name} is none.")
     classes = benchmark.train_classes
-    places = [(env_class.recipe, benchmark.tasks_of(name)) for name, env_class in classes.items()]
-    return _make_vector(places, seed, num_tasks=num_tasks or len(places), **options)
+    envs = [(env_class.recipe, benchmark.tasks_of(name)) for name, env_class in classes.items()]
+    return _make_vector(envs, seed, num_tasks=num_tasks or len(envs), **options)
 
 
 def _meta(
@@ -171,12 +171,11 @@ def _meta(
     if size < 1 or size % len(classes):
         what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
         raise BidexError(f"meta_batch_size: expected {what}; got {size}.")
-    places = [
-        (env_class.recipe, share)
-        for name, env_class in classes.items()
-        for share in _split_tasks(benchmark.tasks_of(name, split)[:total_tasks_per_cls], size // len(classes))
-    ]
-    return _make_vector(places, seed, **options)
+    envs = []
+    for name, env_class in classes.items():
+        tasks = benchmark.tasks_of(name, split)[:total_tasks_per_cls]
+        envs += [(env_class.recipe, share) for share in _split_tasks(tasks, size // len(classes))]
+    return _make_vector(envs, seed, **options)
 
 
 @checked_arguments
@@ -232,17 +231,17 @@ def make_env(
 
 @checked_arguments
 def _make_vector(
-    places: Sequence[tuple[EnvRecipe, list[Task]]],
+    envs: Sequence[tuple[EnvRecipe, list[Task]]],
     seed: int | None = None,
     vector_strategy: str = "sync",
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     **options: Option,
 ) -> SyncVectorEnv | AsyncVectorEnv:
     make = _STRATEGIES[known_name("vector_strategy", vector_strategy, _STRATEGIES)]
-    makers = [
-        partial(make_env, recipe, tasks, seed=None if seed is None else seed + i, **{"env_id": i, **options})
-        for i, (recipe, tasks) in enumerate(places)
-    ]
+    makers = []
+    for number, (recipe, tasks) in enumerate(envs):
+        own_seed = None if seed is None else seed + number
+        makers.append(partial(make_env, recipe, tasks, seed=own_seed, **{"env_id": number, **options}))
     return make(makers, autoreset_mode=checked_mode(autoreset_mode))
 
 

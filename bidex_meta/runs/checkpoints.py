@@ -13,15 +13,16 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from types import ModuleType
+from typing import IO
 
 from bidex_meta.errors import BidexError, one_line, shortened
-from bidex_meta.runs.atomic import refuse_links, remove_leftovers, room_for, write_atomic
+from bidex_meta.runs.atomic import Json, refuse_links, remove_leftovers, room_for, write_atomic
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, open_regular
 from bidex_meta.utils.validation import Whole
 
-State = dict[str, Any]  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
+State = Json  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
 FORMAT = 2  # goes up when older code could not read a checkpoint
 _DEEPEST = 100
@@ -33,7 +34,7 @@ class Checkpoints:
     """The checkpoints of one run."""
 
     folder: Path  # created by the first ``save``
-    keep: Whole = 3  # how many ``step_<N>.pt`` stay: several, so that one damaged file does not end the run
+    keep: Whole = 3  # number of ``step_<N>.pt`` that stay: several, so that one damaged file does not end the run
 
     @property
     def last(self) -> Path:
@@ -100,10 +101,7 @@ class Checkpoints:
 
     def found_of_best(self) -> dict[str, float] | None:
         """Return the results of the policy in ``best.pt``; None if there is no readable one."""
-        if exists(self.best):
-            content = _read(self.best, "none is known")
-        else:
-            content = None
+        content = _read(self.best, "none is known") if exists(self.best) else None
         if content is None:
             return None
         return content.get("found")
@@ -157,7 +155,7 @@ class Checkpoints:
         return [path for _, path in sorted(found, reverse=True)]
 
 
-def _torch():
+def _torch() -> ModuleType:
     import torch  # not at the top: `bidex-meta list` starts without it
 
     return torch
@@ -218,7 +216,7 @@ def weights_digest(policy: State) -> str:
     return _digest({"weights": _halved(policy.get("weights", policy))})[:32]
 
 
-def _halved(value: Any) -> Any:
+def _halved(value: object) -> object:
     if isinstance(value, dict):
         return {name: _halved(part) for name, part in sorted(value.items())}
     is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
@@ -246,13 +244,13 @@ def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
         found.update(flat.view(torch.uint8).numpy().data)
     elif isinstance(value, dict):
         found.update(f"dict {len(value)}:".encode())
-        for name, each in value.items():
+        for name, entry in value.items():
             _feed(name, found, depth + 1)
-            _feed(each, found, depth + 1)
+            _feed(entry, found, depth + 1)
     elif isinstance(value, list | tuple):
         found.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}:".encode())
-        for each in value:
-            _feed(each, found, depth + 1)
+        for entry in value:
+            _feed(entry, found, depth + 1)
     else:
         # repr gives every bit of a float, except for NaN.
         if isinstance(value, bytes):

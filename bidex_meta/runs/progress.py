@@ -5,7 +5,7 @@ import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, TextIO, TypeVar
+from typing import TextIO, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -63,7 +63,7 @@ class Progress:
         if self._live is not None:
             self._live.start()
 
-    def update(self, metrics: Mapping[str, Any], step: int) -> None:
+    def update(self, metrics: Mapping[str, float], step: int) -> None:
         """Show an iteration's metrics; earlier values stay, because an iteration may end no episode.
 
         Raises BrokenPipeError if the reader has ended or the terminal is gone; later output is discarded.
@@ -89,8 +89,8 @@ class Progress:
                 self._print(self._overall(self._step))
 
     def _tasks(self) -> list[str]:
-        starts = (_SUCCESS, _RETURN)
-        return list(dict.fromkeys(tag[len(s) :] for tag in self._shown for s in starts if tag.startswith(s)))
+        tags = [tag for tag in self._shown if tag.startswith((_SUCCESS, _RETURN))]
+        return list(dict.fromkeys(tag.split("/", 2)[2] for tag in tags))
 
     def _of_tasks(self) -> list[str]:
         return [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]

@@ -170,7 +170,7 @@ def _is_protocol(hint: object) -> bool:
 
 
 def _lacking(value: object, protocol: Any) -> list[str]:
-    """Attributes of a protocol that a value does not have."""
+    """Return the attributes of a protocol that a value does not have."""
     return [name for name in _members(protocol) if not hasattr(value, name)]
 
 
@@ -185,7 +185,7 @@ def _members(protocol: type) -> list[str]:
 
 
 def _expected(hint: Any) -> str:
-    """An annotation in words."""
+    """Return an annotation in words."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:

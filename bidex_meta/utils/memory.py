@@ -39,9 +39,9 @@ def available() -> int:
 
 
 def check_memory(needed: float, what: str, mend: str) -> None:
-    """Raises BidexError where fewer than ``needed`` bytes are free.
+    """Raise BidexError if fewer than ``needed`` bytes are free.
 
-    ``what`` takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
+    ``what`` is the object that takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
     """
     there = available()
     if needed > there:

@@ -16,7 +16,7 @@ _SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
-    """Geoms that a viewer shows, without planes."""
+    """Return the geoms that a viewer shows, without planes."""
     return [
         geom
         for geom in range(model.ngeom)
@@ -27,14 +27,17 @@ def visible(model: mujoco.MjModel) -> list[int]:
 
 
 def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
-    """Red, green, blue, alpha in [0, 1]: the geom's, or its material's."""
+    """Return red, green, blue, alpha in [0, 1] of a geom, or of its material."""
     material = int(model.geom_matid[geom])
     red, green, blue, alpha = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).tolist()
     return red, green, blue, alpha
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom; BidexError for height fields."""
+    """Return points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
+
+    Raises BidexError for kinds that the browser cannot show, e.g. height fields.
+    """
     make = import_module("trimesh.creation")  # of viser's packages
     kind = model.geom_type[geom]
     size = model.geom_size[geom]
@@ -95,11 +98,11 @@ class Browser:
             gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))
 
     def is_open(self) -> bool:
-        """Until it is interrupted."""
+        """Return True: the view is open until it is interrupted."""
         return True
 
     def obey(self, stage: Stage) -> None:
-        """The controls."""
+        """Apply the state of the controls to the stage."""
         self.paused = bool(self._pause.value)
         self.speed = float(self._pace.value)
         stage.tour = bool(self._tour.value)
@@ -139,7 +142,7 @@ class Browser:
             client.camera.look_at = camera.look_at
 
     def show(self, stage: Stage) -> None:
-        """Poses of all shapes and goals, and the status."""
+        """Show the poses of all shapes and goals, and the status."""
         if stage.names[stage.row] != self._chosen:
             self._set_the_scene(stage)
         data = stage.data()
@@ -167,5 +170,5 @@ class Browser:
             handle.wxyz = ghost.quaternion
 
     def close(self) -> None:
-        """Stops the server."""
+        """Stop the server."""
         self._server.stop()

@@ -18,7 +18,7 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class ActionSequences:
-    """Plays ``sequences`` (n, steps, action), ``which`` of them in each environment, and repeats the last action."""
+    """Plays ``sequences`` (n, steps, action), number ``which`` in each environment, and repeats the last action."""
 
     def __init__(self, sequences: Tensor, which: Tensor):
         self._sequences = sequences
@@ -26,17 +26,17 @@ class ActionSequences:
         self._step = torch.zeros_like(which)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
+        """Return the next actions (num_envs, action)."""
         action = self._sequences[self._which, self._step.clamp_max(self._sequences.shape[1] - 1)]
         self._step += 1
         return action
 
     def reset(self, env_mask: Tensor) -> None:
-        """These environments begin again."""
+        """Restart the sequences of the environments of a mask."""
         self._step[env_mask] = 0
 
     def _store(self, sequence: int, actions: Tensor) -> None:
-        """Puts actions (T, a) into the first columns of a sequence, and repeats the last one to its end."""
+        """Write actions (T, a) into the first columns of a sequence, and repeat the last one to its end."""
         into = self._sequences[sequence]
         into[:, : actions.shape[1]] = actions[torch.arange(len(into)).clamp_max(len(actions) - 1)]
 
@@ -61,7 +61,7 @@ class OpenLoopReplay(ActionSequences):
         self._generator = torch.Generator(task_id.device).manual_seed(seed)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
+        """Return the next actions (num_envs, action)."""
         action = super().eval_action(obs)
         if self._noise:
             noise = torch.randn(action.shape, generator=self._generator, device=action.device)
@@ -70,12 +70,12 @@ class OpenLoopReplay(ActionSequences):
 
 
 class Scripted:
-    """Plays the scripts of a world's classes, each row's from the state that it is in.
+    """Plays the scripts of a world's classes, in each environment from its present state.
 
-    ``world`` is on C MuJoCo and has moving bases; ``names``: of the slots that play, None for all, others get zero
-    actions. A script begins with its row's episode, and reacts to whatever moved the hands: noise (of this standard
-    deviation), or another policy's actions. After its end it repeats its last action. ``misled``: each row's is given
-    the next task of its pool, as one that has to guess. Raises BidexError for a class without a script.
+    ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots that play (None: all); other slots get zero
+    actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise`` (a
+    standard deviation) or another policy's actions. After its end it repeats its last action. With ``misled`` each
+    script is given the next task of its pool, as if it had to guess. Raises BidexError for a class without a script.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Scripted:
         self._actions = torch.zeros(world.num_envs, world.action_size)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
+        """Return the next actions (num_envs, action)."""
         for each in self._classes:
             each.write(self._actions)
         if not self._noise:
@@ -105,13 +105,13 @@ class Scripted:
         return (self._actions + self._noise * noise).clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """These environments are at the start of an episode."""
+        """Restart the scripts of the environments of a mask, which are at the start of an episode."""
         for each in self._classes:
             each.begin(env_mask)
 
 
 class _Class:
-    """The scripts of a class's environments, which are led together."""
+    """The scripts of a class's environments, whose actions are computed together."""
 
     def __init__(self, world: World, part: Part, number: int, member: Member, ahead: int):
         task = world.slots[member.slot].task_class
@@ -128,7 +128,7 @@ class _Class:
         self._sensors = part.group.engine.sensordata[member.engine_rows]
 
     def write(self, actions: Tensor) -> None:
-        """Puts the next actions of scripts that have not ended into those (N, a) of the world."""
+        """Write the next actions of scripts that have not ended into the world's actions (N, a)."""
         self._sensors = self._part.group.engine.sensordata[self._member.engine_rows].clone()
         leads = {row: lead for row, script in self._playing.items() if (lead := next(script, None)) is not None}
         if leads:
@@ -138,12 +138,12 @@ class _Class:
             actions[self._member.env_ids][rows, : found.shape[1]] = found
 
     def begin(self, env_mask: Tensor) -> None:
-        """A new script in the environments of the class among a mask (N,)."""
+        """Begin a new script in the class's environments among a mask (N,)."""
         for row in env_mask[self._member.env_ids].nonzero().flatten().tolist():
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
-        """The script of a row; reads nothing before its first action is asked for."""
+        """Play the script of an environment; nothing is read before its first action is requested."""
         place = self._member.env_ids.start + row
         given = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
         frozen = self._part.frozen(self._number, given)
@@ -164,7 +164,7 @@ class ShiftedStarts(PooledWorldWrapper):
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes of all environments, shifted by the seed; raises BidexError for options."""
+        """Start episodes of all environments, shifted by the seed; raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)

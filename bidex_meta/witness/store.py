@@ -35,17 +35,20 @@ class Witness:
 
 
 def quantised(actions: "Tensor") -> "Tensor":
-    """Actions rounded to multiples of 1/127, float32."""
+    """Round actions to multiples of 1/127, float32."""
     return (actions.clamp(-1.0, 1.0) * LEVELS).round() / LEVELS
 
 
 def witness_path(name: str) -> Path:
-    """Path of the installation's witness of a class; nothing is written there by default."""
+    """Return the path of the installation's witness of a class; nothing is written there by default."""
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
 def load_witness(name: str, path: Path | None = None) -> Witness:
-    """A class's witness, or one in a file; BidexError for none, a damaged one or actions of another size."""
+    """Load a class's witness, or one in a file.
+
+    Raises BidexError if it is missing or damaged, or if its actions have another size.
+    """
     if path is None:
         path = witness_path(name)
         if not path.is_file():
@@ -62,7 +65,7 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
 
 
 def save_witness(path: Path, actions: np.ndarray, made: Json) -> Path:
-    """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
+    """Write a witness; actions (T, action_size) must be multiples of 1/127."""
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)
     write_atomic(path, lambda file: np.savez_compressed(file, actions=levels, made=np.array(json.dumps(made))))

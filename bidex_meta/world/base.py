@@ -68,7 +68,7 @@ class BatchedWorld(VectorEnv, ABC):
     observation_groups: tuple[ObservationGroup, ...]
     success_at_end = False
     _masked = False
-    """Whether the host may read no number within a step, because it would wait for the accelerator."""
+    """True if the host may read no number within a step, because it would wait for the accelerator."""
     _stepper: Stepper = EagerStepper()
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
 

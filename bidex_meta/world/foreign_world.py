@@ -92,7 +92,7 @@ class ForeignWorld(BatchedWorld):
         """
 
     def state_dict(self) -> State:
-        """As in ``BatchedWorld``."""
+        """Return the state; see ``BatchedWorld``."""
         return super().state_dict() | {"success": self._success.clone()}
 
     def _restore(self, state: State) -> None:

@@ -123,15 +123,15 @@ class EagerStepper:
     """Runs each stretch as it is."""
 
     def run(self, work: Work, *inputs: Tensor) -> Any:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
         return work(*inputs)
 
     def keep(self, result: Any) -> Any:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
         return result
 
     def forget(self) -> None:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
 
 
 class CapturedStepper:
@@ -147,15 +147,15 @@ class CapturedStepper:
         self._graphs = GraphCache(get, put, record)
 
     def run(self, work: Work, *inputs: Tensor) -> Any:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
         return self._graphs.run(work, work, *inputs)
 
     def keep(self, result: Any) -> Any:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
         return fresh(result)
 
     def forget(self) -> None:
-        """As in ``Stepper``."""
+        """See ``Stepper``."""
         self._graphs.forget()
 
 

@@ -14,7 +14,7 @@ from bidex_meta.utils.maths import conjugate, xyzw
 from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
-"""What a suite shows: everything; everything and the task's id; everything but the goal."""
+"""The observation of a suite: everything; everything and the task's id; everything but the goal."""
 _HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_blocks(side, moving=True)}
 """By name and not by prefix: ``right_handle_position`` is of an object."""
 

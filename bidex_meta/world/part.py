@@ -84,7 +84,7 @@ class Part:
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
         self.looks = self._engine.device.type == "cpu"
-        """Whether the numbers of the user's own classes are checked in every step; on a GPU that would stall it."""
+        """True if every step checks the numbers of the user's own classes; on a GPU that would stall the step."""
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
@@ -263,7 +263,7 @@ class PartedWorld(Protocol):
     task_index: Tensor
     observation_size: int
     hides_goals: bool
-    """Whether observations have zeros in place of goals."""
+    """True if observations have zeros in place of goals."""
 
     @property
     def hidden_size(self) -> int:

@@ -46,7 +46,7 @@ class Randomiser:
 
     @property
     def remembered(self) -> int:
-        """How many actions are remembered, the last one among them; 0 without delay."""
+        """Return the number of actions that are remembered, the last one among them; 0 without delay."""
         most = self._rule.action_delay[1]
         return most + 1 if most else 0
 

@@ -31,7 +31,7 @@ _FAR = 2**31
 
 
 class AnyTask(Protocol):
-    """What `set_task` needs to know of a task (`bidex_meta.Task`)."""
+    """The part of a task (`bidex_meta.Task`) that `set_task` reads."""
 
     @property
     def env_name(self) -> str:
@@ -67,7 +67,7 @@ class EnvRecipe:
 
     @property
     def env_name(self) -> str:
-        """The name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
+        """Return the name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
@@ -105,7 +105,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
     recipe: ClassVar[EnvRecipe]
     task_class: ClassVar[TaskClass]
-    """What the class is: scene, variations, observation, reward, success."""
+    """The class: scene, variations, observation, reward, success."""
 
     @checked_arguments
     def __init__(
@@ -149,12 +149,12 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @property
     def task_name(self) -> str:
-        """The task class's name with its version, as the class's tasks have it."""
+        """Return the task class's name with its version, as the class's tasks have it."""
         return self.recipe.env_name
 
     @property
     def max_path_length(self) -> int:
-        """Time limit of an episode, steps of 1/60 s."""
+        """Return the time limit of an episode, steps of 1/60 s."""
         return self.task_class.episode_steps
 
     def seed(self, seed: int) -> list[int]:

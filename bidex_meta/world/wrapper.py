@@ -49,7 +49,7 @@ class WorldWrapper(VectorWorld):
 
     @property
     def unwrapped(self) -> Any:
-        """The world within all wrappers."""
+        """Return the world within all wrappers."""
         return getattr(self.world, "unwrapped", self.world)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
@@ -74,13 +74,13 @@ class WorldWrapper(VectorWorld):
 
 
 class TaskWorldWrapper(WorldWrapper, TaskWorld):
-    """The same around a ``TaskWorld``."""
+    """A ``TaskWorld`` that passes everything on to another one."""
 
     world: TaskWorld
 
 
 class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
-    """The same around a ``PooledWorld``."""
+    """A ``PooledWorld`` that passes everything on to another one."""
 
     world: PooledWorld
 
@@ -152,7 +152,7 @@ class NumpyWorld(VectorEnv):
 
 
 def _arrays(value: Any) -> Any:
-    """Tensors, and those of a dict, as arrays."""
+    """Return tensors, and those in a dict, as arrays."""
     if isinstance(value, dict):
         return {name: _arrays(each) for name, each in value.items()}
     if isinstance(value, torch.Tensor):

@@ -10,6 +10,7 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.runs import plots
+from bidex_meta.runs.evaluations import MetaTestEvaluation, SplitSummary
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.utils.files import read_json
 from tools.pages.studies import Study
@@ -34,22 +35,23 @@ def gains_table(study: Study) -> Iterator[str]:
         BidexError: A run has no meta-test of the split, or an arm several runs of one seed.
     """
     split = study.split or "test"
-    parts: dict[tuple[str, int], tuple[StoredRun, dict[str, Any]]] = {}
+    parts: dict[tuple[str, int], tuple[StoredRun, SplitSummary]] = {}
     for run in study.runs:
-        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config().seed)
-        if part is None or "gain" not in part:
+        part = _splits(run).get(split)
+        key = (run.arm, run.config().seed)
+        if part is None:
             raise BidexError(f"Study {study.name}: {run.path} has no meta-test of {split} tasks. Leave it out.")
         if key in parts:
             raise BidexError(f"{run.path} and {parts[key][0].path.name} are both seed {key[1]} of the arm {key[0]!r}.")
         parts[key] = run, part
     order, rows = sorted(parts, key=lambda key: (key[0] == CONTROL, *key)), []
-    for name in dict.fromkeys(name for _, part in parts.values() for name in part["gain"]["classes"]):
+    for name in dict.fromkeys(name for _, part in parts.values() for name in part.after.classes):
         for arm, seed in order:
             run, part = parts[arm, seed]  # all runs of a study cover the same classes
             gain, control = _gain(part, name), None if arm == CONTROL else parts.get((CONTROL, seed))
             rows.append([
-                name, arm, str(seed), f"{run.content['steps']:,}", f"{part['shots']} × {part['rollouts']}",
-                _both(part, name, "success", 100.0, " %"), _both(part, name, "return"),
+                name, arm, str(seed), f"{run.content['steps']:,}", f"{part.shots} × {part.rollouts}",
+                _both(part, name, "success", 100.0, " %"), _both(part, name, "mean_return"),
                 _bold(gain), "" if control is None else _bold(_over(gain, _gain(control[1], name))),
             ])  # fmt: skip
     return table(_HEAD, rows)
@@ -120,12 +122,15 @@ def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
 
     for study in studies:
         for run in study.runs:
-            splits = run.evaluation()["splits"]
-            by_shot = splits[study.split or (next(iter(splits)) if len(splits) == 1 else "test")]["by_shot"]
-            shares, returns = (
-                rows(study, {name: [shot["classes"][name][what] for shot in by_shot] for name in by_shot[0]["classes"]})
-                for what in ("success", "return")
-            )
+            splits = _splits(run)
+            by_shot = splits[study.split or (next(iter(splits)) if len(splits) == 1 else "test")].by_shot
+            success = {}
+            mean_returns = {}
+            for name in by_shot[0].classes:
+                success[name] = [shot.classes[name].success for shot in by_shot]
+                mean_returns[name] = [shot.classes[name].mean_return for shot in by_shot]
+            shares = rows(study, success)
+            returns = rows(study, mean_returns)
             for name in shares:
                 seeds = found.setdefault((name, run.arm), _Seeds())
                 seeds.shares.append(shares[name])
@@ -144,9 +149,20 @@ def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
     return dict(sorted(found.items(), key=place))
 
 
-def _gain(part: dict[str, Any], name: str) -> Estimate:
+def _splits(run: StoredRun) -> dict[str, SplitSummary]:
+    """Return the splits of a run's meta-test; empty without one."""
+    evaluation = run.evaluation()
+    if isinstance(evaluation, MetaTestEvaluation):
+        return evaluation.splits
+    return {}
+
+
+def _gain(part: SplitSummary, name: str) -> Estimate:
     """Return the gain of the return."""
-    return Estimate(**part["gain"]["classes"][name]["return"])
+    gain = None if part.gain is None else part.gain.classes[name]["return"]
+    if gain is None:
+        raise BidexError(f"The meta-test of {part.split} tasks has no gain in {name}. Evaluate again.")
+    return gain
 
 
 def _over(gain: Estimate, control: Estimate) -> Estimate:
@@ -159,8 +175,9 @@ def _over(gain: Estimate, control: Estimate) -> Estimate:
     return Estimate(value, (value - low, value + high))
 
 
-def _both(part: dict[str, Any], name: str, measure: str, factor: float = 1.0, unit: str = "") -> str:
-    before, after = (factor * part[when]["classes"][name][measure] for when in ("before", "after"))
+def _both(part: SplitSummary, name: str, measure: str, factor: float = 1.0, unit: str = "") -> str:
+    before = factor * getattr(part.before.classes[name], measure)
+    after = factor * getattr(part.after.classes[name], measure)
     return f"{before:.4g} → {after:.4g}{unit}"
 
 

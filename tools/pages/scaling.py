@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import classes_of, curves_of
+from bidex_meta.evaluation.comparison import curves_of
 from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing
@@ -32,7 +32,7 @@ def rows_table(study: Study) -> Iterator[str]:
     steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
     seeds = sorted({len(runs) for runs in cells.values()})
     yield ""
-    returns = [row["return"] for rows in random_rows(study).values() for row in rows]
+    returns = [row.mean_return for rows in random_rows(study).values() for row in rows]
     random = f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
     yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {random}"
 
@@ -62,7 +62,7 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
 
 
 def _class(study: Study) -> str:
-    names = {name for run in study.runs for name in classes_of(run.evaluation())}
+    names = {name for run in study.runs for name in run.evaluation().results}
     if len(names) != 1:
         raise BidexError(
             f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}."
@@ -73,7 +73,10 @@ def _class(study: Study) -> str:
 def _cell(runs: Sequence[StoredRun]) -> str:
     if not runs:
         return "–"
-    return mean_and_range(np.array([row["return"] for run in runs for row in classes_of(run.evaluation()).values()]))
+    returns = []
+    for run in runs:
+        returns += [row.mean_return for row in run.evaluation().results.values()]
+    return mean_and_range(np.array(returns))
 
 
 def _range(numbers: Sequence[int]) -> str:

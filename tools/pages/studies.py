@@ -12,9 +12,10 @@ import numpy as np
 
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Group, classes_of, curves_of, group_of
+from bidex_meta.evaluation.comparison import Group, curves_of, group_of
 from bidex_meta.evaluation.statistics import Estimate, iqm_over_seeds
 from bidex_meta.runs import plots
+from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
 from bidex_meta.runs.stored import StoredRun, read_study
 from bidex_meta.utils.plugins import short_name
 
@@ -39,9 +40,13 @@ class Arm:
     @cached_property
     def others(self) -> np.ndarray | None:
         """Success on other tasks of the classes (seeds, classes), as ``group.success``; None if a run lacks a value."""
-        rows = [run.evaluation().get("other_tasks", {}).get("policy", {}).get("classes", {}) for run in self.runs]
-        by_seed = [[row.get(name, {}).get("success") for name in self.group.classes] for row in rows]
-        return None if any(None in row for row in by_seed) else np.array(by_seed)
+        by_seed = []
+        for run in self.runs:
+            classes = classes_of_others(run)
+            if not classes.keys() >= set(self.group.classes):
+                return None
+            by_seed.append([classes[name].success for name in self.group.classes])
+        return np.array(by_seed)
 
     @property
     def parameters(self) -> int | None:
@@ -123,7 +128,7 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
     whole = [run for run in runs if run.config().task is None]
     by_classes: dict[frozenset[str], list[StoredRun]] = {}
     for run in whole:
-        by_classes.setdefault(frozenset(classes_of(run.evaluation())), []).append(run)
+        by_classes.setdefault(frozenset(run.evaluation().results), []).append(run)
     alone = [run for run in runs if run.config().task is not None]
     for classes, members in by_classes.items():
         joining = [run for run in alone if _covered(run, alone) == classes]
@@ -143,6 +148,22 @@ def digest_of(studies: Sequence[Study]) -> str:
         for path in study.ladders:
             found.update(path.read_bytes())
     return found.hexdigest()
+
+
+def classes_of_others(run: StoredRun) -> dict[str, ClassSummary]:
+    """Return a run's results on tasks that it was not trained on; empty if there are none."""
+    evaluation = run.evaluation()
+    if isinstance(evaluation, PolicyEvaluation) and evaluation.other_tasks is not None:
+        return evaluation.other_tasks.policy.classes
+    return {}
+
+
+def classes_of_random(run: StoredRun) -> dict[str, ClassSummary]:
+    """Return the results of uniform actions in a run's evaluation; empty if there are none."""
+    evaluation = run.evaluation()
+    if isinstance(evaluation, PolicyEvaluation) and evaluation.random is not None:
+        return evaluation.random.classes
+    return {}
 
 
 def curves_figure(study: Study) -> Any:

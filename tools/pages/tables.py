@@ -1,16 +1,16 @@
 """Tables of studies in Markdown: arms, classes, the best runs, references."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from bidex_meta.evaluation.comparison import Group, scored_classes
 from bidex_meta.evaluation.references import Kind, load
 from bidex_meta.evaluation.statistics import Estimate, iqm_over_seeds
+from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.tasks import registry
-from tools.pages.studies import Study
+from tools.pages.studies import Study, classes_of_others, classes_of_random
 
 _FEW = 4
 """The table of arms shows returns per class for at most this many classes."""
@@ -46,11 +46,11 @@ def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str
     return f"{values.mean():{form}}{unit}{ends}"
 
 
-def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
+def random_rows(study: Study) -> dict[str, list[ClassSummary]]:
     """Collect the results of uniform actions by class, from each evaluation that has such results."""
-    found: dict[str, list[dict[str, float]]] = {}
+    found: dict[str, list[ClassSummary]] = {}
     for run in study.runs:
-        for name, row in run.evaluation().get("random", {"classes": {}})["classes"].items():
+        for name, row in classes_of_random(run).items():
             found.setdefault(name, []).append(row)
     return found
 
@@ -75,8 +75,8 @@ def arms_table(study: Study) -> Iterator[str]:
         ])  # fmt: skip
     random = random_rows(study)
     if random.keys() == set(study.classes):
-        success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
-        returns = [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
+        success = np.array([[np.mean([row.success for row in random[name]]) for name in study.classes]])
+        returns = [f"{np.mean([row.mean_return for row in random[name]]):.4g}" for name in classes]
         value = success.mean() if means_only else iqm_over_seeds(success).value
         rows.append(["uniform actions", "", "", f"{100 * value:.1f} %", "–", *returns, "", ""])
     return table(head, rows)
@@ -126,7 +126,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
 
     If there is only one run, the rows do not name it. Columns without any number are left out.
     """
-    found: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
+    found: dict[str, list[tuple[StoredRun, ClassSummary]]] = {}
     for run in (run for study in studies for run in study.runs):
         for name, row in scored_classes(run).items():
             found.setdefault(name, []).append((run, row))
@@ -136,17 +136,17 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     experts = {name: row["return"] for name, row in load("expert").items()}  # of whom a score would say nothing
     rows = []
     for name in sorted(found, key=lambda name: order.index(name) if name in order else len(order)):
-        run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
-        random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
-        others = run.evaluation().get("other_tasks", {"policy": {"classes": {}}})["policy"]["classes"].get(name)
+        run, best = max(found[name], key=lambda pair: (pair[1].success, pair[1].mean_return))
+        random = classes_of_random(run).get(name)
+        others = classes_of_others(run).get(name)
         content, wide = run.content, str(run.config().suite).endswith("-v2")  # references are of version 1
         which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
         cells = [
-            _measure(best, "success").text(100.0, " %", ".4g"),
-            "–" if others is None else _measure(others, "success").text(100.0, " %", ".4g"),
-            _measure(best, "return").text(form=".4g"),
-            "–" if best["score"] is None or best["return"] == experts.get(name) else f"{best['score']:.0f}",
-            "–" if random is None else f"{random['return']:.4g}",
+            Estimate(best.success, best.success_interval).text(100.0, " %", ".4g"),
+            "–" if others is None else Estimate(others.success, others.success_interval).text(100.0, " %", ".4g"),
+            Estimate(best.mean_return, best.return_interval).text(form=".4g"),
+            "–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}",
+            "–" if random is None else f"{random.mean_return:.4g}",
             *(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–" for known in references),
         ]
         rows.append([name, *which, *cells, str(len(found[name]))] if several else [name, *cells])
@@ -168,10 +168,6 @@ def references_table() -> Iterator[str]:
         best = expert.get(name)
         rows.append([*cells, *(["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]])])
     return table(["class", *measures, "expert: return", "expert"], rows)
-
-
-def _measure(row: Mapping[str, Any], measure: str) -> Estimate:
-    return Estimate(row[measure], row.get(f"{measure}_interval"))
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.onpolicy.lessons import Lessons
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.training.distributed import all_sum, world_size
-from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
+from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
 from bidex_meta.utils.validation import Count, NonNegative, Positive, Whole
 from bidex_meta.world.contract import VectorWorld
 
@@ -64,8 +64,7 @@ class DAgger(Learner):
     remedy = "lower learning_rate"
     config_type = DAggerConfig
     presets = PRESETS
-    taught = True
-    discounts_by_class = True
+    capabilities = frozenset({Capability.TAUGHT, Capability.DISCOUNTS_BY_CLASS})
     per_process = ("generator", "episodes", "data", "obs", "teacher_plays")
     going_on = ("obs", "teacher_plays", *Learner.going_on)
     config: DAggerConfig

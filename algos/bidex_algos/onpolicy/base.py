@@ -17,7 +17,7 @@ from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, world_size
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import Capability, Parts, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -94,7 +94,7 @@ class OnPolicy(Learner):
 
     config: OnPolicyConfig
     policy: GaussianPolicy
-    discounts_by_class = True
+    capabilities = frozenset({Capability.DISCOUNTS_BY_CLASS})
     per_process = ("generator", "episodes", "obs")
     going_on = ("obs", *Learner.going_on)
     policy_of = staticmethod(gaussian_policy)

@@ -22,7 +22,7 @@ from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, own_seed, sum_gradients, world_size
-from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
+from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.graphs import GraphCache, cuda_graph
@@ -173,7 +173,7 @@ class MTPPO(OnPolicy):
     remedy = "lower learning_rate"
     config_type = MTPPOConfig
     presets = PRESETS
-    imitates = True
+    capabilities = OnPolicy.capabilities | {Capability.IMITATES}
     config: MTPPOConfig
     demonstrations: Demonstrations | None = None
     lessons: Lessons | None = None

@@ -44,12 +44,12 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
 
 
 def scripts_of(rules: Rules) -> dict[str, Script]:
-    """The scripts that play by a suite's rules, by class."""
+    """Return the scripts that play by a suite's rules, by class."""
     return WIDE_SCRIPTS if rules.wide else SCRIPTS
 
 
 def script_of(task: TaskClass) -> Script:
-    """The script of a class by its rules; raises BidexError where it has none, or its bases are fixed."""
+    """Return the script of a class by its rules; raises BidexError if it has none, or its bases are fixed."""
     known = scripts_of(task.rules)
     if not task.moving_base:
         raise BidexError(f"Expected moving bases for the script of {task.name}, got fixed ones: moving_base=True.")

@@ -15,7 +15,7 @@ _FORK = {"FFJ3": 0.3, "LFJ3": -0.3, "MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1
 
 
 def push_blocks(hands: HandController) -> Actions:
-    """Each hand takes its block between forefinger and little finger and pushes it to its goal."""
+    """Take each block between forefinger and little finger of one hand and push it to its goal."""
     blocks = {"right": "block2", "left": "block1"}
     goals = {"right": "goal2", "left": "goal1"}
     for side in SIDES:
