@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
 
-from bidex_meta.suite import ListedTask, Suite
+from bidex_meta.suite.contents import ListedTask, Suite
 
 _OPENING = ("right_angle", "left_angle", 0.5, 1.2)
 _CLOSING = ("right_angle", "left_angle", 0.18, 0.82)
