@@ -1,6 +1,6 @@
 """Protocols of agents. Names and order of calls are Meta-World's, so that both libraries can evaluate an agent."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -42,7 +42,8 @@ class MetaLearningAgent(Agent, Protocol):
 
     Calls come in this order: ``assign`` (only in our evaluation), ``init``; then for each shot ``reset`` of all
     environments, ``adapt_action`` and ``step`` until every environment has played its episodes, and ``adapt``.
-    Evaluations before, between and after shots call ``reset`` and ``eval_action``.
+    Evaluations before, between and after shots call ``reset`` and ``eval_action``. An agent that learns within an
+    episode also has ``observe(timestep)``, which these evaluations call after each step to show its reward.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
@@ -63,3 +64,22 @@ class MetaLearningAgent(Agent, Protocol):
 
     def adapt(self) -> None:
         """Learn from all transitions since the last ``adapt`` or ``init``."""
+
+
+@runtime_checkable
+class TrialAgent(Protocol):
+    """An agent of your own that learns about a task while it plays. ``meta_test`` asks nothing else of it.
+
+    A trial is a few episodes of one task with rewards shown in all of them. ``copy.deepcopy`` must copy what the agent
+    has learned: the evaluation after each number of episodes plays on a copy.
+    """
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Begin trials of other tasks in the environments of a mask, bool ``(num_envs,)``: forget the last ones."""
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Return actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``."""
+        ...
+
+    def observe(self, timestep: Timestep) -> None:
+        """Receive the transition that the last actions led to; ``terminated`` and ``truncated`` end episodes."""

@@ -30,12 +30,15 @@ class Protocol:
     """Number of tasks of each class, the first of its pool; None: all."""
     episodes_per_task: int = 4
     """Evaluation episodes of each task, after each trial."""
-    shots: int = 1
+    shots: int = 2
     """Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation."""
     rollouts: int | None = None
     """Exploring episodes of each task in a shot; None: one in each environment that plays it."""
     trials: int = 1
     """Number of adaptations to each task, each from the start and with other episodes."""
+    hidden_rewards: bool = False
+    """Also play the evaluation episodes with their rewards hidden. Otherwise rewards are shown in all episodes, as in
+    the papers: an agent that learns while it acts needs them. Hidden rewards test what it remembers."""
     max_adapt_steps: int | None = None
     """Number of steps after which exploring episodes are cut (``truncated``); None: they are not cut."""
 

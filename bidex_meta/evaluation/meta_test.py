@@ -40,6 +40,7 @@ class MetaEvaluation:
     """Per class the number from 0 of the adaptation (a trial of a task) that each episode followed, ``(episodes,)``."""
     protocol: Protocol  # as played, with the actual number of rollouts and length of the longest exploring episode
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
+    hidden_by_shot: list[Evaluation] | None = None  # the same with rewards hidden, if the protocol asks for that
 
     @property
     def rollouts(self) -> int:
@@ -67,6 +68,7 @@ class MetaEvaluation:
             split=self.protocol.split, shots=len(self.adapt_steps), rollouts=self.rollouts,
             trials=self.protocol.trials, max_adapt_steps=self.protocol.max_adapt_steps,
             adapt_steps=self.adapt_steps, before=by_shot[0], after=by_shot[-1], gain=self.gains(), by_shot=by_shot,
+            hidden_by_shot=self.hidden_by_shot and [each.summary() for each in self.hidden_by_shot],
         )  # fmt: skip
 
     def to_json(self) -> Json:
@@ -78,8 +80,8 @@ class MetaEvaluation:
 def meta_evaluate(
     agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
     episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
-    max_adapt_steps: int | None = None, seed: int | None = None, protocol: Protocol = DEFAULT,
-    references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
+    max_adapt_steps: int | None = None, seed: int | None = None, hidden_rewards: bool | None = None,
+    protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
     evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
@@ -91,7 +93,7 @@ def meta_evaluate(
     Args:
         agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: Adaptation rounds. This and the next six arguments, if not None, replace entries of ``protocol``.
+        shots: Adaptation rounds. This and the next seven arguments replace entries of ``protocol`` if not None.
         rollouts: Exploring episodes of each task in a shot.
         episodes_per_task: Evaluation episodes of each task, after each trial.
         tasks: Number of tasks of each pool, the first ones.
@@ -99,6 +101,7 @@ def meta_evaluate(
         max_adapt_steps: Steps after which exploring episodes are cut.
         seed: Seed of all starts. Before adaptation, and with all tasks in the world at once, starts are those of
             ``evaluate``.
+        hidden_rewards: Whether to play all evaluation episodes a second time with their rewards hidden.
         protocol: The tasks and episodes to play.
         references: As in ``evaluate``.
         adapt_world: Another world for the episodes of adaptation, with the same starts and the same number of
@@ -109,7 +112,7 @@ def meta_evaluate(
     """
     protocol = protocol.changed(
         shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
-        max_adapt_steps=max_adapt_steps, seed=seed
+        max_adapt_steps=max_adapt_steps, seed=seed, hidden_rewards=hidden_rewards
     )  # fmt: skip
     shots = protocol.shots
     seed = protocol.seed
@@ -119,6 +122,7 @@ def meta_evaluate(
         worlds = [world, adapt_world]
     _check(agent, worlds, shots)
     found = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
+    hidden = {shot: list[Episodes]() for shot in found if protocol.hidden_rewards}
     if not found:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
     portions = Portions(world, protocol.rollouts, protocol.tasks, protocol.trials)
@@ -139,13 +143,17 @@ def meta_evaluate(
                         starts = _seed(seed, "evaluation", number)
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts)
                     found[shot].append(portions.labelled(played, number))
-    joined = [joined_episodes(parts) for parts in found.values()]
+                if shot in hidden:
+                    played = play_tasks(agent, world, protocol.episodes_per_task, starts, hidden_rewards=True)
+                    hidden[shot].append(portions.labelled(played, number))
+    joined = [joined_episodes(parts) for parts in (*found.values(), *hidden.values())]
     if references is None:
         references = references_of(world)
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
+    evaluations = [Evaluation(classes, protocol.episodes_per_task) for classes in by_class]
     first = joined[0]
     return MetaEvaluation(
-        by_shot=[Evaluation(classes, protocol.episodes_per_task) for classes in by_class],
+        by_shot=evaluations[: len(found)], hidden_by_shot=evaluations[len(found) :] or None,
         adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
         protocol=protocol.changed(rollouts=portions.rollouts, max_adapt_steps=longest), adapt_steps=adapt_steps
     )  # fmt: skip

@@ -6,14 +6,14 @@ unscaled reward. An episode of broken physics is no success and counts with the 
 that is lower.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from bidex_meta.agents import Agent
+from bidex_meta.agents import Agent, Timestep
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference, references_of
@@ -59,8 +59,12 @@ def evaluate(
     return Evaluation(results_by_class(world.task_names, episodes, references), protocol.episodes_per_task)
 
 
-def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int) -> Episodes:
+def play_tasks(
+    agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int, hidden_rewards: bool = False
+) -> Episodes:  # fmt: skip
     """Play ``episodes_per_task`` episodes of every task, as ``evaluate`` does, and return arrays ``(episodes,)``.
+
+    An agent that has ``observe`` is shown each step with its reward, unless ``hidden_rewards``.
 
     The arrays are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule),
     ``once`` (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world
@@ -70,11 +74,15 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
     tasks = world.task_index.clone()
     remaining = quota(world, episodes_per_task)
     rounds: list[dict[str, torch.Tensor]] = []
+    if hidden_rewards:
+        observe = None
+    else:
+        observe = getattr(agent, "observe", None)
     while bool((playing := remaining > 0).any()):
         if rounds:
             obs, _ = world.reset(options={"reset_mask": playing})
         agent.reset(playing)
-        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing)})
+        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing, observe)})
         remaining -= playing.long()
     episodes = {key: torch.cat([played[key] for played in rounds]).cpu().numpy() for key in rounds[0]}
     row = episodes.pop("row")
@@ -123,7 +131,13 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
+def _play(
+    agent: Agent,
+    world: TaskWorld,
+    obs: torch.Tensor,
+    playing: torch.Tensor,
+    observe: Callable[[Timestep], None] | None,
+) -> dict[str, torch.Tensor]:
     """Play an episode in each environment of ``playing``; return results as ``play_tasks``, for these environments."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
@@ -133,7 +147,13 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
     longest = int(world.max_episode_steps.max())
     for step in range(longest):
         note("Playing episodes to evaluate", f"step {step} of {longest}")
-        obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
+        action = agent.eval_action(obs)
+        new, reward, terminated, truncated, info = world.step(action)
+        if observe is not None:
+            valid = running & ~info["unstable"]
+            action = torch.as_tensor(action, device=obs.device)
+            observe(Timestep(obs, action, reward, terminated, truncated, {}, info["final_obs"], valid))
+        obs = new
         gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))
         lengths += running

@@ -109,6 +109,7 @@ class SplitSummary:
     after: Summary
     gain: Gains | None = None
     by_shot: Annotated[list[Summary], Meta(min_length=1)]  # after 0, 1, ..., ``shots`` shots
+    hidden_by_shot: list[Summary] | None = None  # the same episodes played with their rewards hidden
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,7 +75,8 @@ class MemoryAgent:
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return mean actions (N, a) in [-1, 1] for raw observations (N, d).
 
-        The memory continues within the episode; its input marks rewards as unknown, as in training (``blind_share``).
+        The memory continues within the episode. Its input marks rewards as unknown, as in training (``blind_share``),
+        until :meth:`observe` shows them.
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)
@@ -83,6 +84,17 @@ class MemoryAgent:
         no = torch.zeros_like(memory.done)
         self._playing = Memory(state, action, torch.zeros_like(memory.reward), no, no)
         return action
+
+    def observe(self, timestep: Timestep) -> None:
+        """Show the memory of an evaluation episode the reward of its last step."""
+        if self._playing is None:
+            return
+        if timestep.valid is None:
+            known = torch.ones_like(timestep.terminated)
+        else:
+            known = timestep.valid
+        reward = timestep.reward.masked_fill(~known, 0.0)
+        self._playing = replace(self._playing, reward=reward, known=known)
 
     def _memory(self, memory: Memory | None, rows: int) -> Memory:
         if memory is not None and len(memory.state) == rows:

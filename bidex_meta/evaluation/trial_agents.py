@@ -1,0 +1,50 @@
+"""Agents of one's own (``TrialAgent``) in the calls of the meta-test."""
+
+import copy
+
+import torch
+from torch import Tensor
+
+from bidex_meta.agents import Timestep, TrialAgent
+
+
+class AdaptingTrialAgent:
+    """A ``MetaLearningAgent`` made of a ``TrialAgent``: exploring episodes teach it, evaluations play on a copy."""
+
+    def __init__(self, agent: TrialAgent) -> None:
+        self._agent = agent
+        self._playing = agent
+        self._is_fresh = True
+
+    def assign(self, task_of_row: Tensor | None) -> None:
+        """Do nothing: each environment learns from its own episodes."""
+
+    def init(self) -> None:
+        """Forget all trials at the next ``reset``, which tells the number of environments."""
+        self._is_fresh = True
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Begin episodes in the environments of a mask (N,)."""
+        if self._is_fresh:
+            self._agent.reset(torch.ones_like(env_mask))
+            self._is_fresh = False
+        self._playing = copy.deepcopy(self._agent)
+
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the agent's actions (N, a) for observations (N, d)."""
+        return self._agent.act(obs), {}
+
+    def step(self, timestep: Timestep) -> None:
+        """Show the agent a transition of an exploring episode."""
+        self._agent.observe(timestep)
+
+    def adapt(self) -> None:
+        """Do nothing: the agent has learned from each transition."""
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Return the copy's actions (N, a) for observations (N, d)."""
+        return self._playing.act(obs)
+
+    def observe(self, timestep: Timestep) -> None:
+        """Show the copy a transition of an evaluation episode."""
+        self._playing.observe(timestep)
