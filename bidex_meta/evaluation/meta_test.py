@@ -81,8 +81,8 @@ def meta_evaluate(
     agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
     episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
     max_adapt_steps: int | None = None, seed: int | None = None, hidden_rewards: bool | None = None,
-    protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
-    evaluated: Collection[int] | None = None
+    protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None,
+    adapt_world: TaskWorld | None = None, evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
 
@@ -93,7 +93,7 @@ def meta_evaluate(
     Args:
         agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: Adaptation rounds. This and the next seven arguments replace entries of ``protocol`` if not None.
+        shots: Adaptation rounds. This and the next seven arguments replace entries of ``protocol``, if given.
         rollouts: Exploring episodes of each task in a shot.
         episodes_per_task: Evaluation episodes of each task, after each trial.
         tasks: Number of tasks of each pool, the first ones.
