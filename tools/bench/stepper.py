@@ -30,8 +30,7 @@ class Stepper:
     def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[Any]:
         """Make and reset the world of a suite, or of one of the suite's classes.
 
-        Returns:
-            Time step (seconds) and substeps of each engine batch; empty if the code stores these values elsewhere.
+        Returns time step (seconds) and substeps of each engine batch; empty if the code stores them elsewhere.
         """
         from bidex_meta import Benchmark
 
@@ -50,11 +49,7 @@ class Stepper:
             return []
 
     def step(self, steps: int, seed: int) -> dict[str, float]:
-        """Step all rows under uniform actions, once more than is measured.
-
-        Returns:
-            ``wall`` and ``cpu`` (of all threads), seconds.
-        """
+        """Step all rows under uniform actions, once more than is measured; return ``wall`` and ``cpu`` seconds."""
         import torch
 
         generator = torch.Generator().manual_seed(seed)

@@ -4,12 +4,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
 
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of
@@ -31,13 +31,10 @@ class Search:
     threads: int | None = None
     """Threads of the physics; None: one per core."""
 
-    def keep(self, actions: np.ndarray, made: dict[str, Any], above: float = -float("inf")) -> Replay:
-        """Replay an episode (T, action_size), print the result, and store the episode.
+    def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
+        """Replay an episode (T, action_size), print the result, and store the episode with facts about its search.
 
-        Args:
-            actions: Actions of the episode.
-            made: Facts about how the episode was found.
-            above: Return that an episode that does not hold must exceed to be stored.
+        An episode that does not hold is stored only if its return is higher than ``above``.
         """
         result = replay(self.task, Witness(actions, {}), self.threads)
         print(

@@ -79,21 +79,12 @@ class Plan:
 
     @property
     def total(self) -> float:
-        """Sum of the rewards."""
+        """Return the sum of the rewards."""
         return float(self.rewards.sum())
 
 
 class Planner:
-    """The search for one class; see the module.
-
-    Args:
-        name: The class.
-        config: See :class:`PlannerConfig`.
-        threads: Engine threads; None takes all CPUs.
-
-    Raises:
-        BidexError: Copies do not divide samples.
-    """
+    """The search for one class; see the module. Raises BidexError if the number of copies does not divide samples."""
 
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
         if config.samples % config.copies:
@@ -108,8 +99,7 @@ class Planner:
     def search(self, earlier: np.ndarray | None = None) -> Plan:
         """Play one episode with replanning, and print the return so far after every plan.
 
-        Args:
-            earlier: Actions (T, action_size) of an earlier search: every plan also tries these actions at their time.
+        Every plan also tries the actions (T, action_size) of an ``earlier`` search at their time.
         """
         cfg, sim = self.config, self.simulator
         states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
@@ -123,7 +113,10 @@ class Planner:
         rivals: list[float] = []
         solved = torch.zeros(cfg.copies, dtype=torch.bool)
         while len(rewards) < sim.episode_steps:
-            rounds = cfg.first_rounds if not actions else cfg.rounds_after if solved.all() else cfg.rounds
+            if not actions:
+                rounds = cfg.first_rounds
+            else:
+                rounds = cfg.rounds_after if solved.all() else cfg.rounds
             mean, elites, unsuccessful = self._plan(states, mean, elites, rounds)
             if not any(success):
                 rivals += [sum(rewards) + more for more in self._to_the_end(states[0], unsuccessful, len(rewards))]
@@ -216,16 +209,18 @@ class Planner:
 
 def interpolation(horizon: int, knots: int) -> Tensor:
     """Return weights (horizon, knots) of linear interpolation; the first knot is the first step, the last the last."""
-    place = torch.linspace(0.0, knots - 1.0, horizon)
+    return _weights(torch.linspace(0.0, knots - 1.0, horizon), knots)
+
+
+def _weights(place: Tensor, knots: int) -> Tensor:
+    """Return the weights (n, knots) of linear interpolation at places (n,), in spaces between knots."""
     return (1.0 - (place[:, None] - torch.arange(knots)).abs()).clamp(min=0.0)
 
 
 def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
     """Return the knots (K, a) of a plan after ``steps`` steps have been played; the last value is held."""
     place = torch.linspace(0.0, horizon - 1.0, len(knots)) + steps
-    weights = (1.0 - (place[:, None] * (len(knots) - 1) / (horizon - 1) - torch.arange(len(knots))).abs()).clamp(
-        min=0.0
-    )
+    weights = _weights(place * (len(knots) - 1) / (horizon - 1), len(knots))
     weights[place >= horizon - 1] = 0.0
     weights[place >= horizon - 1, -1] = 1.0
     return weights @ knots
