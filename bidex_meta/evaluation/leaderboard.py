@@ -26,8 +26,7 @@ from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
 
-PROFILE = (0.1, 0.5, 0.9)
-"""Success rates at which a performance profile is read."""
+PROFILE = (0.1, 0.5, 0.9)  # Success rates at which a performance profile is read.
 FORMAT = 2
 _TASKS_OF_METAWORLD = 50
 _ROUNDING = 1e-4  # of stored rates

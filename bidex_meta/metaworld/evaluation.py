@@ -35,11 +35,10 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Envs, *args: in
 @contextmanager
 def known_to_metaworld(envs: Envs) -> Iterator[None]:
     """Add the classes of ``envs`` to the names in `metaworld.evaluation` (a copy: other modules share its dict)."""
-    module = vars(library)
-    before = module[_CLASSES]
-    ours = {name: type(name, (), {}) for name in envs.get_attr("task_name")}
-    module[_CLASSES] = {**before, **ours}
+    before = vars(library)[_CLASSES]
+    ours = {str(name): type(str(name), (), {}) for name in envs.get_attr("task_name")}
+    setattr(library, _CLASSES, {**before, **ours})
     try:
         yield
     finally:
-        module[_CLASSES] = before
+        setattr(library, _CLASSES, before)

@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import IO
 
 from bidex_meta.errors import BidexError, one_line, shortened
@@ -155,7 +154,7 @@ class Checkpoints:
         return [path for _, path in sorted(found, reverse=True)]
 
 
-def _torch() -> ModuleType:
+def _torch():
     import torch  # not at the top: `bidex-meta list` starts without it
 
     return torch
@@ -219,9 +218,9 @@ def weights_digest(policy: State) -> str:
 def _halved(value: object) -> object:
     if isinstance(value, dict):
         return {name: _halved(part) for name, part in sorted(value.items())}
-    is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
-    if is_number:
-        return value.to(_torch().float16)
+    torch = _torch()
+    if isinstance(value, torch.Tensor) and value.is_floating_point():
+        return value.to(torch.float16)
     return value
 
 

@@ -12,11 +12,9 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
-FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
-"""Suffixes of films, and their media types on web pages."""
+FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}  # Suffixes of films, and their media types on web pages.
 SUFFIXES = (".png", *FILMS)
-LABEL = 20
-"""Height of a name under a tile, pixels."""
+LABEL = 20  # Height of a name under a tile, pixels.
 _BACK = (24, 26, 30)
 _INK = (215, 218, 224)
 _DONE = (110, 220, 130)

@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Iterator
 from itertools import chain
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -91,7 +91,7 @@ def _robot_hands(skipped: dict[str, str]) -> Iterator[Entry]:
         yield f"gymnasium-robotics {name}", vector, single.dt, [single.model.nv]
 
 
-def _mend(utils: ModuleType) -> None:
+def _mend(utils: Any) -> None:
     """Patch gymnasium-robotics 1.4.2 to run on MuJoCo 3.12 and later.
 
     gymnasium-robotics tests if a joint's type, a NumPy number, is in a tuple of MuJoCo's names of joint types. Since

@@ -50,13 +50,10 @@ _DIGEST = "Description"
 class Block:
     """The options of a block."""
 
-    study: str = ""
-    """Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``)."""
+    study: str = ""  # Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``).
     show: str = "table"
-    on: str | None = None
-    """Only this suite or class."""
-    split: str | None = None
-    """Only this split of meta-tests."""
+    on: str | None = None  # Only this suite or class.
+    split: str | None = None  # Only this split of meta-tests.
 
 
 def fill(page: Path, data: Path, check: bool = False) -> list[Path]:

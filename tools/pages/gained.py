@@ -103,11 +103,9 @@ def shots_figure(*studies: Study) -> "Figure":
 class _Seeds:
     """Results of an arm's seeds, or of a ladder's line, on one class or suite."""
 
-    shares: list[list[float]] = field(default_factory=list)
-    """Success before and after each shot."""
+    shares: list[list[float]] = field(default_factory=list)  # Success before and after each shot.
     steps: list[int] = field(default_factory=list)
-    returns: list[list[float]] = field(default_factory=list)
-    """Before, and after the last shot."""
+    returns: list[list[float]] = field(default_factory=list)  # Before, and after the last shot.
 
 
 def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:

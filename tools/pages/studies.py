@@ -31,10 +31,8 @@ _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", 
 class Arm:
     """One setting of a study, on several seeds."""
 
-    group: Group
-    """Final evaluations of its runs, labelled with its name."""
-    runs: list[StoredRun]
-    """Its runs."""
+    group: Group  # Final evaluations of its runs, labelled with its name.
+    runs: list[StoredRun]  # Its runs.
 
     @cached_property
     def success(self) -> Estimate:
@@ -63,14 +61,10 @@ class Arm:
 class Study:
     """Arms on one suite or class."""
 
-    name: str
-    """Name of its file."""
-    on: str
-    """The suite or class."""
-    runs: list[StoredRun]
-    """Sorted by name."""
-    split: str | None = None
-    """Split of a meta-test to show; None: all."""
+    name: str  # Name of its file.
+    on: str  # The suite or class.
+    runs: list[StoredRun]  # Sorted by name.
+    split: str | None = None  # Split of a meta-test to show; None: all.
 
     @cached_property
     def arms(self) -> list[Arm]:
