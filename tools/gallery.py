@@ -1,8 +1,7 @@
 """``python -m tools.gallery`` (``make gallery``): generate the page of all task classes from their code."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -199,7 +198,9 @@ class _Comparisons(TorchFunctionMode):
         super().__init__()
         self.operands: list[Tensor] = []
 
-    def __torch_function__(self, func: Any, types: object, args: tuple = (), kwargs: dict | None = None) -> object:
+    def __torch_function__(
+        self, func: Callable[..., object], types: object, args: tuple = (), kwargs: dict | None = None
+    ) -> object:
         if getattr(func, "__name__", "").strip("_") in ("lt", "le", "gt", "ge"):
             self.operands += [value for value in args if isinstance(value, Tensor)]
         return func(*args, **(kwargs or {}))

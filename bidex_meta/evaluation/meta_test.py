@@ -76,29 +76,21 @@ class MetaEvaluation:
 
 @checked_arguments
 def meta_evaluate(
-    agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
-    episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
-    max_adapt_steps: int | None = None, seed: int | None = None, protocol: Protocol = DEFAULT,
+    agent: Agent, world: TaskWorld, shots: int | None = None, *, protocol: Protocol = DEFAULT,
     references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
     evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
 
     Environments that play the same task share one adaptation. If the world has fewer environments than tasks times
-    ``rollouts``, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The
-    world must be reset afterwards.
+    rollouts, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The world
+    must be reset afterwards. Before adaptation, and with all tasks in the world at once, starts are those of
+    ``evaluate``.
 
     Args:
-        agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
+        agent: A MetaLearningAgent; with no shots any Agent.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: Adaptation rounds. This and the next six arguments, if not None, replace entries of ``protocol``.
-        rollouts: Exploring episodes of each task in a shot.
-        episodes_per_task: Evaluation episodes of each task, after each trial.
-        tasks: Number of tasks of each pool, the first ones.
-        trials: Adaptations to each task, each from the start and with other episodes.
-        max_adapt_steps: Steps after which exploring episodes are cut.
-        seed: Seed of all starts. Before adaptation, and with all tasks in the world at once, starts are those of
-            ``evaluate``.
+        shots: Adaptation rounds; None: those of ``protocol``.
         protocol: The tasks and episodes to play.
         references: As in ``evaluate``.
         adapt_world: Another world for the episodes of adaptation, with the same starts and the same number of
@@ -107,10 +99,7 @@ def meta_evaluate(
 
     Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
-    protocol = protocol.changed(
-        shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
-        max_adapt_steps=max_adapt_steps, seed=seed
-    )  # fmt: skip
+    protocol = protocol.changed(shots=shots)
     shots = protocol.shots
     seed = protocol.seed
     if adapt_world is None:

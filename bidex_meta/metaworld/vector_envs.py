@@ -204,10 +204,11 @@ def make_env(
     turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
     wrappers = mended().wrappers  # not needed by the package's other names
-    env: Any = recipe.make_class()(**options)
+    single = recipe.make_class()(**options)
     if seed is not None:
-        env.seed(seed)
-    env.toggle_terminate_on_success(terminate_on_success)
+        single.seed(seed)
+    single.toggle_terminate_on_success(terminate_on_success)
+    env: gymnasium.Env = single
     if max_episode_steps is not None:
         env = gymnasium.wrappers.TimeLimit(env, max_episode_steps)
     if use_one_hot:
@@ -224,8 +225,7 @@ def make_env(
     if normalize_observations:
         env = gymnasium.wrappers.NormalizeObservation(env)
     env = gymnasium.wrappers.RecordEpisodeStatistics(env)
-    random = task_select == "random"
-    select: Any = wrappers.RandomTaskSelectWrapper if random else wrappers.PseudoRandomTaskSelectWrapper
+    select = wrappers.RandomTaskSelectWrapper if task_select == "random" else wrappers.PseudoRandomTaskSelectWrapper
     return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.env_name}_{env_id}")
 
 

@@ -148,9 +148,9 @@ class Progress:
         return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
-def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
+def counted(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
     """Yield the items and show their count out of ``total`` on stderr: a bar in a terminal, plain lines elsewhere."""
-    console = PlainConsole(file=stream or sys.stderr)
+    console = PlainConsole(file=sys.stderr)
     if console.is_terminal:
         note("")  # the bar moves by itself
         yield from track(items, description=what, total=total, console=console, transient=True)

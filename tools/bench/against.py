@@ -159,7 +159,7 @@ class _Worker:
         self._process.kill()
         self._process.communicate()
 
-    def ask(self, name: str, **given: Any) -> Any:
+    def ask(self, name: str, **given: object) -> Any:
         """Call the worker's method of this name and return the method's result."""
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # a dead worker is reported below
