@@ -100,7 +100,7 @@ class DatasetWriter:
 
     @property
     def open_steps(self) -> int:
-        """Number of transitions that are not committed yet."""
+        """Return the number of transitions that are not committed yet."""
         return 0 if self._part is None else self._part.steps
 
     def add(self, episode: Episode) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.evaluation.statistics import (
     Estimate,
     crossed_estimate,
@@ -209,14 +209,11 @@ def class_rows(evaluations: Sequence[Evaluation]) -> Json:
     """Return the classes of an entry from one evaluation per seed, ready for JSON."""
     rows = {}
     for name in evaluations[0].classes:
-        tasks = np.array([_success_of_tasks(evaluation.classes[name]) for evaluation in evaluations])
+        results = [evaluation.classes[name] for evaluation in evaluations]
+        tasks = np.array([result.task_means(result.successes) for result in results])
         mean = crossed_estimate(lambda tables: tables[0].mean(), [tasks])
         rows[name] = {"success": mean.value, "interval": mean.interval, "tasks": tasks.round(4).tolist()}
     return rows
-
-
-def _success_of_tasks(result: ClassResult) -> list[float]:
-    return [result.successes[result.tasks == task].mean() for task in np.unique(result.tasks)]
 
 
 def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:

@@ -12,6 +12,7 @@ from typing import cast
 
 import numpy as np
 import torch
+from msgspec import to_builtins
 from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
@@ -23,7 +24,7 @@ from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import Gains, SplitSummary, summary_json
+from bidex_meta.runs.evaluations import Gains, SplitSummary
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import Info, TaskWorld
@@ -71,7 +72,7 @@ class MetaEvaluation:
 
     def to_json(self) -> Json:
         """Return the results without the single episodes, ready for JSON."""
-        return summary_json(self.summary())
+        return to_builtins(self.summary())
 
 
 @checked_arguments

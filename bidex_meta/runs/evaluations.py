@@ -238,11 +238,6 @@ def evaluation_json(evaluation: Evaluated) -> Json:
     return content
 
 
-def summary_json(summary: Summary | SplitSummary | ClassSummary) -> Json:
-    """Return a part of ``evaluation.json``."""
-    return msgspec.to_builtins(summary)
-
-
 def _without_none(content: Json) -> Json:
     """Return the entries of the first level that are known."""
     return {name: value for name, value in content.items() if value is not None}
