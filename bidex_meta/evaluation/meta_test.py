@@ -108,8 +108,8 @@ def meta_evaluate(
     else:
         worlds = [world, adapt_world]
     _check(agent, worlds, shots)
-    found = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
-    if not found:
+    by_shot = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
+    if not by_shot:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
     portions = Portions(world, protocol.rollouts, protocol.tasks, protocol.trials)
     field = worlds[-1]
@@ -122,14 +122,14 @@ def meta_evaluate(
                 if shot > 0:
                     starts = _seed(seed, "adaptation", number, shot)
                     adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, longest, starts)
-                if shot in found:
+                if shot in by_shot:
                     if number == 0:
                         starts = seed
                     else:
                         starts = _seed(seed, "evaluation", number)
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts)
-                    found[shot].append(portions.labelled(played, number))
-    joined = [joined_episodes(parts) for parts in found.values()]
+                    by_shot[shot].append(portions.labelled(played, number))
+    joined = [joined_episodes(parts) for parts in by_shot.values()]
     if references is None:
         references = references_of(world)
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]

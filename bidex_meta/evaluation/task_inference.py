@@ -201,10 +201,10 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
         x = torch.where(better[:, None], new, x)
         off = torch.where(better[:, None], new_off, off)
         damping = torch.where(better[:, None, None], 0.3 * damping, 5.0 * damping).clamp(1e-6, 1e6)
-    found = truth.clone()
-    found[columns] = x[off.square().sum(dim=1).argmin()]
+    fitted = truth.clone()
+    fitted[columns] = x[off.square().sum(dim=1).argmin()]
     errors = []
     for part, where in parts:
-        error = float(distances(part, found[None, where], truth[where])[0])
+        error = float(distances(part, fitted[None, where], truth[where])[0])
         errors.append(error if part.kind == "sign" else error / part.tolerance)
     return max(errors)

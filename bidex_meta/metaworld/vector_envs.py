@@ -40,11 +40,9 @@ def make_mt_envs(
     if _is_class(name):
         benchmark = MT1(name, seed)
         [(env_name, env_class)] = benchmark.train_classes.items()
-        one = {
-            "num_tasks": num_tasks or 1,
-            "env_id": 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None,
-        }
-        return make_env(env_class.recipe, benchmark.tasks_of(env_name), seed, **(one | options))
+        env_id = 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None
+        given = {"num_tasks": num_tasks or 1, "env_id": env_id, **options}
+        return make_env(env_class.recipe, benchmark.tasks_of(env_name), seed, **given)
     return _multi_task(Benchmark(name, seed or 0), seed, num_tasks, **options)
 
 
@@ -169,8 +167,8 @@ def _meta(
     else:
         size = meta_batch_size
     if size < 1 or size % len(classes):
-        what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
-        raise BidexError(f"meta_batch_size: expected {what}; got {size}.")
+        fault = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
+        raise BidexError(f"meta_batch_size: expected {fault}; got {size}.")
     envs = []
     for name, env_class in classes.items():
         tasks = benchmark.tasks_of(name, split)[:total_tasks_per_cls]

@@ -202,10 +202,10 @@ def svg(figure: "Figure") -> bytes:
     return out.getvalue()
 
 
-def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, style: str, one: float = 1e6) -> None:
+def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, style: str, unit: float = 1e6) -> None:
     if curve is None:
         return
-    steps = curve.steps / one
+    steps = curve.steps / unit
     colour = _colour(number)
     if len(steps) == 1 or (style != "-" and len(steps) <= _FEW):
         marker = "."
