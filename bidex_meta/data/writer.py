@@ -71,7 +71,7 @@ def check_name(name: str) -> None:
 
 
 def check_room(folder: Path, needed: int, subject: str) -> None:
-    """Raise BidexError if the disk of a folder, which may be missing, lacks room for ``needed`` bytes of ``subject``."""
+    """Raise BidexError if the disk of a folder, perhaps a missing one, lacks ``needed`` bytes for ``subject``."""
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
