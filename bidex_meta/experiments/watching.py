@@ -11,7 +11,7 @@ import torch
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.filming import film_tiles
+from bidex_meta.evaluation.filming import Look, film_tiles
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments import metatest
@@ -30,7 +30,7 @@ from bidex_meta.worlds import Worlds
 
 TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
 _LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
-_FILM = {"width": 240, "height": 180}
+_FILM: Look = {"width": 240, "height": 180}
 _FILM_EVERY = 2
 _MOST_FILM_STEPS = 300
 

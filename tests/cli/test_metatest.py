@@ -76,7 +76,7 @@ def test_the_curve_of_adaptation(adapted, shown, refused, tmp_path):
     other.write_text(shown("evaluate", adapted, "--json", "--shots", 3))
     shown("plot", adapted, "--evaluation", other, "--out", picture)
     assert picture.stat().st_size > 0
-    other.write_text('{"policy": {}}')
+    other.write_text('{"policy": {"classes": {"A": {"success": 0.5, "return": 1.0}}}}')
     assert "holds no meta-test" in refused("plot", adapted, "--evaluation", other)
 
 
