@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.files import absolute, expanded, portable, read_toml
+from bidex_meta.utils.files import Json, absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.utils.validation import check_fields, check_rising, parse
@@ -226,7 +226,7 @@ class Suite:
 _OF_THE_FILE = ("name", "version", "description", "file")
 
 
-def _chosen(value: Any) -> Any:
+def _chosen(value: object) -> Json:
     """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))

@@ -93,7 +93,7 @@ class Episodes:
             setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))
 
 
-def ended_info(info: Info) -> dict[str, Any]:
+def ended_info(info: Info) -> Info:
     """Return Gymnasium's keys for what ended in a step, from the contract's keys; zero outside each mask.
 
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last

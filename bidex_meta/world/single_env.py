@@ -4,9 +4,10 @@ For code that is written so; all environments of a suite at once are `Benchmark.
 """
 
 import copyreg
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import gymnasium
 import numpy as np
@@ -79,8 +80,11 @@ class _Remade(type):
     """Of classes that no module holds: they are pickled as their recipes."""
 
 
-def _reduced(made: Any) -> str | tuple[Any, ...]:
-    return (_make_class, (made.recipe,)) if "recipe" in vars(made) else made.__qualname__  # one of a module's own
+def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
+    recipe = vars(made).get("recipe")
+    if recipe is None:
+        return made.__qualname__  # one of a module's own
+    return _make_class, (recipe,)
 
 
 copyreg.pickle(_Remade, _reduced)
