@@ -132,10 +132,9 @@ class Benchmark:
         self.seed = whole_number("seed", seed, 0)
         classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._classes = ByClass(classes, self.suite.rules)
-        self._tasks = {
-            split: {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
-            for split in SPLITS
-        }
+        self._tasks: dict[Split, dict[str, list[Task]]] = {}
+        for split in SPLITS:
+            self._tasks[split] = {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
         overlap = set(self.train_tasks) & set(self.test_tasks)
         if overlap:
             raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
@@ -256,18 +255,22 @@ class Benchmark:
                 randomisation = self.suite.randomisation
             else:
                 randomisation = None
+        if seed is None:
+            seed = self.seed
+        keeps_tasks = evaluates or self.suite.kind == "meta"
+        points = PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None
         config = WorldConfig(
             num_envs=num_envs,
             device=device,
             engine=engine,
-            seed=self.seed if seed is None else seed,
+            seed=seed,
             autoreset_mode=mode,
             observation=self.suite.observation,
             pad_to=self.padded_size,
-            task_sampling="fixed" if evaluates or self.suite.kind == "meta" else "uniform",
+            task_sampling="fixed" if keeps_tasks else "uniform",
             threads=threads,
             stagger=stagger,
-            points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
+            points=points,
             randomisation=randomisation,
             pixels=pixels,
         )

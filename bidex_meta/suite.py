@@ -362,8 +362,10 @@ def _parse(file: Path) -> Suite:
     points = content.points or _PointsEntry(0)
     rules = Rules(content.reward, content.variation, content.success, content.starts)
     given = {f.name: getattr(content, f.name) for f in fields(content) if f.name in {f.name for f in fields(Suite)}}
-    classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
-    given |= {"classes": classes, "file": file, "rules": rules}
+    classes: list[SuiteClass] = []
+    for i, entry in enumerate(content.classes):
+        classes += _classes(file, i, entry)
+    given |= {"classes": tuple(classes), "file": file, "rules": rules}
     suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
     _check(suite)
     return suite
@@ -379,19 +381,24 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
     if entry.objects and given is not None:
         mend = "Leave one of them out."
         raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
+    if entry.split == "both":
+        splits = SPLITS
+    else:
+        splits = (entry.split,)
     for name in entry.objects or [given]:
         if name is None:
             object = None
         else:
             object = _object(file, str(name))
+            options["object"] = object
         yield SuiteClass(
             name=name_with_object(entry.name, object),
             class_name=entry.name,
-            splits=SPLITS if entry.split == "both" else (entry.split,),
+            splits=splits,
             reward_scale=entry.reward_scale,
             gamma=entry.gamma,
             tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
-            options=options if object is None else {**options, "object": object},
+            options=dict(options),
         )
 
 

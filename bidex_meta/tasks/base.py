@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import ClassVar, Literal
 
@@ -261,7 +262,7 @@ class TaskClass(ABC):
     def hidden_columns(self) -> list[int]:
         """Return the columns of a variation that hold hidden components."""
         names = self.variation_space.names
-        return [names.index(name) for part in self.hides() for name in part.names]
+        return [names.index(name) for name in chain.from_iterable(part.names for part in self.hides())]
 
     def guides(self, state: TaskState) -> list[Tensor]:
         """Return distances (m), each (n,), from hands to points; the reward of version 2 rewards small distances."""

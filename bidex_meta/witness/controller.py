@@ -134,10 +134,8 @@ class HandActions:
 
     def __call__(self, leads: Sequence[Lead], sensor: Callable[[str], Tensor]) -> Tensor:
         """Return actions (n, action_size) of n environments; ``sensor`` returns values (n, k), in double precision."""
-        at, now = (
-            torch.stack([sensor(f"{side}/{name}") for side in SIDES], 1)
-            for name in ("hand_point_position", "mount_quaternion")
-        )
+        at = torch.stack([sensor(f"{side}/hand_point_position") for side in SIDES], 1)
+        now = torch.stack([sensor(f"{side}/mount_quaternion") for side in SIDES], 1)
         goals = at.new_tensor([lead.points for lead in leads])
         held = at.new_tensor([lead.held for lead in leads])
         speed = at.new_tensor([lead.speed for lead in leads])[:, None, None]

@@ -87,12 +87,11 @@ class Scripted:
         self._generator = torch.Generator().manual_seed(seed)
         if names is None:
             names = world.task_names
-        self._classes = [
-            _Class(world, part, k, member, int(misled))
-            for part in world.parts
-            for k, member in enumerate(part.group.members)
-            if world.slots[member.slot].name in names
-        ]
+        self._classes: list[_Class] = []
+        for part in world.parts:
+            for number, member in enumerate(part.group.members):
+                if world.slots[member.slot].name in names:
+                    self._classes.append(_Class(world, part, number, member, int(misled)))
         self._actions = torch.zeros(world.num_envs, world.action_size)
 
     def eval_action(self, obs: Tensor) -> Tensor:

@@ -249,5 +249,6 @@ def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtyp
 
 
 def _shown(shape: tuple[int | None, ...]) -> str:
-    words = ["n" if size == _ROWS else "k" if size is None else str(size) for size in shape]
+    letters = {_ROWS: "n", None: "k"}
+    words = [letters.get(size, str(size)) for size in shape]
     return f"({', '.join(words)}{',' * (len(words) == 1)})"

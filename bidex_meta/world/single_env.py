@@ -133,6 +133,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         recipe = self.recipe
         space = self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
+        points = PointsRule(*recipe.points) if recipe.points[0] else None
         config = WorldConfig(
             num_envs=1,
             engine="c",
@@ -140,7 +141,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             autoreset_mode="DISABLED",
             observation="masked" if recipe.hides_goal else "plain",
             pad_to=recipe.padded_size,
-            points=PointsRule(*recipe.points) if recipe.points[0] else None,
+            points=points,
         )
         self._world = World([slot], config)
         self.observation_space = self._world.single_observation_space
@@ -253,10 +254,13 @@ def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
 
 def _camera(name: str | None, number: int | None) -> str:
     names = list(CAMERAS)
-    chosen = (names[0] if name is None else name) if number is None else next(iter(names[number : number + 1]), None)
-    if chosen not in names:
-        raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
-    return chosen
+    if number is None and name is None:
+        return names[0]
+    if number is None and name in names:
+        return name
+    if number is not None and number < len(names):
+        return names[number]
+    raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
 
 
 def _array(batch: torch.Tensor) -> np.ndarray:

@@ -55,7 +55,10 @@ class OwnSuite(Worlds):
         pools = {c.name: [task.name for task in c.tasks if task.split == split] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
-        return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
+        listed: dict[str, list[str]] = {}
+        for name, pool in pools.items():
+            listed |= {f"{name}/{task}": [task] for task in pool}
+        return listed
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """See ``Worlds``."""
