@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import meets_box, noisy_joints
-from bidex_meta.suite import V1, Rules
+from bidex_meta.rules import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands

@@ -118,11 +118,10 @@ class BatchedWorld(VectorEnv, ABC):
         return torch.tensor(values, device=self.device)[self.task_id]
 
     def _set_spaces(self, single_observation: Box, action_size: int) -> None:
-        spaces = make_spaces(single_observation, action_size, self.num_envs)
-        self.single_observation_space = spaces.single_observation
-        self.single_action_space = spaces.single_action
-        self.observation_space = spaces.observation
-        self.action_space = spaces.action
+        self.single_observation_space = single_observation
+        self.single_action_space = Box(-1.0, 1.0, (action_size,), np.float32)
+        self.observation_space = cast(Box, batch_space(single_observation, self.num_envs))
+        self.action_space = cast(Box, batch_space(self.single_action_space, self.num_envs))
         self.observation_size = int(np.prod(single_observation.shape))
         self.action_size = action_size
         self._obs = torch.zeros(self.num_envs, self.observation_size, device=self.device)
@@ -318,23 +317,6 @@ class BatchedWorld(VectorEnv, ABC):
         if callable(value):
             return (value(*args, **kwargs),) * self.num_envs
         return self.get_attr(name)
-
-
-class Spaces(NamedTuple):
-    """The four spaces of a Gymnasium vector environment."""
-
-    single_observation: Box
-    single_action: Box
-    observation: Box
-    action: Box
-
-
-def make_spaces(single_observation: Box, action_size: int, num_envs: int) -> Spaces:
-    """Return the spaces of environments with these observations and ``action_size`` actions within [-1, 1]."""
-    single_action = Box(-1.0, 1.0, (action_size,), np.float32)
-    observation = cast(Box, batch_space(single_observation, num_envs))
-    action = cast(Box, batch_space(single_action, num_envs))
-    return Spaces(single_observation, single_action, observation, action)
 
 
 def split_envs(num_envs: int, slots: int) -> list[slice]:

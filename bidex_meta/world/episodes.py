@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import HELD_STEPS
+from bidex_meta.rules import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import true_or_false, whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld

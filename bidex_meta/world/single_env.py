@@ -15,7 +15,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, Rules, versioned_name
+from bidex_meta.rules import V1, Rules, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.utils.arguments import checked_arguments

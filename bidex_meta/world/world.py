@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Randomisation
+from bidex_meta.rules import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument

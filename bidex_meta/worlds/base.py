@@ -9,17 +9,8 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import (
-    METAWORLD_SUITES,
-    OTHER_SEED,
-    SPLITS,
-    Rules,
-    Suite,
-    load_randomisation,
-    load_suite,
-    plain_name,
-    suite_names,
-)
+from bidex_meta.rules import Rules, plain_name
+from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.utils.files import Json
 
