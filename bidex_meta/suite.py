@@ -253,7 +253,7 @@ class _File:
             yield f"classes[{i}].name", entry.name
             yield from ((f"classes[{i}].tasks[{j}].name", task.name) for j, task in enumerate(entry.tasks))
             yield from ((f"classes[{i}].objects", name) for name in entry.objects)
-            yield from ((f"classes[{i}].options.object", name) for name in [entry.options.get("object", "egg")])
+            yield f"classes[{i}].options.object", entry.options.get("object", "egg")
 
 
 def _parse(file: Path) -> Suite:
@@ -264,7 +264,8 @@ def _parse(file: Path) -> Suite:
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
     rules = Rules(content.reward, content.variation, content.success, content.starts)
-    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name in {f.name for f in fields(Suite)}}
+    names = {entry.name for entry in fields(Suite)} & {entry.name for entry in fields(content)}
+    given = {name: getattr(content, name) for name in names}
     classes: list[SuiteClass] = []
     for i, entry in enumerate(content.classes):
         classes += _classes(file, i, entry)
@@ -290,12 +291,11 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
         splits = (entry.split,)
     for name in entry.objects or [given]:
         if name is None:
-            object = None
+            chosen = None
         else:
-            object = _object(file, str(name))
-            options["object"] = object
+            chosen = options["object"] = _object(file, str(name))
         yield SuiteClass(
-            name=name_with_object(entry.name, object),
+            name=name_with_object(entry.name, chosen),
             class_name=entry.name,
             splits=splits,
             reward_scale=entry.reward_scale,
@@ -316,13 +316,11 @@ def _check(suite: Suite) -> None:
     _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
     if suite.kind == "meta":
         expected = SPLITS
+        mend = "Give each class a split."
     else:
         expected = ("train",)
+        mend = 'Leave split out, or write kind = "meta".'
     if suite.splits != expected:
-        if suite.kind == "meta":
-            mend = "Give each class a split."
-        else:
-            mend = 'Leave split out, or write kind = "meta".'
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
     all_listed = all(entry.tasks for entry in suite.classes)

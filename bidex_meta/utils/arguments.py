@@ -77,8 +77,9 @@ def checked_arguments(target: Target) -> Target:
             kind = signature.parameters[argument].kind
             if kind is inspect.Parameter.VAR_KEYWORD:
                 continue
-            for each in value if kind is inspect.Parameter.VAR_POSITIONAL else (value,):
-                check_argument(f"{name}: {argument}", each, hint)
+            values = value if kind is inspect.Parameter.VAR_POSITIONAL else (value,)
+            for given_value in values:
+                check_argument(f"{name}: {argument}", given_value, hint)
         return target(*arguments, **keywords)
 
     return checked  # type: ignore[return-value]

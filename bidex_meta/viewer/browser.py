@@ -111,7 +111,10 @@ class Browser:
             self._tour.value = False
             self.show(stage)
         while self._asked:
-            stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
+            if self._asked.pop(0) == "Another episode":
+                stage.restart()
+            else:
+                stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
         scene = self._server.scene

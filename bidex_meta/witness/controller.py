@@ -94,12 +94,12 @@ class HandController:
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
-    def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
+    def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
         """Hold a hand's start orientation, turned about the world's axes, rad, from now on.
 
         A hand that no script holds may turn.
         """
-        self._held[side] = quaternion_product(quaternion_from_rpy((roll, pitch, yaw)), self._first[side])
+        self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
     def turn(self, side: str, way: Tensor) -> None:
         """Turn a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""

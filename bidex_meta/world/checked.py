@@ -191,7 +191,8 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
     _check_shape(f"{name}.success", task.success(state), kind=torch.bool)
     _check_shape(f"{name}.failed", task.failed(state), kind=torch.bool)
     sizes = {block.name: block.size for block, _ in task.layout}
-    for key, value in task.observe(state).items() if observed else ():
+    blocks = task.observe(state) if observed else {}
+    for key, value in blocks.items():
         if key not in sizes:
             raise BidexError(f"{name}.observe: expected blocks of the layout ({', '.join(sizes)}), got {key!r}.")
         _check_shape(f"{name}.observe: {key!r}", value, sizes[key])

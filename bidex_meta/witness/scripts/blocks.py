@@ -44,5 +44,6 @@ def push_blocks(hands: HandController) -> Actions:
                 lead = way * 1.0
             # Where the fork is, if it follows its block; it never runs ahead.
             ahead = float(lead[0])
-            points.append(beside(place, _BEHIND + ahead if ahead < -0.004 else _CLEAR, float(lead[1]), _LOW))
+            behind_block = _BEHIND + ahead if ahead < -0.004 else _CLEAR
+            points.append(beside(place, behind_block, float(lead[1]), _LOW))
         yield from hands.lead_each(points, 0.5)
