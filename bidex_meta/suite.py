@@ -5,22 +5,32 @@ Names of task classes and of their variations are checked where the classes are 
 
 import hashlib
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
+from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.rules import (  # noqa: F401 (names of a suite, imported from here too)
+    FACTORS,
+    HELD_STEPS,
+    V1,
+    V2,
+    Randomisation,
+    Rules,
+    plain_name,
+    rules_apart,
+    versioned_name,
+)
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.files import absolute, expanded, portable, read_toml
+from bidex_meta.utils.files import Json, absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import check_fields, check_rising, parse
+from bidex_meta.utils.validation import parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
@@ -37,107 +47,6 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
 }  # fmt: skip
 """Suites of Meta-World's own environments, and their classes in its order."""
-
-
-HELD_STEPS = 15
-"""Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
-
-
-@checked_arguments
-@dataclass(frozen=True)
-class Rules:
-    """Four choices, each alone; the defaults are version 1, ``V2`` has all of version 2."""
-
-    reward: Literal["paper", "v2"] = "paper"
-    """The printed formula of each class, or ``aligned_terms``."""
-    variation: Literal["narrow", "wide"] = "narrow"
-    """Whether goals vary about as much as success tolerates, or several times as much, with a hidden quantity in every
-    class. Wide observations also give objects' and goals' quaternions with w >= 0."""
-    success: Literal["once", "at-end"] = "once"
-    """Whether the condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
-    starts: Literal["plain", "jittered"] = "plain"
-    """Whether every episode of every class draws joint noise and shifts what stands or lies."""
-
-    @property
-    def wide(self) -> bool:
-        """Return whether the variation is wide."""
-        return self.variation == "wide"
-
-    @property
-    def as_printed(self) -> bool:
-        """Return whether returns can be compared with those of version 1: the same tasks and reward."""
-        return self.reward == "paper" and not self.wide
-
-    @property
-    def jittered(self) -> bool:
-        """Return whether starts are jittered."""
-        return self.starts == "jittered"
-
-
-V1 = Rules()
-V2 = Rules("v2", "wide", "at-end", "jittered")
-_VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
-
-
-def plain_name(name: str) -> str:
-    """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
-    found = _VERSIONED.match(name)
-    if found is None:
-        return name
-    return found[1] + name[found.end() :]
-
-
-def versioned_name(name: str, rules: Rules) -> str:
-    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
-    task_class, dash, thing = plain_name(name).partition("-")
-    if rules == V2:
-        return f"{task_class}-v2{dash}{thing}"
-    return name
-
-
-_Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
-_Size = Annotated[float, Meta(ge=0.8, le=1.25)]
-_Steps = Annotated[int, Meta(ge=0, le=60)]
-_Range = tuple[_Factor, _Factor]
-
-
-@dataclass(frozen=True)
-class Randomisation:
-    """Factors drawn for an environment, uniformly from ranges, and added noise; nothing by default.
-
-    Raises BidexError for values out of bounds or ranges that fall.
-    """
-
-    friction: _Range = (1.0, 1.0)
-    """Factor of the friction of all contacts."""
-    object_mass: _Range = (1.0, 1.0)
-    object_size: tuple[_Size, _Size] = (1.0, 1.0)
-    """Factor of the lengths of free objects without joints; their masses stay."""
-    actuator_gain: _Range = (1.0, 1.0)
-    """Factor of the fingers' actuator forces, before their limits."""
-    joint_damping: _Range = (1.0, 1.0)
-    """Factor of the damping of the fingers' joints."""
-    gravity: _Range = (1.0, 1.0)
-    observation_noise: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
-    """Standard deviation in an observation's units, of what sensors show of hands and objects."""
-    action_noise: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
-    """Standard deviation; actions are clipped afterwards."""
-    action_delay: tuple[_Steps, _Steps] = (0, 0)
-    """Control steps, a whole number of the range."""
-    push_speed: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Most that a push adds to the velocity of all objects along each axis, m/s."""
-    push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
-    """Mean time between pushes, s."""
-    draw: Literal["episode", "environment"] = "episode"
-    """Whether factors and the delay are drawn for every episode, or once for an environment."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "randomisation")
-        check_rising(self, "randomisation", *FACTORS, "action_delay")
-
-
-FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_damping", "gravity")
-"""Of a randomisation, those that are factors of the model's numbers."""
 
 
 @checked_arguments
@@ -226,7 +135,7 @@ class Suite:
 _OF_THE_FILE = ("name", "version", "description", "file")
 
 
-def _chosen(value: Any) -> Any:
+def _chosen(value: object) -> Json:
     """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))
@@ -249,12 +158,6 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
         mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
         raise _error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
     return replace(entry, name=plain_name(entry.name), class_name=plain)
-
-
-def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Return in words how other rules, by name, differ from ``rules``; empty if they are equal."""
-    pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
-    return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
 
 def suite_names() -> list[str]:
@@ -350,7 +253,7 @@ class _File:
             yield f"classes[{i}].name", entry.name
             yield from ((f"classes[{i}].tasks[{j}].name", task.name) for j, task in enumerate(entry.tasks))
             yield from ((f"classes[{i}].objects", name) for name in entry.objects)
-            yield from ((f"classes[{i}].options.object", name) for name in [entry.options.get("object", "egg")])
+            yield f"classes[{i}].options.object", entry.options.get("object", "egg")
 
 
 def _parse(file: Path) -> Suite:
@@ -361,9 +264,12 @@ def _parse(file: Path) -> Suite:
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
     rules = Rules(content.reward, content.variation, content.success, content.starts)
-    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name in {f.name for f in fields(Suite)}}
-    classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
-    given |= {"classes": classes, "file": file, "rules": rules}
+    names = {entry.name for entry in fields(Suite)} & {entry.name for entry in fields(content)}
+    given = {name: getattr(content, name) for name in names}
+    classes: list[SuiteClass] = []
+    for i, entry in enumerate(content.classes):
+        classes += _classes(file, i, entry)
+    given |= {"classes": tuple(classes), "file": file, "rules": rules}
     suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
     _check(suite)
     return suite
@@ -379,19 +285,23 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
     if entry.objects and given is not None:
         mend = "Leave one of them out."
         raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
+    if entry.split == "both":
+        splits = SPLITS
+    else:
+        splits = (entry.split,)
     for name in entry.objects or [given]:
         if name is None:
-            object = None
+            chosen = None
         else:
-            object = _object(file, str(name))
+            chosen = options["object"] = _object(file, str(name))
         yield SuiteClass(
-            name=name_with_object(entry.name, object),
+            name=name_with_object(entry.name, chosen),
             class_name=entry.name,
-            splits=SPLITS if entry.split == "both" else (entry.split,),
+            splits=splits,
             reward_scale=entry.reward_scale,
             gamma=entry.gamma,
             tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
-            options=options if object is None else {**options, "object": object},
+            options=dict(options),
         )
 
 
@@ -406,13 +316,11 @@ def _check(suite: Suite) -> None:
     _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
     if suite.kind == "meta":
         expected = SPLITS
+        mend = "Give each class a split."
     else:
         expected = ("train",)
+        mend = 'Leave split out, or write kind = "meta".'
     if suite.splits != expected:
-        if suite.kind == "meta":
-            mend = "Give each class a split."
-        else:
-            mend = 'Leave split out, or write kind = "meta".'
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
     all_listed = all(entry.tasks for entry in suite.classes)

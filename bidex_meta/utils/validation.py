@@ -6,6 +6,7 @@ the field, what was expected and the value.
 
 import dataclasses
 import functools
+import itertools
 import math
 import operator
 import re
@@ -223,7 +224,8 @@ def _choices(hint: object) -> list[object]:
     """Return all values that literals within an annotation allow."""
     if get_origin(hint) is Literal:
         return list(get_args(hint))
-    return [value for part in get_args(hint) if not isinstance(part, Meta) for value in _choices(part)]
+    parts = [part for part in get_args(hint) if not isinstance(part, Meta)]
+    return list(itertools.chain.from_iterable(map(_choices, parts)))
 
 
 # A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Randomisation
+from bidex_meta.rules import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument
@@ -137,10 +137,8 @@ class World(BatchedWorld):
         groups = build_groups(self.slots, self.slot_env_ids, make_engine)
         self._masked = groups[0].engine.masked
         self._describe_observations(groups)
-        self.parts = [
-            Part(group, self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
-            for group in groups
-        ]
+        own = (self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
+        self.parts = [Part(group, *own) for group in groups]
         if config.randomisation is None:
             self._randomiser = None
         else:

@@ -3,31 +3,22 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import (
-    METAWORLD_SUITES,
-    OTHER_SEED,
-    SPLITS,
-    Rules,
-    Suite,
-    load_randomisation,
-    load_suite,
-    plain_name,
-    suite_names,
-)
+from bidex_meta.rules import Rules, plain_name
+from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.utils.files import Json
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 
-Json = Mapping[str, Any]
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
@@ -51,7 +42,7 @@ class WorldsConfig:
     randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
-    def of(config: "Json | WorldsConfig") -> "WorldsConfig":
+    def of(config: "Mapping[str, Json] | WorldsConfig") -> "WorldsConfig":
         """Return the entries of a run's config that concern worlds; the others are left out."""
         if isinstance(config, WorldsConfig):
             return config
@@ -93,7 +84,7 @@ class Worlds(ABC):
             self.randomisation = load_randomisation(config.randomisation)
 
     @staticmethod
-    def open(config: Json | WorldsConfig) -> "Worlds":
+    def open(config: Mapping[str, Json] | WorldsConfig) -> "Worlds":
         """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
 
         Raises BidexError for unknown or faulty ones.
