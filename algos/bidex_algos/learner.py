@@ -6,7 +6,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any, ClassVar
 
 import torch
@@ -165,7 +165,9 @@ class Learner(Contract):
         total = sum(weight.numel() for weight in weights.values())
         if max(size for size in sizes.values() if isinstance(size, int)) > total:
             raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
-        config = cls.config_type(**state["config"])
+        # Options that a later version dropped do not shape the network.
+        names = {option.name for option in fields(cls.config_type)}
+        config = cls.config_type(**{name: value for name, value in state["config"].items() if name in names})
         shape = Shape.load(sizes)
         with torch.device("meta"):
             planned = cls._make_policy(config, shape, init, torch.device("meta")).state_dict()
