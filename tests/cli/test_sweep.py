@@ -56,6 +56,7 @@ def planned() -> list[PlannedRun]:
 
 def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, shown) -> None:
     core = max(CORES)
+    assert "--run-dir=runs/tiny/HandOver-ppo-seed0" in shown("sweep", file, "--dry-run") and not Path("runs").exists()
     out = shown("sweep", file, "--cores", core)
     assert out.count(" done ") == 2 and "2 done, 0 runs, 0 failed, 0 left" in out
     begun = starts(tmp_path)
@@ -226,7 +227,7 @@ def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, refused) -
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("submitit", reason="needs the extra slurm")
-    out, runs = Path("runs/tiny"), planned()
+    out, runs = Path("runs/tiny"), planned()[:1]
     out.mkdir(parents=True)
     for job in queue.submit(runs, out, "local", {"timeout_min": 2}).values():
         assert job.result()

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli.parsing import peek_all
+from bidex_meta.cli.run_flags import config_of_words
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.sweep_plan import PlannedRun, read_sweep
 from tests.pages import ROOT
@@ -133,13 +134,15 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
         assert told in error and error.count("\n") == 1 and not Path("runs").exists()
 
 
-def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, shown) -> None:
+def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch) -> None:
+    """A run of each arm, and one on each suite or class."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "results").symlink_to(ROOT / "results")  # teachers
     # Data sets are recorded before; which, the files say.
     monkeypatch.setattr("bidex_meta.experiments.run_data.open_datasets", lambda names: [])
     monkeypatch.setattr("bidex_meta.experiments.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
-        if "seeds" in path.read_text():
-            assert f"--run-dir=runs/{path.stem}/" in shown("sweep", path, "--dry-run")
-    assert not (tmp_path / "runs").exists()
+        runs = read_sweep(path).runs if "seeds" in path.read_text() else []
+        chosen = {run.arm: run for run in runs} | {run.subject: run for run in runs}
+        for run in chosen.values():
+            assert config_of_words(run.begin[1:]).num_envs and run.path.parent == Path("runs", path.stem)

@@ -1,6 +1,7 @@
 """Held-out classes: the suite's own form, demonstrations, the runs of each start, tables of what is done."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -30,10 +31,13 @@ from bidex_meta.cli.transfer_plan import (
 from bidex_meta.data import Episode, open_dataset, part_files
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation import statistics
 from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
 from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds.own import OwnSuite
+from tests.cli.conftest import toy
 from tests.data.worlds import ABOUT
 from tests.fakes import run_config
 
@@ -195,13 +199,23 @@ FLAGS = ["--steps", "96", "--demonstrations", "0", "--seeds", "2", "--num-envs",
 MORE = ["--", "--episodes", "1", "--device", "cpu", "--learner.critic-first", "12"]
 
 
-@pytest.fixture
-def trained(toy_worlds, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A run to start from, and runs within this process."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("trained") / "start"
     words = ["--suite", "ML4-v2", "--algo", "mtppo", "--num-envs", "6", "--steps", "480", "--device", "cpu"]
     words += ["--learner.hidden", "8", "--learner.activation", "tanh", "--threads", "1", "--logger", "none"]
-    assert main(["run", *words, "--no-evaluate", "--run-dir", "start"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OwnSuite, "world", toy)
+        assert main(["run", *words, "--no-evaluate", "--run-dir", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def trained(start: Path, toy_worlds, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A run to start from, and runs within this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(statistics, "RESAMPLES", 400)
+    shutil.copytree(start, "start")
 
     def work(runs, cores, say) -> int:
         return sum(main(list(run.begin)) != 0 for run in runs)
@@ -249,12 +263,12 @@ def test_a_failed_run_is_left_out_and_tried_again(trained: Path, monkeypatch, sh
     whole = transfer.work
     monkeypatch.setattr(transfer, "work", lambda runs, cores, say: whole(runs[1:], cores, say) + 1)
     with pytest.raises(SystemExit, match="1"):
-        main(["transfer", str(trained), *FLAGS, "--out", "t", *MORE])
+        main(["transfer", str(trained), *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2]])
     assert "1 failed" in capsys.readouterr().err
     first = json.loads(Path("t/transfer.json").read_text())["demonstrations"][0]
     assert (first["from"], first["seeds"]) == ("start", [1])
     monkeypatch.setattr(transfer, "work", whole)
-    shown("transfer", trained, *FLAGS, "--out", "t", *MORE)
+    shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2])
     assert json.loads(Path("t/transfer.json").read_text())["demonstrations"][0]["seeds"] == [0, 1]
 
 
