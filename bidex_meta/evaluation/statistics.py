@@ -14,6 +14,10 @@ from bidex_meta.runs.atomic import Json
 
 Statistic = Callable[..., np.ndarray]
 """Maps one array of shape ``(resamples, n, ...)`` per sample to values of shape ``(resamples,)``."""
+
+NONE = "–"
+"""Stands in tables for a value that is not there."""
+
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % bootstrap interval."""
 

@@ -314,12 +314,12 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "SweepPlan.of": lambda s: (SweepPlan.of, {
         "folder": (s.folder / "plan", "empty word nowhere"), "configs": ({"a": run_config()}, "dict"),
     }),
-    "SweepPlan.read": lambda s: (SweepPlan.read, {"file": (s.folder / "no.toml", ""), "root": ("runs", "empty word")}),
+    "SweepPlan.read": lambda s: (SweepPlan.read, {"file": (s.folder / "no.toml", ""), "root": ("runs", "")}),
     "sweep": lambda s: (sweep, {"plan": (SweepPlan(s.folder / "plan", []), ""), "workers": (1, "None one")}),
     "record": lambda s: (record, {"config": (RecordConfig("random"), "")}),
     "RecordConfig": lambda s: (RecordConfig, {
         "kind": ("random", "empty word"), "runs": ((), ""), "task": ("HandOver", "None empty word"),
-        "size": (5, "zero one huge"), "noise": (0.0, "zero one half"), "seed": (0, SEED), "actions": ("mean", ""),
+        "size": (5, "zero one"), "noise": (0.0, "zero one half"), "seed": (0, "zero one"), "actions": ("mean", ""),
     }),
     "transfer": lambda s: (transfer, {
         "run": (s.run, ""), "out": (s.folder / "t", ""), "classes": ((), ""), "steps": (5, ""), "seeds": (1, ""),
