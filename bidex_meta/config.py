@@ -68,6 +68,10 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 """A flag that may be given several times."""
 
 
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""A flag without a value and without a ``--no-`` twin."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Generic[LearnerSettings]):
     """Everything that decides what a run does, for example ``RunConfig(suite="MT4-v2", learner={"gamma": 0.99})``.

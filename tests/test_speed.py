@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.cli.bench import paired_steps
+from bidex_meta.experiments.world_speed import paired_steps
 from tests.world.play import suite_world
 
 FEW = ["--num-envs", "8", "--steps", "2", "--repeats", "3", "--threads", "1"]

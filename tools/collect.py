@@ -17,7 +17,7 @@ from torch import nn
 
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.policies import load_policy
-from bidex_meta.experiments.sweep_plan import read_sweep
+from bidex_meta.experiments.sweep_plan import SweepPlan
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation, evaluation_json
 from bidex_meta.runs.folder import RunFolder
@@ -115,7 +115,7 @@ def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
     """Return run folders; for a sweep, the folders of the ended runs, with the names of their arms."""
     if path.suffix != ".toml":
         return [(path, None)]
-    runs = read_sweep(path, out).runs
+    runs = SweepPlan.read(path, out).runs
     ended = [(run.path, run.arm) for run in runs if run.folder.evaluated]
     if not ended:
         raise BidexError(f"{path}: no run of it has ended under {out}. Run it: bidex-meta sweep {path}")

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import tyro
 
+from bidex_meta.config import Switch
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.validation import Seed, check_fields
 
@@ -45,8 +46,7 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
     raise TypeError(f"{command.__module__}.main parses no flags")
 
 
-Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # A flag without a value and without a ``--no-`` twin
-JsonSwitch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print JSON.")]
+JsonSwitch = Annotated[Switch, tyro.conf.arg(help="Print JSON.")]
 Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
 Engine = Annotated[
     Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
@@ -150,7 +150,7 @@ def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
         name = field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
         if dataclasses.is_dataclass(value):
-            yield from _flags(value, prefix if name == "config" else f"{prefix}{name}.")
+            yield from _flags(value, prefix if name in ("config", "final") else f"{prefix}{name}.")
         else:
             yield from [prefix + name, f"{prefix}no-{name}"][: 1 + isinstance(value, bool)]
 

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal
+from typing import Annotated, Any, Generic
 
 import tyro
 
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.config import LearnerSettings, RunConfig
-from bidex_meta.experiments.run_config import check, resolve
+from bidex_meta.experiments.evaluating import USUAL_EVALUATION, FinalEvaluation
+from bidex_meta.experiments.run_config import resolve
 from bidex_meta.runs.folder import AnyConfig, RunFolder
-from bidex_meta.utils.validation import Count, Few, Shots
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
@@ -29,20 +29,8 @@ class RunFlags(Generic[LearnerSettings]):
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
     count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
     evaluate: bool = True  # Evaluate at the end.
-    episodes: Few | None = None
-    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
-    that adapt play --rollouts episodes."""
-    other_tasks: Switch = False
-    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
-    others."""
-    split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
-    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
-    on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
-    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
-    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
     print_config: Switch = False  # Print the resolved config as JSON and stop.
+    final: Annotated[FinalEvaluation, tyro.conf.arg(name="")] = USUAL_EVALUATION
 
 
 def run_flags(arguments: Sequence[str]) -> RunFlags:
@@ -70,14 +58,9 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
         algo=default.algo,
         preset=default.preset,
     )
-    return replace(flags, config=resolve(config))
-
-
-def config_of_words(arguments: Sequence[str]) -> AnyConfig:
-    """Return the resolved and checked config of a run by the words that follow ``bidex-meta run``."""
-    config = run_flags(arguments).config
-    check(config)
-    return config
+    config = resolve(config)
+    flags.final.check(config)
+    return replace(flags, config=config)
 
 
 def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:

@@ -14,14 +14,13 @@ from rich.text import Text
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
-from bidex_meta.evaluation.statistics import Interval
+from bidex_meta.evaluation.statistics import NONE, Interval
 from bidex_meta.utils.streams import output_width
 
 if TYPE_CHECKING:  # torch, which lists and help do without
     from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 
 Json = dict[str, Any]  # an object of JSON
-NONE = "–"
 _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
     "unknown: of the worst finished episode)"

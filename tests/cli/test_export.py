@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from bidex_algos.nets.shape import Shape
-from bidex_meta.cli import export
-from bidex_meta.cli.export import exported
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import exporting as export
+from bidex_meta.experiments.exporting import exported
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.world.contract import ObservationGroup
 from tests.fakes import trained_run

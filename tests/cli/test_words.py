@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS
-from bidex_meta.cli import COMMANDS, listing, main
+from bidex_meta.cli import COMMANDS, main
+from bidex_meta.experiments import catalogue
 from bidex_meta.experiments.learners import ALGOS, learner_kind
 from bidex_meta.tasks import registry
 
@@ -36,7 +37,7 @@ def test_lists_read_from_source_are_as_the_classes_say(shown):
 
 
 def test_a_class_whose_docstring_gives_no_size_is_named(monkeypatch, capsys):
-    monkeypatch.setattr(listing, "_docstring", lambda *place: "Throw an egg.")
+    monkeypatch.setattr(catalogue, "_docstring", lambda *place: "Throw an egg.")
     assert main(["list", "tasks"]) == 2
     told = capsys.readouterr().err
     assert "HandOver: expected the observation's size" in told and told.count("\n") == 1

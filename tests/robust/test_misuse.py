@@ -26,7 +26,11 @@ from bidex_meta.evaluation.results import compare
 from bidex_meta.experiments import evaluating
 from bidex_meta.experiments.plotting import plot
 from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.recording import RecordConfig, record
+from bidex_meta.experiments.sweep_plan import SweepPlan
+from bidex_meta.experiments.sweeping import sweep
 from bidex_meta.experiments.training import train
+from bidex_meta.experiments.transferring import transfer
 from bidex_meta.experiments.verifying import verify
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
@@ -307,6 +311,19 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "run": (s.run, ""), "shots": (1, ""), "tasks": (1, ""), "trials": (1, ""),
     }),
     "verify": lambda s: (verify, {"run": (s.run, ""), "device": ("cpu", ""), "num_envs": (4, "")}),
+    "SweepPlan.of": lambda s: (SweepPlan.of, {
+        "folder": (s.folder / "plan", "empty word nowhere"), "configs": ({"a": run_config()}, "dict"),
+    }),
+    "SweepPlan.read": lambda s: (SweepPlan.read, {"file": (s.folder / "no.toml", ""), "root": ("runs", "")}),
+    "sweep": lambda s: (sweep, {"plan": (SweepPlan(s.folder / "plan", []), ""), "workers": (1, "None one")}),
+    "record": lambda s: (record, {"config": (RecordConfig("random"), "")}),
+    "RecordConfig": lambda s: (RecordConfig, {
+        "kind": ("random", "empty word"), "runs": ((), ""), "task": ("HandOver", "None empty word"),
+        "size": (5, "zero one"), "noise": (0.0, "zero one half"), "seed": (0, "zero one"), "actions": ("mean", ""),
+    }),
+    "transfer": lambda s: (transfer, {
+        "run": (s.run, ""), "out": (s.folder / "t", ""), "classes": ((), ""), "steps": (5, ""), "seeds": (1, ""),
+    }),
     "plot": lambda s: (plot, {"runs": ([s.run], ""), "out": (s.folder / "curves.png", "")}),
     "Checkpoints": lambda s: (lambda **a: Checkpoints(**a).load(), {
         "folder": (s.run.path, "nowhere"), "keep": (3, "one zero"),
