@@ -22,8 +22,8 @@ class Team(nn.Module):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, outputs: Sequence[int], output_gain: float,
-        generator: torch.Generator, share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, outputs: Sequence[int],
+        output_gain: float, generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__()
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
@@ -159,8 +159,8 @@ class TeamCritic(Team):
     """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, heads: int, generator: torch.Generator,
-        share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, heads: int,
+        generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 
