@@ -126,7 +126,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
-    --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
+    --algo mtppo and ppo, see --learner.demonstration-batch. Given several times: all of them."""
     teacher: Several = ()
     """With --algo dagger, icl, mtppo and ppo: who labels what the policy comes to. scripts: the scripts of all classes
     that have one; or the folder of a run on the same suite, or on one of its classes alone. Given several times: each

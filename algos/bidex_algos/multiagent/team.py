@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import Networks
+from bidex_algos.nets.architecture import NetworkConfig
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
@@ -22,8 +22,8 @@ class Team(nn.Module):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: Networks, outputs: Sequence[int], output_gain: float,
-        generator: torch.Generator, share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, outputs: Sequence[int],
+        output_gain: float, generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__()
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
@@ -159,8 +159,8 @@ class TeamCritic(Team):
     """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self, views: Sequence[AgentView], config: Networks, heads: int, generator: torch.Generator,
-        share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, heads: int,
+        generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 

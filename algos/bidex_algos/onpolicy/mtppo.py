@@ -334,7 +334,7 @@ class MTPPO(OnPolicy):
             else:
                 name = f"{len(index)} samples, first {first}, critic alone {critic_alone}"
                 measured.append(self._graphs.run(name, work, *inputs).clone())
-        names: list[str] = list(NAMES)
+        names = list[str](NAMES)
         if self.balance is not None:
             names.append(self.balance.tag)
         if self.demonstrations is not None:
