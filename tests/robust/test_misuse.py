@@ -20,6 +20,7 @@ from bidex_meta.clients.torchrl_env import TorchRLEnv
 from bidex_meta.data import open_dataset
 from bidex_meta.data.dataset import dataset_names
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import compare
@@ -284,10 +285,8 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "references": (None, "None dict"),
     }),
     "meta_evaluate": lambda s: (meta_evaluate, {
-        "agent": (s.zero, ""), "world": (s.few, ""), "shots": (0, "zero"), "rollouts": (None, "None one"),
-        "episodes_per_task": (1, "one None"), "tasks": (None, "None one"),
-        "trials": (1, "one None"), "max_adapt_steps": (5, "one huge None"),
-        "seed": (0, SEED + " None"), "references": (None, "None dict"),
+        "agent": (s.zero, ""), "world": (s.few, ""), "shots": (0, "zero"), "protocol": (Protocol(rollouts=1), ""),
+        "references": (None, "None dict"),
         "adapt_world": (None, "None"),
         "evaluated": (None, "None"),
     }),
