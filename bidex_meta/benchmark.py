@@ -335,7 +335,7 @@ def make_task_world(
       out, uniform in training worlds, fixed in evaluation worlds.
     - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
     - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
-    - `randomisation`: what is drawn anew for environments (docs/randomisation.md); left out, nothing.
+    - `randomisation`: factors and noise of environments (docs/randomisation.md); left out, none.
     - `task_seed`: draws the 50 tasks in the place of `seed`.
     - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
