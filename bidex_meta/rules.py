@@ -18,17 +18,17 @@ HELD_STEPS = 15
 @checked_arguments
 @dataclass(frozen=True)
 class Rules:
-    """Four choices, each alone; the defaults are version 1, ``V2`` has all of version 2."""
+    """Four independent choices; the defaults are version 1, and ``V2`` has all of version 2."""
 
     reward: Literal["paper", "v2"] = "paper"
     """The printed formula of each class, or ``aligned_terms``."""
     variation: Literal["narrow", "wide"] = "narrow"
-    """Whether goals vary about as much as success tolerates, or several times as much, with a hidden quantity in every
-    class. Wide observations also give objects' and goals' quaternions with w >= 0."""
+    """Narrow goals vary about as much as success tolerates; wide goals vary several times as much, with a hidden
+    quantity in every class. Wide observations also give objects' and goals' quaternions with w >= 0."""
     success: Literal["once", "at-end"] = "once"
-    """Whether the condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
+    """The condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
     starts: Literal["plain", "jittered"] = "plain"
-    """Whether every episode of every class draws joint noise and shifts what stands or lies."""
+    """If jittered, every episode of every class draws joint noise and shifts fixtures and objects."""
 
     @property
     def wide(self) -> bool:
@@ -107,7 +107,7 @@ class Randomisation:
     push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
     """Mean time between pushes, s."""
     draw: Literal["episode", "environment"] = "episode"
-    """Whether factors and the delay are drawn for every episode, or once for an environment."""
+    """Factors and the delay are drawn for every episode, or once per environment."""
 
     def __post_init__(self) -> None:
         check_fields(self, "randomisation")

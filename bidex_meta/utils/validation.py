@@ -190,7 +190,10 @@ def _refuse_unknown(content: object, kind: object, where: str, place: str = "") 
 
 def _message(error: msgspec.ValidationError, content: object, kind: object, field: str = "") -> str:
     """Rewrite msgspec's complaint as ``place: expected ..., got ....``."""
-    complaint, _, path = str(error).rpartition(" - at `$") if " - at `$" in str(error) else (str(error), "", "")
+    complaint, found, path = str(error).rpartition(" - at `$")
+    if not found:
+        complaint = str(error)
+        path = ""
     path = path.rstrip("`")
     place = (field + path).removeprefix(".")
     if isinstance(error.__cause__, BidexError):  # of a dataclass that checks more than its annotations

@@ -56,8 +56,8 @@ class Transition(NamedTuple):
 class BatchedWorld(VectorEnv, ABC):
     """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
 
-    Worlds pickle and copy: a copy is built anew and continues bit for bit. Of attributes set from outside only
-    ``stagger`` is copied.
+    Worlds pickle and copy: a copy is built again and continues bit for bit. Of the attributes that were set from
+    outside, only ``stagger`` is copied.
     """
 
     single_observation_space: Box

@@ -96,7 +96,7 @@ class GraphCache:
 
 
 def fresh(result: Result) -> Result:
-    """Return a nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
+    """Copy a nest of tensors into new memory; a tensor that occurs twice is copied once."""
     tensors = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
     copies = {key: torch.empty_like(value) for key, value in tensors.items()}
     for kind in {value.dtype for value in tensors.values()}:  # one call per dtype launches few kernels

@@ -1,6 +1,6 @@
 """Domain randomisation of a world: draws, and their way into models, actions and observations.
 
-A draw depends on seed, slot, environment, episode and, of noise and pushes, on the elapsed steps alone.
+A draw depends only on seed, slot, environment and episode; noise and pushes also depend on the elapsed steps.
 """
 
 from collections.abc import Sequence

@@ -43,7 +43,7 @@ class DrawnGhost(NamedTuple):
 class Painter(threading.local):
     """Draws environments of a world; renderers are cached. A copy starts without renderers: they cannot be copied.
 
-    A renderer draws in the thread that made it alone. Each thread therefore has its own cache, which ends with it.
+    A renderer draws only in the thread that made it. Each thread therefore has its own cache, which ends with it.
     """
 
     def __init__(self) -> None:

@@ -51,20 +51,20 @@ class EnvRecipe:
 
     name: str
     moving_base: bool | None
-    """Whether the hands' bases are driven; None: as the class has it alone."""
+    """True if the hands' bases move, False if they are fixed; None: as the class has it on its own."""
     options: tuple[tuple[str, float | str], ...]
     padded_size: int
     """Entries of an observation, without a point cloud."""
     hides_goal: bool
     reward_scale: float
     class_name: str | None = None
-    """The task class, where it is called otherwise: with an object."""
+    """The task class, if its name differs from ``name``, as with an object."""
     rules: Rules = V1
-    """Those of the suite."""
+    """The suite's rules."""
     points: tuple[int, bool] = (0, False)
-    """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
+    """Points of the cloud in place of objects' states (0: the states), and whether each point has its kind."""
     listed: bool = False
-    """Whether the suite's file lists the tasks, which may then lie outside of the class's variation space."""
+    """True if the suite's file lists the tasks, which may then lie outside of the class's variation space."""
 
     @property
     def env_name(self) -> str:

@@ -190,7 +190,7 @@ _OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """Kinds of points: what stands still in an episode; either hand; what physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
-"""Shares of the candidates: by area alone a table would leave an egg a handful."""
+"""Shares of the candidates: by area only, a table would leave an egg a handful of points."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers draw geoms of groups 0 to 2."""
 _PROBES = 512

@@ -1,7 +1,7 @@
-"""Worlds around a world: what recorders, statistics and the like are made from, and the form that Gymnasium expects.
+"""Wrappers of a world, the base of recorders and statistics, and the NumPy form that Gymnasium expects.
 
-Take the class of what is wrapped, so that evaluation and learners still see what it can do, and override what shall be
-done besides::
+Extend the wrapper of the wrapped world's class, so that evaluation and learners still see its abilities, and override
+the methods that shall do more::
 
     class Count(WorldWrapper):
         steps = 0

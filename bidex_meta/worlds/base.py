@@ -57,15 +57,15 @@ Identity = dict[str, str | int | None]
 class Worlds(ABC):
     """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
-    hides_goals: bool = False  # whether it is a meta suite that does not show its goals
+    hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
-    class_name: str | None = None  # the class, where it is a single one
+    class_name: str | None = None  # the class, if there is a single one
     object: str | None = None
-    moving_base: bool | None = None  # whether the bases of a single class move; None: as it has them
-    on_gpu: ClassVar[bool] = True  # whether a GPU is of use to its worlds
+    moving_base: bool | None = None  # whether a single class has moving bases; None: the class's own bases
+    on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
-    """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
-    default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
+    """A preset that precedes the others for these worlds, if the learner has it; and the reason in words."""
+    default_episodes: ClassVar[int] = 4  # default number of episodes per task in an evaluation
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
         self.name = name

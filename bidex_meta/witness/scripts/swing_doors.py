@@ -94,8 +94,15 @@ def push(hands: HandController) -> Actions:
     """Push the leaves away with fists above the bars, each to its angle, and then let go of it."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
-    leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
-    goals = [sign * goal for goal in _goals(hands, -0.1 if inward else 1.35)]  # inward they are shut
+    if inward:
+        leaves = _INWARD
+        sign = 1.0
+        usual = -0.1  # they are shut
+    else:
+        leaves = _OUTWARD
+        sign = -1.0
+        usual = 1.35
+    goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
         """Lead fists to leaves that are open towards the hands by these angles, at distance ``back``."""
