@@ -1,64 +1,65 @@
-"""What an evaluation asks of an agent. Names and order of calls are Meta-World's, so that an agent serves both."""
+"""Protocols of agents. Names and order of calls are Meta-World's, so that both libraries can evaluate an agent."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
 
 class Agent(Protocol):
-    """Whatever can be judged."""
+    """An agent that can be evaluated."""
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``; no exploration."""
+        """Return actions ``(num_envs, action)`` in [-1, 1], without exploration, for ``(num_envs, observation)``."""
         ...
 
     def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the environments of a mask, bool ``(num_envs,)``: forget what was known of them."""
+        """Forget the last episode of the environments in a mask, bool ``(num_envs,)``: they start a new one."""
 
 
 class Timestep(NamedTuple):
-    """One transition of every environment, as an adapting agent gets it.
+    """One transition of every environment, as an adapting agent receives it.
 
-    The first six are Meta-World's; from its evaluation the others are missing (None).
+    The first six entries are Meta-World's. Its evaluation leaves out the other entries (None).
     """
 
     observation: Tensor
-    """Observations the actions were chosen for, ``(num_envs, observation)``."""
+    """Observations that the actions were chosen for, ``(num_envs, observation)``."""
     action: Tensor
     reward: Tensor
     terminated: Tensor
     truncated: Tensor
-    """Bool ``(num_envs,)``: the episode was cut, by its time limit or since it was long enough to adapt."""
+    """Bool ``(num_envs,)``: the episode was cut by its time limit, or because it was long enough to adapt to."""
     aux_policy_outputs: dict[str, Tensor]
-    """What ``adapt_action`` returned beside the actions."""
+    """The other outputs of ``adapt_action``."""
     next_observation: Tensor | None = None
-    """Observations the transition led to, of the same episode, ``(num_envs, observation)``."""
+    """Observations after the transition, in the same episode, ``(num_envs, observation)``."""
     valid: Tensor | None = None
-    """Bool ``(num_envs,)``: False in rows that are frozen, since their episode is over, or where physics broke."""
+    """Bool ``(num_envs,)``: False for environments that are frozen after their episode, or whose physics broke."""
 
 
 class MetaLearningAgent(Agent, Protocol):
-    """An agent that adapts to the tasks it is put into.
+    """An agent that adapts to tasks.
 
-    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all environments, ``adapt_action`` and
-    ``step`` until each has played its episodes, ``adapt``; in between and at the end ``reset`` and ``eval_action``.
+    Calls come in this order: ``assign`` (only in our evaluation), ``init``; then for each shot ``reset`` of all
+    environments, ``adapt_action`` and ``step`` until every environment has played its episodes, and ``adapt``.
+    Evaluations before, between and after shots call ``reset`` and ``eval_action``.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Which environments play the same task and share what they learn: numbers from 0 on, int64 ``(num_envs,)``.
+        """Learn which environments share a task: tasks are numbers from 0, int64 ``(num_envs,)``.
 
-        None: each has a task of its own, as in Meta-World's evaluation, which does not call this.
+        None: each environment has its own task, as in Meta-World's evaluation, which does not call this method.
         """
 
     def init(self) -> None:
-        """Back to what was meta-learned; all adaptation and its data are forgotten."""
+        """Return to the meta-learned state; forget all adaptation and its data."""
 
-    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Exploring actions ``(num_envs, action)``, and what ``step`` shall be given back of the policy's outputs."""
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return exploring actions ``(num_envs, action)``, and the policy's other outputs for ``step``."""
         ...
 
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every environment."""
+        """Receive one transition of every environment."""
 
     def adapt(self) -> None:
-        """Learns from all transitions since the last ``adapt`` or ``init``."""
+        """Learn from all transitions since the last ``adapt`` or ``init``."""

@@ -1,35 +1,21 @@
 """`Benchmark("ML20")`: a suite file and a seed become task classes, tasks and worlds.
 
-The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for.
+The four properties and `Task` have Meta-World's names, so that code for Meta-World also runs here.
 """
 
 import hashlib
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, cast
+from typing import Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import (
-    MOST_POINTS,
-    OTHER_SEED,
-    OTHERS,
-    SPLITS,
-    V2,
-    ListedTask,
-    Randomisation,
-    Rules,
-    Split,
-    Suite,
-    SuiteClass,
-    load_suite,
-    plain_name,
-    versioned_name,
-)
+from bidex_meta.rules import V2, Randomisation, Rules, plain_name, versioned_name
+from bidex_meta.suite import MOST_POINTS, OTHER_SEED, OTHERS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
@@ -47,7 +33,7 @@ Entry = TypeVar("Entry")
 
 
 class Task(NamedTuple):
-    """One task class with one variation. `data` holds plain numbers: nothing is run to read it."""
+    """One task class with one variation. `data` holds plain numbers; reading it runs no code."""
 
     env_name: str
     """Name of the task class, a key of `train_classes` or `test_classes`; in suites of version 2 `CatchUnderarm-v2`."""
@@ -57,13 +43,13 @@ class Task(NamedTuple):
     @classmethod
     @checked_arguments
     def from_variation(cls, env_name: Text, variation: np.ndarray | Sequence[float]) -> "Task":
-        """The task of a class with this variation, shape (size,)."""
+        """Return the task of a class with this variation, shape (size,)."""
         numbers = real_numbers("variation", variation, 1)
         return cls(env_name, numbers.astype(_NUMBERS).tobytes())
 
     @property
     def variation(self) -> np.ndarray:
-        """The numbers of `data`: shape (size,), float64, a copy; BidexError where it holds none."""
+        """Return a copy of the numbers in `data`, shape (size,), float64; raise BidexError for other data."""
         try:
             return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
         except (TypeError, ValueError):
@@ -96,11 +82,11 @@ class ByClass(dict[str, Entry]):
         except KeyError:
             return False
 
-    def __or__(self, other: Any) -> Any:
+    def __or__(self, other: Mapping[str, Entry]) -> "ByClass[Entry]":  # type: ignore[override]
         return ByClass({**self, **other}, self._rules)
 
-    def get(self, name: str, default: Any = None) -> Any:
-        """Return the entry of a name, or the default where there is none."""
+    def get(self, name: str, default: Entry | None = None) -> Entry | None:  # type: ignore[override]
+        """Return the entry of a name, or the default if there is none."""
         try:
             return self[name]
         except KeyError:
@@ -108,12 +94,12 @@ class ByClass(dict[str, Entry]):
 
 
 class Benchmark:
-    """A suite with its task classes, its tasks and the worlds made of them.
+    """A suite with its task classes, tasks and worlds.
 
-    `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`;
-    `seed`, a whole number from 0 on, chooses the tasks and is the default seed of the worlds. Both give the same tasks
-    in every process; no global random generator is read or written. Its classes make single environments as
-    Meta-World's do; with `bidex_meta.metaworld` imported it is a `metaworld.Benchmark`.
+    `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of your own suite file, or a `Suite`.
+    `seed`, a whole number from 0, chooses the tasks and is the default seed of the worlds. The same name and seed give
+    the same tasks in every process; no global random generator is used. The classes make single environments, as in
+    Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a `metaworld.Benchmark`.
 
     Raises BidexError for an unknown suite, a faulty suite file or seed.
 
@@ -132,10 +118,9 @@ class Benchmark:
         self.seed = whole_number("seed", seed, 0)
         classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._classes = ByClass(classes, self.suite.rules)
-        self._tasks = {
-            split: {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
-            for split in SPLITS
-        }
+        self._tasks: dict[Split, dict[str, list[Task]]] = {}
+        for split in SPLITS:
+            self._tasks[split] = {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
         overlap = set(self.train_tasks) & set(self.test_tasks)
         if overlap:
             raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
@@ -151,42 +136,42 @@ class Benchmark:
 
     @property
     def name(self) -> str:
-        """The suite's name."""
+        """Return the suite's name."""
         return self.suite.name
 
     @property
     def train_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the train split by their tasks' `env_name`, in the order of the suite file.
+        """Return the environment classes of the train split by `env_name`, in the order of the suite file.
 
-        Classes of version 2 are also found by their name without `-v2`.
+        A class of version 2 also has its name without `-v2` as a key.
         """
         return self._env_classes("train")
 
     @property
     def test_classes(self) -> dict[str, type[SuiteEnv]]:
-        """Environment classes of the test split, as `train_classes`; empty in a multi-task suite."""
+        """Return the environment classes of the test split; empty in a multi-task suite."""
         return self._env_classes("test")
 
     @checked_arguments
     def task_classes(self, split: Split = "train") -> dict[str, TaskClass]:
-        """What the classes of a split are (scene, observation, reward), by name."""
+        """Return the task classes of a split (scene, observation, reward) by name."""
         classes = {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
         return ByClass(classes, self.suite.rules)
 
     @property
     def train_tasks(self) -> list[Task]:
-        """Tasks of the train split, class after class."""
+        """Return the tasks of the train split, class after class."""
         return list(chain.from_iterable(self._tasks["train"].values()))
 
     @property
     def test_tasks(self) -> list[Task]:
-        """Tasks of the test split, class after class; empty in a multi-task suite."""
+        """Return the tasks of the test split, class after class; empty in a multi-task suite."""
         return list(chain.from_iterable(self._tasks["test"].values()))
 
     def tasks_of(self, name: str, split: str = "train") -> list[Task]:
-        """Tasks of a class in a split; in version 2 the name may end in `-v2` or not.
+        """Return the tasks of a class in a split; in version 2 the name may end in `-v2` or not.
 
-        Raises BidexError for a class that the split does not have.
+        Raises BidexError if the split does not have the class.
         """
         tasks = ByClass(self._tasks[self._checked_split(split)], self.suite.rules)
         if name not in tasks:
@@ -200,7 +185,7 @@ class Benchmark:
 
     @property
     def padded_size(self) -> int:
-        """Width to which every observation is padded, before a one-hot: the widest class of the suite, both splits."""
+        """Return the size to which observations are padded, before a one-hot: that of the widest class."""
         return max(task_class.observation_size for task_class in self._classes.values())
 
     def make_world(
@@ -216,25 +201,26 @@ class Benchmark:
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
     ) -> World:
-        """A batched world of one split.
+        """Make a batched world of one split.
 
-        In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks; in a meta
-        suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo their number.
+        In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
+        suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
+        tasks.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
                 another seed, that no run trained on.
-            num_envs: Environments over all classes, divided evenly; left out, 1024 on the CPU, 8192 on an accelerator.
-            device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
-            seed: Seed of starts and task draws; left out, the benchmark's.
+            num_envs: Environments over all classes, divided evenly; None: 1024 on the CPU, 8192 on an accelerator.
+            device: `"auto"` (CUDA if there is a GPU), `"cpu"`, `"cuda"`, ... or a `torch.device`.
+            seed: Seed of starts and task draws; None: the benchmark's seed.
             autoreset_mode: SAME_STEP (the default, for training), NEXT_STEP (for Gymnasium's tools) or DISABLED (for
                 evaluation); also as text.
-            threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
-            engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
+            threads: Engine threads on the CPU; None: one per core. Results do not depend on it.
+            engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either device) or `"auto"`: the faster one.
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
-                environments do not end together; False: at 0.
-            randomisation: True: as the suite's file says; False: none; left out, as the file says in training worlds
-                alone; or another (docs/randomisation.md).
+                environments do not end together; False: all begin at step 0.
+            randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training
+                worlds; or a `Randomisation` (docs/randomisation.md).
             pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
@@ -253,18 +239,28 @@ class Benchmark:
                 randomisation = self.suite.randomisation
             else:
                 randomisation = None
+        if seed is None:
+            seed = self.seed
+        if evaluates or self.suite.kind == "meta":
+            task_sampling = "fixed"
+        else:
+            task_sampling = "uniform"
+        if self.suite.points:
+            points = PointsRule(self.suite.points, self.suite.point_kinds)
+        else:
+            points = None
         config = WorldConfig(
             num_envs=num_envs,
             device=device,
             engine=engine,
-            seed=self.seed if seed is None else seed,
+            seed=seed,
             autoreset_mode=mode,
             observation=self.suite.observation,
             pad_to=self.padded_size,
-            task_sampling="fixed" if evaluates or self.suite.kind == "meta" else "uniform",
+            task_sampling=task_sampling,
             threads=threads,
             stagger=stagger,
-            points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
+            points=points,
             randomisation=randomisation,
             pixels=pixels,
         )
@@ -334,18 +330,19 @@ def make_task_world(
     pixels: int = 0,
     task_seed: int | None = None,
 ) -> World:
-    """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
+    """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
-    `task_name` is a task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
-    `"package.module:Class"` of your own (docs/own-task.md). Beside the arguments of `Benchmark.make_world`:
+    `task_name` is a task class, e.g. `"HandOver"` (the only one with a fixed base: 398 observations, 40 actions), or
+    your own class as `"package.module:Class"` (docs/own-task.md). In addition to arguments of `Benchmark.make_world`:
 
-    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
-      out, uniform in training worlds, fixed in evaluation worlds.
-    - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
-    - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
-    - `randomisation`: what is drawn anew for environments (docs/randomisation.md); left out, nothing.
-    - `task_seed`: draws the 50 tasks in the place of `seed`.
-    - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
+    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. None:
+      uniform in training worlds, fixed in evaluation worlds.
+    - `moving_base`: whether the hands' bases move; None: as the class defines it.
+    - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state.
+    - `randomisation`: randomisation of the environments (docs/randomisation.md); None: nothing is randomised.
+    - `task_seed`: seed of the 50 tasks; None: `seed`.
+    - `object`: name or MJCF file (docs/objects.md) of an object that replaces the class's own; the slot's name then
+      ends in a dash and the object.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """

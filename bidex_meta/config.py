@@ -157,19 +157,22 @@ class RunConfig(Generic[LearnerSettings]):
 
     @property
     def learner_values(self) -> JsonObject:
-        """The learner's config as plain values."""
+        """Return the learner's config as plain values."""
         return json.loads(msgspec.json.encode(self.learner))
 
     def to_json(self) -> JsonObject:
-        """As ``config.json`` holds it."""
+        """Return the config as ``config.json`` holds it."""
         return json.loads(msgspec.json.encode(self))
 
     def flat(self) -> JsonObject:
-        """Plain values without nesting: ``learner.gamma`` beside ``seed``."""
+        """Return plain values without nesting: ``learner.gamma`` beside ``seed``."""
         return flat(self.to_json())
 
     def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
-        """Name, value here and value there of all entries that differ, but for those that a resumed run may change."""
+        """Yield name, value here and value there of all entries that differ.
+
+        Entries that a resumed run may change are left out.
+        """
         free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
         here = self.flat()
         there = other.flat()
@@ -178,7 +181,7 @@ class RunConfig(Generic[LearnerSettings]):
                 yield name, here.get(name), there.get(name)
 
     def early_end(self, metrics: Mapping[str, Json]) -> str | None:
-        """The tag of the metrics that has reached what ends the run early; None where the run goes on."""
+        """Return the tag of the metric that ends the run early, or None if the run continues."""
         if self.evaluate_every is None:
             prefix = "Train"
         else:
@@ -194,14 +197,17 @@ class RunConfig(Generic[LearnerSettings]):
         return None
 
     def goal(self, last: Mapping[str, Json]) -> int:
-        """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
+        """Return the steps that a run trains for.
+
+        These are the steps of its last metrics if time or a metric ended it, else ``steps``.
+        """
         if self.minutes is not None or self.early_end(last):
             return last["step"]
         return self.steps
 
 
 def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
-    """Tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    """Return tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
     found: JsonObject = {}
     for name, value in content.items():
         found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
@@ -226,5 +232,5 @@ def config_of(content: object, where: str) -> RunConfig[JsonObject]:
 
 
 def printed(config: RunConfig) -> str:
-    """The config as JSON for reading."""
+    """Return the config as indented JSON."""
     return json.dumps(config.to_json(), indent=2)

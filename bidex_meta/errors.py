@@ -21,9 +21,10 @@ class BidexError(ValueError):
 
 
 def known_name(kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})) -> str:
-    """The known name that a given one is, without regard to case; ``kind`` is what is looked up, e.g. ``"suite"``.
+    """Return the known name that equals a name except for upper and lower case.
 
-    Raises BidexError where there is none, with the nearest name (or the one that ``meant`` has for it) and the list.
+    ``kind`` says what is looked up, e.g. ``"suite"``. Raises BidexError if there is none, with the nearest name (or the
+    name that ``meant`` has for it) and the list.
     """
     names = list(known)
     if isinstance(name, str) and name in names:
@@ -35,7 +36,10 @@ def known_name(kind: str, name: str, known: Iterable[str], meant: Mapping[str, s
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that was probably meant; of one with a prefix (``metaworld/MT10``) the rest alone will do."""
+    """Return the known name that was probably meant, or None.
+
+    The part of a known name after its prefix is enough: ``MT10`` for ``metaworld/MT10``.
+    """
     given = name.casefold()
     names = list(known)
     for other in names:
@@ -49,7 +53,10 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def unknown_name(
     kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})
 ) -> BidexError:
-    """An error for a name of a kind, e.g. ``"suite"``, that does not exist, with the nearest known one and the list."""
+    """Return the error for an unknown name, with the nearest known name and the list.
+
+    ``kind`` says what was looked up, e.g. ``"suite"``.
+    """
     names = sorted(known)
     near = meant.get(str(name).casefold()) or nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
@@ -57,7 +64,10 @@ def unknown_name(
 
 
 def shortened(value: object) -> str:
-    """A value for one line of an error. Python refuses to print whole numbers of more than 4,300 digits."""
+    """Return a value as text of at most 80 characters, for one line of an error.
+
+    Python refuses to print whole numbers of more than 4,300 digits; the text then says so.
+    """
     try:
         shown = " ".join(repr(value).split())
     except Exception:
@@ -66,9 +76,9 @@ def shortened(value: object) -> str:
 
 
 def one_line(text: object) -> str:
-    """A text for a terminal: on one line, and without what a terminal would obey; names in it may be anybody's.
+    """Return a text on one line, without control characters that a terminal would obey.
 
-    Of words of more than 400 letters it keeps the beginning.
+    Names in it may come from anybody. Words of more than 400 letters are cut after 200.
     """
     words = " ".join(word if len(word) <= 400 else f"{word[:200]}..." for word in str(text).split())
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)

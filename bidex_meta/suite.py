@@ -5,22 +5,32 @@ Names of task classes and of their variations are checked where the classes are 
 
 import hashlib
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from bidex_meta.errors import BidexError, known_name, one_line, shortened, unknown_name
+from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.rules import (  # noqa: F401 (names of a suite, imported from here too)
+    FACTORS,
+    HELD_STEPS,
+    V1,
+    V2,
+    Randomisation,
+    Rules,
+    plain_name,
+    rules_apart,
+    versioned_name,
+)
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.files import absolute, expanded, portable, read_toml
+from bidex_meta.utils.files import Json, absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import check_fields, check_rising, parse
+from bidex_meta.utils.validation import parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
@@ -37,107 +47,6 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
 }  # fmt: skip
 """Suites of Meta-World's own environments, and their classes in its order."""
-
-
-HELD_STEPS = 15
-"""Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
-
-
-@checked_arguments
-@dataclass(frozen=True)
-class Rules:
-    """Four choices, each alone; the defaults are version 1, ``V2`` has all of version 2."""
-
-    reward: Literal["paper", "v2"] = "paper"
-    """The printed formula of each class, or ``aligned_terms``."""
-    variation: Literal["narrow", "wide"] = "narrow"
-    """Whether goals vary about as much as success tolerates, or several times as much, with a hidden quantity in every
-    class. Wide observations also give objects' and goals' quaternions with w >= 0."""
-    success: Literal["once", "at-end"] = "once"
-    """Whether the condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
-    starts: Literal["plain", "jittered"] = "plain"
-    """Whether every episode of every class draws joint noise and shifts what stands or lies."""
-
-    @property
-    def wide(self) -> bool:
-        """Whether the variation is wide."""
-        return self.variation == "wide"
-
-    @property
-    def as_printed(self) -> bool:
-        """Whether returns compare with those of version 1: the same tasks and reward."""
-        return self.reward == "paper" and not self.wide
-
-    @property
-    def jittered(self) -> bool:
-        """Whether starts are jittered."""
-        return self.starts == "jittered"
-
-
-V1 = Rules()
-V2 = Rules("v2", "wide", "at-end", "jittered")
-_VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
-
-
-def plain_name(name: str) -> str:
-    """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
-    found = _VERSIONED.match(name)
-    if found is None:
-        return name
-    return found[1] + name[found.end() :]
-
-
-def versioned_name(name: str, rules: Rules) -> str:
-    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
-    task_class, dash, thing = plain_name(name).partition("-")
-    if rules == V2:
-        return f"{task_class}-v2{dash}{thing}"
-    return name
-
-
-_Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
-_Size = Annotated[float, Meta(ge=0.8, le=1.25)]
-_Steps = Annotated[int, Meta(ge=0, le=60)]
-_Range = tuple[_Factor, _Factor]
-
-
-@dataclass(frozen=True)
-class Randomisation:
-    """What is drawn anew for an environment, uniformly from ranges, or added as noise; nothing by default.
-
-    Raises BidexError for values out of bounds or ranges that fall.
-    """
-
-    friction: _Range = (1.0, 1.0)
-    """Factor of the friction of all contacts."""
-    object_mass: _Range = (1.0, 1.0)
-    object_size: tuple[_Size, _Size] = (1.0, 1.0)
-    """Factor of the lengths of free objects without joints; their masses stay."""
-    actuator_gain: _Range = (1.0, 1.0)
-    """Factor of the fingers' actuator forces, before their limits."""
-    joint_damping: _Range = (1.0, 1.0)
-    """Factor of the damping of the fingers' joints."""
-    gravity: _Range = (1.0, 1.0)
-    observation_noise: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
-    """Standard deviation in an observation's units, of what sensors show of hands and objects."""
-    action_noise: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
-    """Standard deviation; actions are clipped afterwards."""
-    action_delay: tuple[_Steps, _Steps] = (0, 0)
-    """Control steps, a whole number of the range."""
-    push_speed: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Most that a push adds to the velocity of all objects along each axis, m/s."""
-    push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
-    """Mean time between pushes, s."""
-    draw: Literal["episode", "environment"] = "episode"
-    """Whether factors and the delay are drawn for every episode, or once for an environment."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "randomisation")
-        check_rising(self, "randomisation", *FACTORS, "action_delay")
-
-
-FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_damping", "gravity")
-"""Of a randomisation, those that are factors of the model's numbers."""
 
 
 @checked_arguments
@@ -158,7 +67,7 @@ class SuiteClass:
     """One task class of a suite."""
 
     name: str
-    """What it is called in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
+    """Name in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
     class_name: str
     splits: tuple[Split, ...]
     reward_scale: float
@@ -167,7 +76,7 @@ class SuiteClass:
     tasks: tuple[ListedTask, ...]
     """Listed tasks; empty where the tasks are drawn."""
     options: Mapping[str, float | str]
-    """What else the class lets one choose, by the names of its constructor's arguments."""
+    """Further options of the class, by the names of its constructor's arguments."""
 
 
 @checked_arguments
@@ -182,12 +91,12 @@ class Suite:
     """Multi-task suites have a train split only; meta suites both, without a task in common."""
     description: str
     observation: Literal["plain", "one-hot", "masked"]
-    """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
+    """Change of the padded observation: none, task id appended, goal entries zeroed."""
     task_id: Literal["class", "task"]
-    """What one entry of the one-hot stands for: a class or a listed task."""
+    """Meaning of one entry of the one-hot: a class or a listed task."""
     rules: Rules
     base: Literal["moving", "alone"]
-    """Whether every class gets the moving base, or each what it has on its own."""
+    """Moving bases for every class, or for each class the base that it has alone."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
@@ -195,9 +104,9 @@ class Suite:
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False
-    """Whether each point tells what it is of."""
+    """True if each point has its kind as a fourth entry."""
     randomisation: Randomisation | None = None
-    """Of training worlds."""
+    """Randomisation of training worlds."""
 
     def __post_init__(self) -> None:
         """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
@@ -205,28 +114,29 @@ class Suite:
 
     @property
     def digest(self) -> str:
-        """Twelve hexadecimal digits of all that decides tasks, rewards and observations, whatever the file's version.
+        """Return twelve hexadecimal digits of everything that decides tasks, rewards and observations.
 
-        Entries with their default value do not enter, so that a new kind of entry leaves old digests as they are.
+        The file's version does not enter. Entries with their default value do not enter either, so that a new kind of
+        entry leaves old digests as they are.
         """
         content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 
     @property
     def splits(self) -> tuple[Split, ...]:
-        """The splits that hold at least one class."""
+        """Return the splits that hold at least one class."""
         return tuple(split for split in SPLITS if self.split_classes(split))
 
     def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
-        """The classes of one split, in file order."""
+        """Return the classes of one split, in file order."""
         return tuple(entry for entry in self.classes if split in entry.splits)
 
 
 _OF_THE_FILE = ("name", "version", "description", "file")
 
 
-def _chosen(value: Any) -> Any:
-    """A value ready for JSON: of dataclasses the fields that are no default, of paths the name."""
+def _chosen(value: object) -> Json:
+    """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))
         return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
@@ -250,20 +160,14 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
     return replace(entry, name=plain_name(entry.name), class_name=plain)
 
 
-def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Return in words how other rules, by name, differ from some; empty where they are equal."""
-    pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
-    return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
-
-
 def suite_names() -> list[str]:
-    """Names of the suites that this installation ships, sorted."""
+    """Return the names of the suites that this installation ships, sorted."""
     return sorted(path.stem for path in suites_dir().glob("*.toml"))
 
 
 @checked_arguments
 def metaworld_classes(suite: str) -> tuple[str, ...]:
-    """The classes of one of Meta-World's suites; BidexError where there is none, with the nearest name."""
+    """Return the classes of one of Meta-World's suites; raises BidexError for another, with the nearest name."""
     if suite not in METAWORLD_SUITES:
         raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
     return METAWORLD_SUITES[suite]
@@ -271,7 +175,7 @@ def metaworld_classes(suite: str) -> tuple[str, ...]:
 
 @checked_arguments
 def load_suite(name_or_path: str | Path) -> Suite:
-    """Reads a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
+    """Read a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
 
     Raises BidexError for a missing suite or file, or a file that is not as `suites/README.md` describes.
     """
@@ -283,9 +187,9 @@ def load_suite(name_or_path: str | Path) -> Suite:
 
 @checked_arguments
 def load_randomisation(path: str | Path) -> Randomisation:
-    """The table ``[randomisation]`` of a TOML file: a suite's, or one that holds nothing else.
+    """Read the table ``[randomisation]`` of a TOML file: a suite's, or a file that holds nothing else.
 
-    Raises BidexError where there is none, or a faulty one.
+    Raises BidexError if the file has no such table, or a faulty one.
     """
     content = read_toml(expanded(path), "a file with a table [randomisation]")
     if "randomisation" not in content:
@@ -343,13 +247,13 @@ class _File:
     starts: Literal["plain", "jittered"] = "plain"
 
     def texts(self) -> Iterator[tuple[str, object]]:
-        """What comes to terminals, by its place in the file."""
+        """Yield every text that may be printed on a terminal, with its location in the file."""
         yield from (("name", self.name), ("description", self.description))
         for i, entry in enumerate(self.classes):
             yield f"classes[{i}].name", entry.name
             yield from ((f"classes[{i}].tasks[{j}].name", task.name) for j, task in enumerate(entry.tasks))
             yield from ((f"classes[{i}].objects", name) for name in entry.objects)
-            yield from ((f"classes[{i}].options.object", name) for name in [entry.options.get("object", "egg")])
+            yield f"classes[{i}].options.object", entry.options.get("object", "egg")
 
 
 def _parse(file: Path) -> Suite:
@@ -360,16 +264,19 @@ def _parse(file: Path) -> Suite:
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
     rules = Rules(content.reward, content.variation, content.success, content.starts)
-    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name in {f.name for f in fields(Suite)}}
-    classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
-    given |= {"classes": classes, "file": file, "rules": rules}
+    names = {entry.name for entry in fields(Suite)} & {entry.name for entry in fields(content)}
+    given = {name: getattr(content, name) for name in names}
+    classes: list[SuiteClass] = []
+    for i, entry in enumerate(content.classes):
+        classes += _classes(file, i, entry)
+    given |= {"classes": tuple(classes), "file": file, "rules": rules}
     suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
     _check(suite)
     return suite
 
 
 def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]:
-    """A class, or with `objects` one for each of them."""
+    """Yield the class of an entry, or with `objects` one class per object."""
     options: dict[str, float | str] = dict(entry.options)
     for name, value in options.items():
         if isinstance(value, str) != (name == "object"):
@@ -378,24 +285,28 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
     if entry.objects and given is not None:
         mend = "Leave one of them out."
         raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
+    if entry.split == "both":
+        splits = SPLITS
+    else:
+        splits = (entry.split,)
     for name in entry.objects or [given]:
         if name is None:
-            object = None
+            chosen = None
         else:
-            object = _object(file, str(name))
+            chosen = options["object"] = _object(file, str(name))
         yield SuiteClass(
-            name=name_with_object(entry.name, object),
+            name=name_with_object(entry.name, chosen),
             class_name=entry.name,
-            splits=SPLITS if entry.split == "both" else (entry.split,),
+            splits=splits,
             reward_scale=entry.reward_scale,
             gamma=entry.gamma,
             tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
-            options=options if object is None else {**options, "object": object},
+            options=dict(options),
         )
 
 
 def _object(file: Path, name: str) -> str:
-    """An object's name; of a file its path, which is relative to the suite file's folder."""
+    """Return an object's name; for a file its path, which is relative to the suite file's folder."""
     if name.endswith(".xml"):
         return str(absolute(file.parent / expanded(name)))
     return name
@@ -405,13 +316,11 @@ def _check(suite: Suite) -> None:
     _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
     if suite.kind == "meta":
         expected = SPLITS
+        mend = "Give each class a split."
     else:
         expected = ("train",)
+        mend = 'Leave split out, or write kind = "meta".'
     if suite.splits != expected:
-        if suite.kind == "meta":
-            mend = "Give each class a split."
-        else:
-            mend = 'Leave split out, or write kind = "meta".'
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
     all_listed = all(entry.tasks for entry in suite.classes)

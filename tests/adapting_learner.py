@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from bidex_meta.training.learner import AutoresetMode
+from bidex_meta.training.learner import AutoresetMode, Capability
 from bidex_meta.training.learner import Learner as Contract
 from bidex_meta.world.contract import State, VectorWorld
 from tests.points import Finder
@@ -26,7 +26,7 @@ PRESETS = {"laptop": Config(), "paper": Config(8)}
 class Learner(Contract):
     name = "finder"
     presets = PRESETS
-    adapts = True
+    capabilities = frozenset({Capability.ADAPTS})
 
     def __init__(self, world: VectorWorld, config: Config, seed: int):
         self.mode = world.metadata["autoreset_mode"].name

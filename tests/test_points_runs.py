@@ -31,7 +31,7 @@ def test_a_run_reads_clouds_and_is_evaluated_on_them(algo, tmp_path, capsys):
     assert main(["run", *flags, "--steps", "64", "--episodes", "1", "--run-dir", str(tmp_path / "a")]) == 0
     folder = RunFolder.open(tmp_path / "a")
     assert folder.config().points == 24 and read_metrics(folder.metrics_path)[-1]["step"] >= 64
-    assert folder.evaluation()["policy"]["classes"].keys() == {"HandOver"}
+    assert folder.evaluation().results.keys() == {"HandOver"}
     state, _ = checkpoint(folder, "last")
     shapes = [each.shape for name, each in state["learner"]["policy"]["weights"].items() if "shared.0.weight" in name]
     assert torch.Size([4, 3]) in shapes, "the actor has a PointNet"

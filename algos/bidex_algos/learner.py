@@ -6,7 +6,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any, ClassVar
 
 import torch
@@ -20,8 +20,8 @@ from bidex_algos.rollout import check_autoreset
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import broadcast, own_seed
+from bidex_meta.training.learner import Capability, LearnerConfig, Parts, State
 from bidex_meta.training.learner import Learner as Contract
-from bidex_meta.training.learner import LearnerConfig, Parts, State
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -49,8 +49,6 @@ class Learner(Contract):
 
     remedy: ClassVar[str]  # advice when a loss is no longer finite
     config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
-    discounts_by_class: ClassVar[bool] = False
-    """True if the learner supports discounts per class (``world.gammas``)."""
     unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
@@ -66,7 +64,7 @@ class Learner(Contract):
         self.env_steps = 0
         self.shape = Shape.of(world)
         check_options(self.name, config, world, self.shape)
-        check_discounts(self.name, world, self.discounts_by_class)
+        check_discounts(self.name, world, Capability.DISCOUNTS_BY_CLASS in self.capabilities)
         self.inputs = self._inputs(config, self.shape)
         # Weights are drawn from a CPU generator, so that a seed gives the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)
@@ -167,7 +165,9 @@ class Learner(Contract):
         total = sum(weight.numel() for weight in weights.values())
         if max(size for size in sizes.values() if isinstance(size, int)) > total:
             raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
-        config = cls.config_type(**state["config"])
+        # Options that a later version dropped do not shape the network.
+        names = {option.name for option in fields(cls.config_type)}
+        config = cls.config_type(**{name: value for name, value in state["config"].items() if name in names})
         shape = Shape.load(sizes)
         with torch.device("meta"):
             planned = cls._make_policy(config, shape, init, torch.device("meta")).state_dict()

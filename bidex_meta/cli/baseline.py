@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> None:
         found = _scripted(worlds, flags)
     else:
         found = _played(what, worlds, flags)
-    numbers = {name: result.to_json() for name, result in found.classes.items()}
+    numbers = found.to_json()["classes"]
     if flags.out is not None:
         stored = ("return", "return_interval", "success", "episodes", "unstable")
         made = {"policy": _POLICIES[what], "suite": portable(flags.suite), "seed": flags.seed}

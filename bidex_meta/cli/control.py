@@ -17,6 +17,7 @@ from bidex_meta.experiments.policies import policy_loader
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
@@ -96,7 +97,7 @@ def _check(folders: Sequence[RunFolder]) -> None:
     seeds: dict[int, Path] = {}
     for folder in folders:
         config = folder.config()
-        if not learner_kind(config.algo).make.adapts:
+        if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
         if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
@@ -120,11 +121,11 @@ def _play(folder: RunFolder, flags: ControlFlags) -> Control:
     say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
     test, train = (worlds.world(split, size) for split in ("test", "train"))
     protocol = Protocol(
-        "test", flags.seed, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
+        "test", flags.seed, shots=flags.shots, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
         max_adapt_steps=metatest.adapt_steps_of(config)
     )  # fmt: skip
     found = control(
-        policy_loader(folder, device)[0], test, train, flags.shots, say=say, protocol=protocol,
+        policy_loader(folder, device)[0], test, train, say=say, protocol=protocol,
         references=worlds.references(),
     )  # fmt: skip
     test.close()

@@ -14,6 +14,7 @@ from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.metatest import Options
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
+from bidex_meta.training.learner import Capability
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(EvaluateFlags, arguments, "evaluate")
     config = RunFolder.open(flags.run).config()
     where: dict[str, Any] = {"checkpoint": flags.checkpoint, "device": flags.device, "engine": flags.engine}
-    if learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
         _refuse_for_adapting(flags, config.algo)
         size = {entry.name: getattr(flags, entry.name) for entry in fields(Options)}
         found = meta_test(flags.run, split=flags.split, randomisation=flags.randomisation, **size, **where)

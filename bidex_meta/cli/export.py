@@ -17,6 +17,7 @@ from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, write_atomic
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.worlds import Worlds
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
     folder = RunFolder.open(flags.run)
     config = replace(folder.config(), device="cpu")
-    if learner_kind(config.algo).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(
             f"{config.algo} adapts to tasks or remembers, and an ONNX file maps one observation to one action. "
             "Export a policy that does not adapt, such as one of mtppo, mtsac, td3, mappo, dagger or bc."

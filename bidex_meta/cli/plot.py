@@ -9,6 +9,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.experiments.plotting import plot
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, refuse_links
+from bidex_meta.runs.evaluations import read_evaluation
 from bidex_meta.runs.stored import StoredRun, open_runs
 
 
@@ -39,11 +40,14 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
     else:
         out = output(flags.out, runs, "adaptation.png")
-        if isinstance(runs[0], StoredRun) and flags.evaluation is None:
-            plots.save(plots.draw_adaptation(runs[0].evaluation(), runs[0].path), out)
+        run = runs[0]
+        if flags.evaluation is None:
+            source = run.evaluation_path
+            evaluation = run.evaluation()
         else:
-            source = flags.evaluation or runs[0].path / "evaluation.json"
-            plots.save(plots.draw_adaptation(plots.read_evaluation(source), source), out)
+            source = flags.evaluation
+            evaluation = read_evaluation(source, f"bidex-meta evaluate {run.path} --shots 3 --json > {source}")
+        plots.save(plots.draw_adaptation(evaluation, source), out)
     print(out)
 
 

@@ -20,6 +20,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
@@ -242,7 +243,7 @@ def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
 
     folder = RunFolder.open(path)
     algo = folder.config().algo
-    if learner_kind(algo).make.adapts:
+    if Capability.ADAPTS in learner_kind(algo).make.capabilities:
         raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
     policy, steps = load_policy(folder, device, flags.checkpoint)
     sampled = flags.actions == "sampled" and isinstance(policy, SamplingAgent)

@@ -114,4 +114,5 @@ def _with_clouds(world: Any) -> Any:
 
     if not isinstance(world, World):
         raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
-    return CloudView(world, (world.points or PointsRule()).count)
+    count = (world.points or PointsRule()).count
+    return CloudView(world, count)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all

@@ -21,6 +21,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import History, estimates, read_groups, read_histories
 from bidex_meta.runs import plots, training_seconds
 from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.evaluations import MetaTestEvaluation
 from bidex_meta.runs.stored import Run
 from bidex_meta.runs.video import FILMS
 from bidex_meta.utils.files import is_file, portable
@@ -146,7 +147,7 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
     for run in filter(lambda run: run.evaluated, runs):
         with suppress(BidexError):  # the final table reports the error
             found = run.evaluation()
-            if found.get("splits"):
+            if isinstance(found, MetaTestEvaluation):
                 picture = _picture(lambda found=found, path=run.path: plots.draw_adaptation(found, path))
                 if picture is not None:
                     yield names[run.path], picture

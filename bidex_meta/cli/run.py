@@ -17,6 +17,7 @@ from bidex_meta.runs import RunFolder
 from bidex_meta.training import distributed
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, resume_command, say
+from bidex_meta.training.learner import Capability
 from bidex_meta.worlds import Worlds
 
 
@@ -53,7 +54,7 @@ def _checked(flags: RunFlags) -> RunFlags:
     """Refuse flags of an evaluation that this learner does not have."""
     config = flags.config
     asked = [name for name in ("split", "shots", "rollouts", "tasks") if vars(flags)[name] not in (None, "auto")]
-    adapts = learner_kind(config.algo, config.task).make.adapts
+    adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
     if asked and not adapts:
         raise BidexError(
             f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {config.algo}. Leave it out."
@@ -76,7 +77,7 @@ def _evaluate(flags: RunFlags, folder: RunFolder) -> None:
     """Evaluate on the device of the training, write evaluation.json and print the tables."""
     config = flags.config
     where: dict[str, Any] = {"device": launch().own_device(config.device), "engine": config.engine, "save": True}
-    if learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
         size = {"shots": flags.shots, "rollouts": flags.rollouts, "episodes": flags.episodes, "tasks": flags.tasks}
         print_meta_test(meta_test(folder, split=flags.split, **size, **where))
         say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

@@ -1,11 +1,10 @@
 """``bidex-meta submit``: write an entry of the leaderboard, verified by playing the runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
@@ -17,8 +16,10 @@ from bidex_meta.experiments.policies import checkpoint, fitting, policy_of
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
+from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Few
@@ -77,10 +78,10 @@ def main(arguments: Sequence[str]) -> None:
         "commit": [row[2] for row in facts],
     }  # fmt: skip
     entry = {
-        "format": FORMAT, "name": name, "suite": suite, "version": verified["suite_version"], "algorithm": first.algo,
+        "format": FORMAT, "name": name, "suite": suite, "version": verified.suite_version, "algorithm": first.algo,
         "weights": weights, "steps": [row[2] for row in played], "episodes": flags.episodes,
         "own": class_rows([row[0] for row in played]), "others": class_rows([row[1] for row in played]),
-        "verified": verified, "stated": stated,
+        "verified": asdict(verified), "stated": stated,
     }  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, entry)
@@ -94,7 +95,7 @@ def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
     for folder, config in zip(folders, configs, strict=True):
         if config.suite is None:
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
-        if learner_kind(config.algo).make.adapts:
+        if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
             raise BidexError(f"{config.algo} adapts to tasks, and the leaderboard is of policies that do not (yet).")
         if run_kind(config) != run_kind(configs[0]):
             raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
@@ -129,7 +130,7 @@ def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
     return round(training_seconds(folder.metrics()) / 3600.0, 3), device, commit
 
 
-def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Evaluation, Evaluation, int, Json]:
+def _play(folder: RunFolder, stored: RunConfig, flags: SubmitFlags) -> tuple[Evaluation, Evaluation, int, Conditions]:
     """Return the evaluations on own and on other tasks, the policy's steps, and the conditions."""
     config = stored.to_json()
     config |= {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": "auto"}

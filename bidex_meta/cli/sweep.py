@@ -146,7 +146,7 @@ def state_of(run: PlannedRun) -> State:
     last = rows[-1] if rows else {"step": 0}
     why = _last_line(_beside(run, "failed"))
     steps = run.config.goal(last)
-    done = evaluated and run.folder.evaluation().get("steps", steps) >= steps
+    done = evaluated and (run.folder.evaluation().steps or steps) >= steps
     if _locked(run):
         state = "runs"
     elif done:

@@ -27,9 +27,7 @@ from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.worlds import Worlds, WorldsConfig
 
-_NETWORK = (
-    "architecture", "modules", "hidden", "activation", "normalise_observations", "point_widths", "points_read",
-)  # fmt: skip
+_NETWORK = ("architecture", "hidden", "activation", "normalise_observations", "point_widths")
 """Fields of a learner's config that a policy to start from must share."""
 _ALGO = "ppo"
 _PRESET = "laptop"

@@ -56,7 +56,7 @@ def _print_table(title: str, found: Sequence[Agreement]) -> None:
     table = Sheet(["task", "outcome", "success", "again", "return [95 %]", "return again [95 %]"], title, caption)
     for each in found:
         both = each.recorded, each.again
-        cells = [each.name, each.outcome, *(percent(row["success"]) for row in both)]
-        cells += [ranged(row["return"], row.get("return_interval")) for row in both]
+        cells = [each.name, each.outcome, *(percent(row.success) for row in both)]
+        cells += [ranged(row.mean_return, row.return_interval) for row in both]
         table.add(*cells, style="bold red" if each.outcome == DIFFERS else "")
     print_table(table)

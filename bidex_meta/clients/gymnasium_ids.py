@@ -1,6 +1,7 @@
 """Gymnasium ids of every shipped suite (only vector entry points) and every task class (single and vector)."""
 
 import secrets
+from itertools import product
 from typing import Any
 
 import gymnasium
@@ -29,22 +30,21 @@ def task_id(task_name: str) -> str:
 
 def register_ids() -> None:
     """Register all ids; ids that are registered already stay as they are."""
-    specs: dict[str, dict[str, Any]] = {
-        env_id: {"vector_entry_point": f"{__name__}:make_suite_world", "kwargs": {"suite": name, "split": split}}
-        for name in suite_names()
-        for env_id, split in suite_ids(load_suite(name)).items()
-    }
-    custom = {"vector_entry_point": "bidex_meta.metaworld.vector_envs:make_custom"}
-    specs |= {f"{NAMESPACE}/custom-{kind}-envs": custom for kind in ("mt", "ml")}
-    for name in (each + version for each in registry.names() for version in ("", "-v2")):
-        specs[task_id(name)] = {
-            "entry_point": "bidex_meta.clients.gymnasium_env:TaskEnv",
-            "vector_entry_point": f"{__name__}:make_class_world",
-            "kwargs": {"task_name": name},
-        }
-    for env_id, spec in specs.items():
-        if env_id not in gymnasium.registry:
-            gymnasium.register(env_id, **spec)
+    for name in suite_names():
+        for env_id, split in suite_ids(load_suite(name)).items():
+            _register(env_id, None, f"{__name__}:make_suite_world", suite=name, split=split)
+    for kind in ("mt", "ml"):
+        _register(f"{NAMESPACE}/custom-{kind}-envs", None, "bidex_meta.metaworld.vector_envs:make_custom")
+    for name, version in product(registry.names(), ("", "-v2")):
+        task_name = name + version
+        single = "bidex_meta.clients.gymnasium_env:TaskEnv"
+        _register(task_id(task_name), single, f"{__name__}:make_class_world", task_name=task_name)
+
+
+def _register(env_id: str, single: str | None, vector: str, **arguments: str) -> None:
+    """Register an id with its entry points and their arguments, unless the id is registered already."""
+    if env_id not in gymnasium.registry:
+        gymnasium.register(env_id, single, vector_entry_point=vector, kwargs=arguments)
 
 
 def make_suite_world(

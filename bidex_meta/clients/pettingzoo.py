@@ -1,7 +1,6 @@
 """A task class as PettingZoo's parallel environment: fingers, hands or any of them as agents. Extra: `marl`."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -42,11 +41,12 @@ class HandsEnv(ParallelEnv):
         self.agents: list[str] = []
         self._columns = {view.name: np.array(view.columns) for view in views}
         self._actions = {view.name: np.array(view.actions) for view in views}
-        self.observation_spaces = {
-            name: Box(whole.low[columns], whole.high[columns], dtype=np.float32)
-            for name, columns in self._columns.items()
-        }
-        self.action_spaces = {name: Box(-1.0, 1.0, own.shape, np.float32) for name, own in self._actions.items()}
+        self.observation_spaces: dict[str, Box] = {}
+        self.action_spaces: dict[str, Box] = {}
+        for view in views:
+            columns = self._columns[view.name]
+            self.observation_spaces[view.name] = Box(whole.low[columns], whole.high[columns], dtype=np.float32)
+            self.action_spaces[view.name] = Box(-1.0, 1.0, self._actions[view.name].shape, np.float32)
         self.state_space = whole
         self._state = np.zeros(whole.shape, np.float32)
 
@@ -69,7 +69,7 @@ class HandsEnv(ParallelEnv):
         return self._observations(), {name: {} for name in self.agents}
 
     @checked_arguments
-    def step(self, actions: Mapping[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+    def step(self, actions: Mapping[str, object]) -> tuple[dict, dict, dict, dict, dict]:
         """Advance 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
 
         Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; all are empty
@@ -82,14 +82,12 @@ class HandsEnv(ParallelEnv):
             expected = self.action_spaces[name].shape
             given = dense(actions.get(name), torch.device("cpu"))
             if given is None or given.shape != expected:
-                if name in actions:
-                    shown = shortened(actions[name])
-                else:
-                    shown = "nothing"
-                if given is None:
-                    got = shown
-                else:
+                if given is not None:
                     got = f"shape {tuple(given.shape)}"
+                elif name in actions:
+                    got = shortened(actions[name])
+                else:
+                    got = "nothing"
                 raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
             joint[self._actions[name]] = given
         self._state, reward, terminated, truncated, info = self._env.step(joint)

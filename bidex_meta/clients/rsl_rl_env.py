@@ -43,7 +43,9 @@ class RslRlVecEnv(VecEnv):
         groups = {group.name: group for group in world.observation_groups}
         for name in set(policy) - groups.keys():
             raise unknown_name("observation group", name, groups)
-        entries = [torch.arange(part.start, part.stop) for name in policy for part in groups[name].where]
+        entries = []
+        for name in policy:
+            entries += [torch.arange(part.start, part.stop) for part in groups[name].where]
         if entries:
             self._policy = torch.cat(entries).to(world.device)
         else:
@@ -65,8 +67,8 @@ class RslRlVecEnv(VecEnv):
             steps = given.to(torch.int64)
         if given is None or steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
             got = shortened(value if given is None else given.tolist())
-            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
-            raise BidexError(f"episode_length_buf: expected {what}. Give steps, one number for each environment.")
+            fault = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
+            raise BidexError(f"episode_length_buf: expected {fault}. Give steps, one number for each environment.")
         self.get_observations()
         episodes = self.world.episodes
         episodes.counts = episodes.counts & (steps == episodes.elapsed)

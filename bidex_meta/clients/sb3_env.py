@@ -53,11 +53,8 @@ class SB3VecEnv(vec_env.VecEnv):
         ended = info["_final_obs"]
         rows = ended.nonzero().squeeze(1).tolist()
         if rows:
-            values = {
-                "truncated": truncated,
-                "episode_mask": info["episode_mask"],
-                **info.get("episode", info["running"]),
-            }
+            values = {"truncated": truncated, "episode_mask": info["episode_mask"]}
+            values |= info.get("episode", info["running"])
             columns = {name: value[ended].tolist() for name, value in values.items()}
             for i, (row, final) in enumerate(zip(rows, info["final_obs"][ended].cpu().numpy(), strict=True)):
                 infos[row] = {"terminal_observation": final, "TimeLimit.truncated": columns["truncated"][i]}

@@ -40,12 +40,12 @@ class SkrlEnv(Wrapper):
 
     @property
     def observation_space(self) -> Box:
-        """Observation space of one environment."""
+        """Return the observation space of one environment."""
         return self.world.single_observation_space
 
     @property
     def action_space(self) -> Box:
-        """Action space of one environment."""
+        """Return the action space of one environment."""
         return self.world.single_action_space
 
     def reset(self) -> tuple[Tensor, Info]:
@@ -70,7 +70,7 @@ class SkrlEnv(Wrapper):
         if bool(episode_mask.any()):
             names = {"r": "Episode / Return", "l": "Episode / Length", "success": "Episode / Success"}
             infos["episode"] = {names[name]: info["running"][name][episode_mask].float().mean() for name in names}
-        reward, terminated, truncated = (each[:, None] for each in results)
+        reward, terminated, truncated = (result[:, None] for result in results)
         return self._obs, reward, terminated, truncated, infos
 
     def state(self) -> None:

@@ -34,8 +34,7 @@ class TorchRLEnv(envs.EnvBase):
         self._world_seed = None
         low = torch.as_tensor(world.observation_space.low)
         high = torch.as_tensor(world.observation_space.high)
-        bounded = bool(low.isfinite().all() and high.isfinite().all())
-        if bounded:
+        if bool(low.isfinite().all() and high.isfinite().all()):
             seen = data.Bounded(low, high, device=device)
         else:
             seen = data.Unbounded(low.shape, device=device)
@@ -44,9 +43,8 @@ class TorchRLEnv(envs.EnvBase):
         counters = {name: data.Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
         episode = data.Composite({**counters, "success": flag}, shape=(rows,))
         self.observation_spec = data.Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
-        self.done_spec = data.Composite(
-            {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,)
-        )
+        ends = {name: flag.clone() for name in ("done", "terminated", "truncated")}
+        self.done_spec = data.Composite(ends, shape=(rows,))
         self.action_spec = data.Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
         self.reward_spec = data.Unbounded(column, device=device)
         self._obs = torch.zeros_like(low, device=device)
@@ -56,23 +54,17 @@ class TorchRLEnv(envs.EnvBase):
         self._world_seed = seed
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        if tensordict is not None:
-            asked = tensordict.get("_reset", None)
-        else:
-            asked = None
+        asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is None:
             mask = torch.ones_like(self._begun)
         else:
             mask = asked.squeeze(-1)
         left = mask & ~self._begun  # environments whose episode did not end in the last step
-        if asked is None or bool(left.any()):
-            if bool(left.all()) or asked is None:
-                options = None
-            else:
-                options = {"reset_mask": left}
-            self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)
-            if options is None:
-                self._world_seed = None
+        if asked is None or bool(left.all()):
+            self._obs, _ = self.world.reset(seed=self._world_seed)
+            self._world_seed = None
+        elif bool(left.any()):
+            self._obs, _ = self.world.reset(options={"reset_mask": left})
         self._begun = self._begun & ~mask
         return self._entries(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
 

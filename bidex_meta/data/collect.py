@@ -89,13 +89,24 @@ def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
     """Return the progress of a collection; raise BidexError if a part is damaged."""
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
-    owner, steps, returns, success = (
-        np.concatenate([np.zeros(0), *(table[name] for table in tables)])
-        for name in ("policy", "steps", "return_unscaled", "success")
-    )
-    of_policy = [owner == number for number in range(policies)]
-    mean = [float(column.mean()) if len(column) else math.nan for column in (returns, success)]
-    return Progress(len(paths), [int(steps[own].sum()) for own in of_policy], [int(o.sum()) for o in of_policy], *mean)
+    owner = _column(tables, "policy")
+    steps = _column(tables, "steps")
+    steps_of = []
+    episodes_of = []
+    for number in range(policies):
+        own = owner == number
+        steps_of.append(int(steps[own].sum()))
+        episodes_of.append(int(own.sum()))
+    returns = _mean(_column(tables, "return_unscaled"))
+    return Progress(len(paths), steps_of, episodes_of, returns, _mean(_column(tables, "success")))
+
+
+def _column(tables: Sequence[dict[str, np.ndarray]], name: str) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(table[name] for table in tables)])
+
+
+def _mean(column: np.ndarray) -> float:
+    return float(column.mean()) if len(column) else math.nan
 
 
 def resumed_writer(folder: Path) -> DatasetWriter:
@@ -133,8 +144,8 @@ def collect(
         collector.active = rows
         _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
-            what = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
-            raise BidexError(f"{what}. Check the policy's actions.")
+            fault = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
+            raise BidexError(f"{fault}. Check the policy's actions.")
         writer.left_out.update({name: count for name, count in collector.left_out.items() if name == BROKEN})
         collector.left_out.clear()
         writer.commit()

@@ -154,13 +154,13 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """Columns of ``part_files.TABLE`` and ``variation``, one row per episode; raises BidexError for damage."""
+        """Return the columns of ``part_files.TABLE`` and ``variation`` by episode; raise BidexError for damage."""
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes = len(columns["steps"])
         steps = int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
-            what = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
-            raise BidexError(f"{self.folder}: {what}. Parts are missing: record it again, or bring them back.")
+            fault = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
+            raise BidexError(f"{self.folder}: {fault}. Parts are missing: record it again, or bring them back.")
         slots = len(self.metadata["tasks"])
         if ((columns["task"] < 0) | (columns["task"] >= slots)).any():
             raise BidexError(f"{self.folder}: expected tasks from 0 to {slots - 1}, found others. Record it again.")
@@ -168,17 +168,17 @@ class Dataset:
 
     @property
     def observation_size(self) -> int:
-        """Number of entries of an observation, d."""
+        """Return the number of entries of an observation, d."""
         return self._sizes[0]
 
     @property
     def action_size(self) -> int:
-        """Number of entries of an action, a."""
+        """Return the number of entries of an action, a."""
         return self._sizes[1]
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Least and largest actions, (a,) each, of a data set from elsewhere; None for our own data sets, i.e. ±1.
+        """Return the least and largest actions, (a,) each, of a data set from elsewhere; None for our own: ±1.
 
         Raises BidexError if the bounds are not finite.
         """
@@ -192,10 +192,12 @@ class Dataset:
         if first is None:
             raise BidexError(f"{self.folder} holds no episode. Record it again.")
         groups = self.metadata.get("observation_groups", ())
-        shown = max((stop for _, ranges in groups for _, stop in ranges), default=0)
+        shown = 0
+        for _, ranges in groups:
+            shown = max(shown, *(stop for _, stop in ranges))
         if shown > (size := first.observations.shape[1]):
-            what = f"expected {shown} entries of an observation, found {size}"
-            raise BidexError(f"{self.folder}: {what}. Record it again.")
+            fault = f"expected {shown} entries of an observation, found {size}"
+            raise BidexError(f"{self.folder}: {fault}. Record it again.")
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:
@@ -221,10 +223,10 @@ class Dataset:
 
     def _episode(self, group: H5, number: int) -> Episode:
         row = {name: column[number].item() for name, column in self.table.items() if name != "variation"}
-        arrays = {
-            ours: other_formats.numbers(group[name], name, self.name, row["steps"] + (name == "observations"))
-            for name, ours in part_files.ARRAYS.items()
-        }
+        arrays = {}
+        for name, ours in part_files.ARRAYS.items():
+            length = row["steps"] + (name == "observations")
+            arrays[ours] = other_formats.numbers(group[name], name, self.name, length)
         variation = self.table["variation"][number]
         return Episode(
             **arrays,
@@ -272,15 +274,17 @@ class Dataset:
         return tensors
 
     def _outside_table(self) -> dict[str, np.ndarray]:
-        found = []
+        steps = []
+        returns = []
         with part_files.reading(self.folder / part_files.MAIN) as file:
             for number in range(self.num_episodes):
                 rewards = other_formats.numbers(file[f"episode_{number}"]["rewards"], "rewards", self.name)
-                found.append((len(rewards), rewards.sum(dtype=np.float64)))
-        table = {name: np.zeros(len(found), kind) for name, kind in part_files.TABLE.items()}
-        if found:
-            table["steps"][:], table["return"][:] = zip(*found, strict=True)
-        return table | {"return_unscaled": table["return"].copy(), "variation": np.zeros((len(found), 0))}
+                steps.append(len(rewards))
+                returns.append(rewards.sum(dtype=np.float64))
+        table = {name: np.zeros(len(steps), kind) for name, kind in part_files.TABLE.items()}
+        table["steps"][:] = steps
+        table["return"][:] = returns
+        return table | {"return_unscaled": table["return"].copy(), "variation": np.zeros((len(steps), 0))}
 
 
 def _joined(columns: list[np.ndarray]) -> np.ndarray:

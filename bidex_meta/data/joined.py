@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -55,14 +56,16 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     forms = [_Form(dataset, world, plain, actions) for dataset in datasets]
     steps = sum(dataset.num_steps for dataset in datasets)
     episodes = sum(dataset.num_episodes for dataset in datasets)
-    slots = {form.slots[task] for form in forms for task in np.unique(form.dataset.table["task"])}
+    slots = set[int]()
+    for form in forms:
+        slots |= {form.slots[task] for task in np.unique(form.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
-        what = f"Expected data of every class, found none of {', '.join(missing)}"
-        raise BidexError(f"{what}. Add a data set, or name a suite of the others alone.")
+        fault = f"Expected data of every class, found none of {', '.join(missing)}"
+        raise BidexError(f"{fault}. Add a data set, or name a suite of the others alone.")
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
-    fitted = (form.fitted(episode, ids) for form in forms for episode in form.dataset.episodes())
+    fitted = chain.from_iterable(form.fitted_episodes(ids) for form in forms)
     return gathered(fitted, steps, episodes, plain + ids, actions)
 
 
@@ -123,14 +126,14 @@ class _Form:
         names: list[str] = about["tasks"]
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
-            what = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
-            raise BidexError(f"{what}. Record it with the same bases (--base), or learn for what it was recorded of.")
+            fault = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
+            raise BidexError(f"{fault}. Record it with the same bases (--base), or learn for what it was recorded of.")
         shown = about.get("observation_groups", ())
-        ids = sum(stop - start for name, parts in shown if name == "task_id" for start, stop in parts)
+        ids = sum(stop - start for start, stop in dict(shown).get("task_id", ()))
         self._width = plain
         self._own = _Columns.of(shown, dataset.observation_size - ids)
-        seen = ((group.name, [(part.start, part.stop) for part in group.where]) for group in world.observation_groups)
-        self._theirs = _Columns.of(seen, plain)
+        groups = [(group.name, [(part.start, part.stop) for part in group.where]) for group in world.observation_groups]
+        self._theirs = _Columns.of(groups, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
         slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
@@ -138,10 +141,10 @@ class _Form:
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own = about.get("reward_scales", {})
         theirs = {slot.name: slot.reward_scale for slot in slots}
-        self._factors = [
-            theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0) if own and theirs else 1.0
-            for name, slot in zip(names, self.slots, strict=True)
-        ]
+        self._factors = [1.0] * len(names)
+        if own and theirs:
+            for number, (name, slot) in enumerate(zip(names, self.slots, strict=True)):
+                self._factors[number] = theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0)
 
     def _check_observations(self, may_pad: bool) -> None:
         """Raise BidexError for other clouds or state sizes; with ``may_pad`` the world's states may be wider."""
@@ -154,11 +157,14 @@ class _Form:
         here = len(own.state)
         there = len(theirs.state)
         if here > there or (here < there and not may_pad):
-            what = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
-            raise BidexError(f"{what}. Learn for what it was recorded of.")
+            fault = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
+            raise BidexError(f"{fault}. Learn for what it was recorded of.")
 
-    def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
-        """Return an episode, its slot, and its observations in the world's form."""
+    def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
+        """Yield all episodes, each with its slot and its observations in the world's form."""
+        return (self._fitted(episode, ids) for episode in self.dataset.episodes())
+
+    def _fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         slot = self.slots[episode.task]
         factor = self._factors[episode.task]
         own = self._own

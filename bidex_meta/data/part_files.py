@@ -26,11 +26,10 @@ import numpy as np
 
 from bidex_meta.data import seals
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.runs.atomic import sync_folder
+from bidex_meta.runs.atomic import Json, sync_folder
 from bidex_meta.utils.files import is_file
 
 H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no types
-Json = dict[str, Any]
 
 MAIN = "main_data.hdf5"
 METADATA = "metadata.json"
@@ -75,8 +74,8 @@ def hdf5() -> ModuleType:
     try:
         import h5py
     except ModuleNotFoundError:
-        what = "Expected h5py for data sets, but it is not installed"
-        raise BidexError(f"{what}. Add it: pip install 'bidex-meta[data]'.") from None
+        fault = "Expected h5py for data sets, but it is not installed"
+        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[data]'.") from None
     return h5py
 
 
@@ -248,8 +247,8 @@ def reading(path: Path) -> Iterator[H5]:
         raise
     except Exception as error:  # h5py raises many kinds; a group instead of an array lacks an array's attributes
         reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
-        what = f"{path} is damaged or no part of a data set ({reason})"
-        raise BidexError(f"{what}. Delete it and record it again.") from None
+        fault = f"{path} is damaged or no part of a data set ({reason})"
+        raise BidexError(f"{fault}. Delete it and record it again.") from None
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:

@@ -1,1 +1,1 @@
-"""How good a policy is: episodes, results, the meta-test and its control, scores, runs beside each other."""
+"""Evaluation of policies: episodes, results, the meta-test and its control, scores, comparison of runs."""

@@ -1,9 +1,9 @@
-"""Several runs beside each other: groups that differ in nothing but the seed, with intervals over seeds."""
+"""Comparison of runs: groups of runs that differ only in the seed, with intervals over seeds."""
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
 from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, iqm_difference, iqm_over_seeds
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
@@ -22,20 +23,20 @@ from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
 _SETTINGS += ("base", "points", "object")
-_MADE = "made with"  # the entry of a kind with what tells its worlds from others
+_MADE = "made with"  # entry of a kind: versions that differ from other runs on the same worlds
 _POINTS = 200  # of a curve over several runs
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but the seed; single-task runs of several classes are one group."""
+    """Runs that differ only in the seed; single-task runs of several classes are one group."""
 
     label: str  # the algo, and settings that differ from other groups of that algo
     seeds: list[int]  # in rising order; rows of the arrays below
     classes: list[str]  # columns of the arrays below
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
-    scores: np.ndarray | None  # normalised score, (seeds, classes); None where a class has no reference
+    scores: np.ndarray | None  # normalised score, (seeds, classes); None if a class has no reference
     steps: int  # environment steps of a seed, over all its runs: the mean over seeds, which may differ
     steps_range: tuple[int, int]  # fewest and most steps of a seed
     hours: float  # mean time of a seed's training, over all its runs, without evaluation
@@ -54,25 +55,29 @@ def read_groups(runs: Sequence[Run]) -> list[Group]:
 
     Raises BidexError if one is not evaluated, two are the same, or a group's seeds cover different classes.
     """
-    kinds = [run_kind(run.config(), run.evaluation().get("split", "train")) for run in runs]
+    kinds = [run_kind(run.config(), run.evaluation().split) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
 
 
 def run_kind(config: AnyConfig, split: str = "train") -> Json:
-    """The settings that runs compared as one share: all of the config that matters but the seed."""
+    """Return the settings that runs of one group share: all settings that matter, without the seed."""
     kind = {name: vars(config)[name] for name in _SETTINGS}
-    kind |= {"on": config.suite or "one class at a time", "split": split}
-    kind["started"] = "afresh" if config.start_from is None else "from another run"  # which: one for each seed
-    kind |= {"dataset": _data(config, config.dataset), "demonstrations": _data(config, config.demonstrations)}
-    # Of runs not which: a group's runs of single classes each have one for their own.
-    kind["teacher"] = (
-        " + ".join(sorted({"scripts" if name == "scripts" else "runs" for name in config.teacher})) or None
-    )
-    return kind | {f"learner.{name}": value for name, value in config.learner_values.items()}
+    kind["on"] = config.suite or "one class at a time"
+    kind["split"] = split
+    # The name of the other run is left out, because each seed may start from its own run.
+    kind["started"] = "afresh" if config.start_from is None else "from another run"
+    kind["dataset"] = _data(config, config.dataset)
+    kind["demonstrations"] = _data(config, config.demonstrations)
+    # Names of teachers are left out, because each single-class run of a group has a teacher for its own class.
+    teachers = {"scripts" if name == "scripts" else "runs" for name in config.teacher}
+    kind["teacher"] = " + ".join(sorted(teachers)) or None
+    for name, value in config.learner_values.items():
+        kind[f"learner.{name}"] = value
+    return kind
 
 
 def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
-    """Data sets by their names; of those called as the run's class the kind alone, or classes were no one group."""
+    """Return the names of data sets, without the name of the run's own class: classes of one group share the rest."""
     if config.task is None:
         own = ""
     else:
@@ -81,36 +86,49 @@ def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
 
 
 def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
-    """Runs of the same kind together, in the order they are named, with a label each.
+    """Return the labels and runs of groups of one kind, in the order in which they are named.
 
-    That is the name of a study's arm where all runs of the group come from it and no other group's do, else the
-    settings that differ. Runs that were made with different worlds are apart, and the label names these.
+    A label is the name of a study's arm if all runs of the group, and of no other group, come from this arm; otherwise
+    it consists of the settings that differ. Runs on different worlds form separate groups, whose labels name the
+    difference.
     """
     _check_copies(runs)
     members: dict[str, list[Run]] = {}
     unique: dict[str, Json] = {}
-    for kind, made, run in zip(kinds, split_by_worlds(runs), runs, strict=True):
-        kind = {**kind, _MADE: [f"{name} {value}" for name, value in made.items()]}
+    for kind, versions, run in zip(kinds, split_by_worlds(runs), runs, strict=True):
+        kind = {**kind, _MADE: [f"{name} {value}" for name, value in versions.items()]}
         key = json.dumps(kind, sort_keys=True)
         unique[key] = kind
         members.setdefault(key, []).append(run)
-    groups = []
-    for key, kind in unique.items():
-        others = [other for other in unique.values() if other["algo"] == kind["algo"]]
-        names = {name for a in others for b in others for name in a.keys() | b.keys() if a.get(name) != b.get(name)}
-        names -= {_MADE}
-        differing = [f"{name.removeprefix('learner.')} {portable(kind.get(name))}" for name in sorted(names)]
-        groups.append((", ".join([kind["algo"], *differing]), members[key]))
-    arms = [{run.arm if isinstance(run, StoredRun) else None for run in mine} for _, mine in groups]
-    names = [arm.pop() if len(arm) == 1 and arms.count(arm) == 1 else None for arm in map(set, arms)]
-    labels = []
-    for name, (label, _), kind in zip(names, groups, unique.values(), strict=True):
-        labels.append(", ".join([name or label, *kind[_MADE]]))
-    return [(label, mine) for label, (_, mine) in zip(labels, groups, strict=True)]
+    arms = [_arms_of(group) for group in members.values()]
+    labelled = []
+    for arm, (key, kind) in zip(arms, unique.items(), strict=True):
+        if len(arm) == 1 and arms.count(arm) == 1:
+            name = next(iter(arm))
+        else:
+            name = None
+        label = name or _differing_settings(kind, unique.values())
+        labelled.append((", ".join([label, *kind[_MADE]]), members[key]))
+    return labelled
+
+
+def _arms_of(runs: Sequence[Run]) -> set[str | None]:
+    """Return the arms of studies that runs come from; run folders have the arm None."""
+    return {run.arm if isinstance(run, StoredRun) else None for run in runs}
+
+
+def _differing_settings(kind: Json, kinds: Iterable[Json]) -> str:
+    """Return the learner's name and the settings that are not the same in all kinds with this learner."""
+    others = [other for other in kinds if other["algo"] == kind["algo"]]
+    texts = [kind["algo"]]
+    for name in sorted(set().union(*others) - {_MADE}):
+        if any(other.get(name) != kind.get(name) for other in others):
+            texts.append(f"{name.removeprefix('learner.')} {portable(kind.get(name))}")
+    return ", ".join(texts)
 
 
 def _check_copies(runs: Sequence[Run]) -> None:
-    """Raise BidexError for a run and its copy, whatever seed the copy's config says: their times are equal."""
+    """Raise BidexError if one run is a copy of another: the times of their metrics are equal, even if seeds differ."""
     known: dict[tuple[float, ...], Path] = {}
     for run in runs:
         times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
@@ -152,42 +170,37 @@ def _comparable(group: Group, first: Group) -> bool:
     return group is not first and set(group.classes) == set(first.classes)
 
 
-def classes_of(evaluation: Json, convert: Callable[[Json], Json] = lambda rows: rows) -> Json:
-    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class.
-
-    ``convert`` takes the results of a split, by class.
-    """
-    if "splits" in evaluation:
-        after = {split: convert(part["after"]["classes"]) for split, part in evaluation["splits"].items()}
-        return {f"{name} ({split})": row for split, rows in after.items() for name, row in rows.items()}
-    return convert(evaluation.get("policy", evaluation)["classes"])
-
-
-def scored_classes(run: Run) -> Json:
-    """Return :func:`classes_of` of the run's evaluation, with scores by the current references."""
+def scored_classes(run: Run) -> dict[str, ClassSummary]:
+    """Return the ``results`` of the run's evaluation, with scores by the present references."""
     config = run.config()
-    return classes_of(run.evaluation(), lambda rows: rescored(rows, config))
+    evaluation = run.evaluation()
+    if isinstance(evaluation, PolicyEvaluation):
+        return rescored(evaluation.policy.classes, config)
+    splits = {}
+    for split, part in evaluation.splits.items():
+        after = replace(part.after, classes=rescored(part.after.classes, config))
+        splits[split] = replace(part, after=after)
+    return replace(evaluation, splits=splits).results
 
 
 def group_of(label: str, runs: Sequence[Run]) -> Group:
-    """Evaluated runs that the caller takes as seeds of one group; errors as of :func:`read_groups`."""
-    by_seed: dict[int, dict[str, Json]] = {}
+    """Return the group of evaluated runs that differ only in the seed; errors are those of :func:`read_groups`."""
+    by_seed = defaultdict[int, dict[str, ClassSummary]](dict)
     seconds = defaultdict[int, float](float)
     steps = defaultdict[int, int](int)
     for run in runs:
         seed = run.config().seed
         goal = run.goal
         own = scored_classes(run)
-        evaluated = run.evaluation().get("steps", goal)
-        if evaluated < goal:
+        evaluated = run.evaluation().steps
+        if evaluated is not None and evaluated < goal:
             raise BidexError(
                 f"The evaluation of {run.path} is of {evaluated:,} steps, but the run goes on to {goal:,}. Let it end, "
                 f"or write it anew: {run.again}"
             )
-        of_seed = by_seed.setdefault(seed, {})
-        if twice := of_seed.keys() & own.keys():
+        if twice := by_seed[seed].keys() & own.keys():
             raise BidexError(f"{run.path} is the second run of {label} with seed {seed} on {min(twice)}.")
-        of_seed |= own
+        by_seed[seed] |= own
         seconds[seed] += training_seconds(run.metrics())
         steps[seed] += goal
     seeds = sorted(by_seed)
@@ -199,12 +212,13 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
                 f"and seed {seed} {', '.join(by_seed[seed])}. Leave out what is not complete."
             )
 
-    def table(name: str) -> np.ndarray:
-        return np.array([[by_seed[seed][c][name] for c in classes] for seed in seeds], dtype=float)
+    def table(measure: str) -> np.ndarray:
+        rows = [[getattr(by_seed[seed][name], measure) for name in classes] for seed in seeds]
+        return np.array(rows, dtype=float)
 
     scores = table("score")
     return Group(
-        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("return"),
+        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("mean_return"),
         scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
         steps_range=(min(steps.values()), max(steps.values())),
         hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
@@ -213,7 +227,7 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
 
 @dataclass(frozen=True)
 class History:
-    """Runs that differ in the seed alone."""
+    """Curves of runs that differ only in the seed."""
 
     label: str  # as of :class:`Group`
     runs: list[Run]
@@ -221,7 +235,7 @@ class History:
 
 
 def read_histories(runs: Sequence[Run]) -> list[History]:
-    """Runs, evaluated or not, by group, in the order they are named; raises BidexError where none logged anything."""
+    """Return runs, evaluated or not, by group, in the order they are named; raise BidexError if no run has metrics."""
     groups = _by_kind([run_kind(run.config()) for run in runs], runs)
     histories = [History(label, members, curves_of(members)) for label, members in groups]
     if not any(history.curves for history in histories):
@@ -230,18 +244,27 @@ def read_histories(runs: Sequence[Run]) -> list[History]:
 
 
 def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
-    """Of each tag that one of the runs has logged: see :func:`over_runs`."""
+    """Return the curve over runs (:func:`over_runs`) of each tag that at least one run has logged."""
     logged = [run.metrics() for run in runs]
-    tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
-    curves = {tag: over_runs([series(rows, tag) for rows in logged]) for tag in tags}
-    return {tag: curve for tag, curve in curves.items() if curve is not None}
+    tags: dict[str, None] = {}  # in the order in which they were logged first
+    for rows in logged:
+        for row in rows:
+            tags |= dict.fromkeys(row)
+    curves = {}
+    for tag in tags:
+        if tag in ("step", "time"):
+            continue
+        curve = over_runs([series(rows, tag) for rows in logged])
+        if curve is not None:
+            curves[tag] = curve
+    return curves
 
 
 def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """Return mean and 95 % bootstrap interval over runs of their steps and values (points,); None without any point.
+    """Return the mean over runs and its 95 % bootstrap interval from steps and values (points,); None without points.
 
-    Several are interpolated to 200 steps between the last of their first points and the first of their last ones, so
-    that each point is of all runs; a run without a point is left out.
+    Several runs are interpolated to 200 steps. The steps lie between the latest first point and the earliest last
+    point of the runs, so that every run has a value there. A run without points is left out.
     """
     known = [(steps, values) for steps, values in series if len(steps)]
     if not known:
@@ -257,7 +280,6 @@ def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
 
 
 def series(rows: list[Json], tag: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps and values (points,) of a tag in those rows of a run's metrics that have it."""
-    points = [(row["step"], row[tag]) for row in rows if row.get(tag) is not None]
-    steps, values = zip(*points, strict=True) if points else ((), ())
-    return np.array(steps, float), np.array(values, float)
+    """Return steps and values (points,) of a tag from the rows of a run's metrics that have the tag."""
+    rows = [row for row in rows if row.get(tag) is not None]
+    return np.array([row["step"] for row in rows], float), np.array([row[tag] for row in rows], float)

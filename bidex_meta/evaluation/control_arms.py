@@ -1,21 +1,24 @@
-"""The control of a meta-test: is it the task's own data that adaptation learns from?
+"""The control of a meta-test: does adaptation learn from the task's own data?
 
-Any further training may raise a return. So the held-out tasks are adapted to their own data and, from the same
-meta-parameters, to data of each train task of their class. The arms play with common random numbers: the same starts,
-the same seed of the agent's own draws, as many episodes. Own minus before is what adaptation gains; own minus foreign
-is what of it is due to the task.
+Any further training may raise a return. So the agent adapts to the data of each held-out task and, from the same
+meta-parameters, to the data of each train task of the class. The arms play with common random numbers: the same starts,
+the same seed of the agent's own draws, the same number of episodes. Own minus before is the gain of adaptation. Own
+minus foreign is the part of the gain that is due to the task.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import chain
 
 import numpy as np
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.gains import MEASURES, grouped
 from bidex_meta.evaluation.meta_test import meta_evaluate
+from bidex_meta.evaluation.play import DEFAULT
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
 from bidex_meta.evaluation.statistics import paired_difference
 from bidex_meta.runs.atomic import Json
@@ -34,14 +37,15 @@ class Control:
 
 
 def control(
-    load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, shots: int = 1, *,
-    say: Callable[[str], None] = lambda line: None, **played: Any
+    load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, *, protocol: Protocol = DEFAULT,
+    references: Mapping[str, Reference] | None = None, say: Callable[[str], None] = lambda line: None
 ) -> Control:  # fmt: skip
-    """Play all arms; ``played`` goes to ``meta_evaluate``, whose errors are raised.
+    """Play all arms by ``meta_evaluate``, whose errors are raised.
 
-    ``load`` returns the agent, a MetaLearningAgent, anew for each arm, so that all draw the same numbers. The worlds,
-    in autoreset mode DISABLED, have as many environments and the same classes (else BidexError); ``train_world``'s
-    pools are replaced. ``say`` gets the mean returns of each arm when it has been played, which may take minutes.
+    ``load`` makes a new MetaLearningAgent for each arm, so that all arms draw the same numbers. Both worlds must be in
+    autoreset mode DISABLED and have the same classes (else BidexError) and the same number of environments; the pools
+    of ``train_world`` are replaced. ``say`` receives the mean returns of each arm after the arm was played, which may
+    take minutes.
     """
     if list(test_world.task_names) != list(train_world.task_names):
         raise BidexError(
@@ -49,45 +53,48 @@ def control(
             f"test: {', '.join(test_world.task_names)}."
         )
     pools = train_world.pools
-    own = meta_evaluate(load(), test_world, shots, evaluated=(0, shots), **played)
+    shots = protocol.shots
+    own = meta_evaluate(load(), test_world, protocol=protocol, references=references, evaluated=(0, shots))
     say(f"before: {_returns(own.before)}; adapted to own data: {_returns(own.after)}")
     foreign = []
     for number in range(max(map(len, pools))):
-        sizes = zip(train_world.task_names, pools, test_world.num_slot_tasks, strict=True)
-        train_world.set_tasks({name: np.repeat(pool[[number % len(pool)]], n, axis=0) for name, pool, n in sizes})
-        found = meta_evaluate(load(), test_world, shots, adapt_world=train_world, evaluated=(shots,), **played)
-        foreign.append(found.after)
-        say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(found.after)}")
+        chosen = {}
+        for name, pool, size in zip(train_world.task_names, pools, test_world.num_slot_tasks, strict=True):
+            chosen[name] = np.repeat(pool[[number % len(pool)]], size, axis=0)
+        train_world.set_tasks(chosen)
+        adapted = meta_evaluate(
+            load(), test_world, protocol=protocol, references=references, adapt_world=train_world, evaluated=(shots,)
+        )
+        foreign.append(adapted.after)
+        say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(adapted.after)}")
     return Control(own.before, own.after, foreign, own.adaptations, own.rollouts)
 
 
-def _returns(found: Evaluation) -> str:
-    return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in found.classes.items())
+def _returns(evaluation: Evaluation) -> str:
+    return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in evaluation.classes.items())
 
 
 def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, Json]:
-    """Results of each arm in a class over all runs (one for each seed), and the gain of own data above it.
+    """Return the results of each arm in a class over all runs (one for each seed), and the gain of own data.
 
-    By arm (``before``, ``own``, ``foreign`` for the mean over the train tasks, then these by their ``names``):
-    ``return`` and ``success``, means over runs; ``runs``, the mean return of each; ``own_minus`` by measure, a
-    Difference over runs, adaptations and episodes, or None where a measure is missing; none for ``own`` itself.
+    Arms are ``before``, ``own``, ``foreign`` (the mean over the train tasks), and each train task by its name in
+    ``names``. Each arm has ``return`` and ``success``, means over runs, and ``runs``, the mean return of each run.
+    Every arm but ``own`` has ``own_minus``: by measure the Difference of ``own`` and this arm, over runs, adaptations
+    and episodes; None if a measure is missing.
     """
     by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
     by_arm["foreign"] = [run.foreign for run in runs]
     by_arm |= {name: [[run.foreign[i]] for run in runs] for i, name in enumerate(names)}
-    found: dict[str, Json] = {}
+    summaries: dict[str, Json] = {}
     for arm, evaluations in by_arm.items():
-        results = [[each.classes[class_name] for each in of_run] for of_run in evaluations]
-        returns = [float(np.mean([each.mean_return for each in of_run])) for of_run in results]
-        found[arm] = {
-            "return": float(np.mean(returns)),
-            "success": float(np.mean([each.success for of_run in results for each in of_run])),
-            "runs": returns,
-        }
+        results = [[evaluation.classes[class_name] for evaluation in of_run] for of_run in evaluations]
+        returns = [float(np.mean([result.mean_return for result in of_run])) for of_run in results]
+        success = float(np.mean([result.success for result in chain.from_iterable(results)]))
+        summaries[arm] = {"return": float(np.mean(returns)), "success": success, "runs": returns}
         if arm != "own":
             minus = {measure: _own_minus(runs, results, class_name, of) for measure, of in MEASURES.items()}
-            found[arm]["own_minus"] = minus
-    return found
+            summaries[arm]["own_minus"] = minus
+    return summaries
 
 
 def _own_minus(

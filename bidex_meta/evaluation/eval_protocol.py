@@ -16,28 +16,23 @@ _MOST = 1_000_000
 
 @dataclass(frozen=True)
 class Protocol:
-    """What an evaluation plays; ``evaluate`` and ``meta_evaluate`` take one, and the commands make one of their flags.
+    """The tasks and episodes of an evaluation, for ``evaluate``, ``meta_evaluate`` and the commands.
 
     Raises BidexError for an unknown split, or a number out of range.
     """
 
     split: str | None = None
-    """Tasks of a world: ``train``, ``test``, or ``others``, which are as many tasks of the train classes, drawn by
-    another seed, that no run trained on; see ``Benchmark.make_world``. None: those of the world that is given."""
-    seed: int = EVALUATION_SEED
-    """Seed of all starts."""
-    tasks: int | None = None
-    """The first so many tasks of each class; None: all."""
-    episodes_per_task: int = 4
-    """Evaluation episodes of each task, after each trial."""
-    shots: int = 1
-    """How often an agent that adapts does so, one after the other; ``evaluate`` plays without adaptation."""
+    """Tasks of a world: ``train``, ``test``, or ``others``: the same number of unseen tasks of the train classes, drawn
+    by another seed; see ``Benchmark.make_world``. None: the tasks of the given world."""
+    seed: int = EVALUATION_SEED  # Seed of all starts.
+    tasks: int | None = None  # Number of tasks of each class, the first of its pool; None: all.
+    episodes_per_task: int = 4  # Evaluation episodes of each task, after each trial.
+    shots: int = 1  # Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation.
     rollouts: int | None = None
     """Exploring episodes of each task in a shot; None: one in each environment that plays it."""
-    trials: int = 1
-    """How often each task is adapted to, from the start and with other episodes."""
+    trials: int = 1  # Number of adaptations to each task, each from the start and with other episodes.
     max_adapt_steps: int | None = None
-    """Exploring episodes are cut (``truncated``) after so many steps; None: they are whole."""
+    """Number of steps after which exploring episodes are cut (``truncated``); None: they are not cut."""
 
     def __post_init__(self) -> None:
         splits = (*SPLITS, OTHERS)

@@ -1,7 +1,7 @@
-"""The leaderboard: results of runs in one schema, a file an entry, and the statistics that rank them.
+"""The leaderboard: one file per entry in one schema, and the statistics that rank entries.
 
 Interquartile mean, performance profile and probability of improvement are those of Agarwal et al. 2021 (arXiv
-2108.13264). Intervals resample seeds, and within each class the tasks, so that a single seed has one too: of its tasks.
+2108.13264). Intervals resample seeds, and the tasks of each class. So a single seed has an interval too.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.evaluation.statistics import (
     Estimate,
     crossed_estimate,
@@ -26,8 +26,7 @@ from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
 
-PROFILE = (0.1, 0.5, 0.9)
-"""Success rates at which a performance profile is read."""
+PROFILE = (0.1, 0.5, 0.9)  # Success rates at which a performance profile is read.
 FORMAT = 2
 _TASKS_OF_METAWORLD = 50
 _ROUNDING = 1e-4  # of stored rates
@@ -42,12 +41,12 @@ _Version = Annotated[str, Meta(max_length=100, pattern=r"^[0-9][\w.+]*$")]
 
 @dataclass(frozen=True)
 class ClassRow:
-    """A class of an entry; interval: 95 %, of the mean over seeds and tasks, None of a single sample."""
+    """The results of a class in an entry."""
 
     success: Fraction
-    interval: _Interval | None
+    interval: _Interval | None  # 95 %, of the mean over seeds and tasks; None with a single value
     tasks: Annotated[list[Annotated[list[Fraction], Meta(min_length=1)]], Meta(min_length=1)]
-    """Success in each task, a list for each seed."""
+    """Success in each task, one list per seed."""
 
 
 Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
@@ -55,7 +54,7 @@ Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 
 @dataclass(frozen=True)
 class Conditions:
-    """Where an entry's episodes were played; the whole of it is written by ``submit`` itself."""
+    """Conditions in which ``submit`` has played an entry's episodes."""
 
     device: _Name
     engine: Literal["auto", "c", "warp"]
@@ -69,17 +68,17 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Stated:
-    """What the run folders say and nobody can verify; lists have an item for each run."""
+    """Statements of the run folders that nobody can verify; lists have one item per run."""
 
     seeds: list[Seed]
     hours: list[NonNegative]  # of training, without evaluation
     device: _Name  # that trained
-    commit: list[_Commit | None]  # that trained; with + where files differed from it
+    commit: list[_Commit | None]  # that trained; + if files differed from the commit
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Runs that differ in nothing but the seed, as they were played to verify them; lists have an item for each run."""
+    """Runs that differ only in the seed, and their verified results; lists have one item per run."""
 
     format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
     name: _Name
@@ -87,8 +86,8 @@ class Entry:
     version: Whole | None  # of the suite's file
     algorithm: _Name
     weights: Annotated[list[_Digest | None], Meta(min_length=1)]
-    """Digests of the policies, see ``weights_digest``; None of a run whose checkpoint was not kept."""
-    steps: list[Count]  # that the checkpoints are of
+    """Digests of the policies, see ``weights_digest``; None for a run whose checkpoint was not kept."""
+    steps: list[Count]  # of the checkpoints
     episodes: Few  # of each task
     own: Classes  # results on the suite's own tasks
     others: Classes  # on as many tasks of each class that no run trained on
@@ -96,7 +95,7 @@ class Entry:
     stated: Stated
 
     def success(self, classes: Classes) -> list[np.ndarray]:
-        """Success of each class's tasks, (seeds, tasks)."""
+        """Return the success in each class's tasks, (seeds, tasks)."""
         return [np.array(row.tasks) for row in classes.values()]
 
 
@@ -106,7 +105,7 @@ def entry_name(suite: str, name: str) -> str:
 
 
 def read_entry(path: Path) -> Entry:
-    """An entry's file; raises BidexError where it cannot be read, does not fit the schema, or contradicts itself."""
+    """Read an entry; raise BidexError if the file cannot be read, does not fit the schema, or contradicts itself."""
     content = read_json(path, "an entry of the leaderboard")
     entry = parse(content, Entry, str(path), exact=True)
     if portable(content) != content:
@@ -117,7 +116,7 @@ def read_entry(path: Path) -> Entry:
 
 
 def check_apart(entries: Mapping[Path, Entry]) -> None:
-    """Raises BidexError where one policy stands in two entries."""
+    """Raise BidexError if one policy is in two entries."""
     known: dict[str, Path] = {}
     for path, entry in entries.items():
         for digest in filter(None, entry.weights):
@@ -127,7 +126,7 @@ def check_apart(entries: Mapping[Path, Entry]) -> None:
 
 
 def _faults(entry: Entry, path: Path) -> Iterator[str]:
-    """Yield what an entry says that cannot be."""
+    """Yield the contradictions within an entry."""
     runs = len(entry.weights)
     stated = entry.stated
     if path.name != entry_name(entry.suite, entry.name):
@@ -159,7 +158,7 @@ def _faults(entry: Entry, path: Path) -> Iterator[str]:
 
 
 def _faults_of(row: ClassRow, runs: int, tasks: int, episodes: int) -> Iterator[str]:
-    """Yield what is wrong with a class of ``runs`` runs and ``tasks`` tasks."""
+    """Yield the contradictions within a class of ``runs`` runs and ``tasks`` tasks."""
     counts = [len(of_run) for of_run in row.tasks]
     if counts != [tasks] * runs:
         yield f"tasks: expected {tasks} values of each of {runs} runs, got {counts}"
@@ -183,7 +182,7 @@ def _faults_of(row: ClassRow, runs: int, tasks: int, episodes: int) -> Iterator[
 
 
 def _deviation(rates: np.ndarray) -> float:
-    """Return the standard deviation of the mean of rates (seeds, tasks), seeds and tasks both drawn anew."""
+    """Return the standard deviation of the mean of rates (seeds, tasks) if both seeds and tasks are resampled."""
     seeds = rates.mean(axis=1, keepdims=True)
     tasks = rates.mean(axis=0, keepdims=True)
     rest = rates - seeds - tasks + rates.mean()
@@ -191,33 +190,30 @@ def _deviation(rates: np.ndarray) -> float:
 
 
 def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
-    """Return the number of train tasks of each class; None for a suite of one's own or of another version."""
+    """Return the number of train tasks of each class; None for a suite that is not shipped in this version."""
     if name in METAWORLD_SUITES:
         return dict.fromkeys(METAWORLD_SUITES[name], _TASKS_OF_METAWORLD)
-    if name in suite_names():
-        suite = load_suite(name)
-    else:
-        suite = None
-    if suite is None or suite.version != version:
+    if name not in suite_names():
         return None
-    return {
-        each.name: sum(task.split == "train" for task in each.tasks) or suite.tasks_per_class or 0
-        for each in suite.split_classes("train")
-    }
+    suite = load_suite(name)
+    if suite.version != version:
+        return None
+    counts = {}
+    for suite_class in suite.split_classes("train"):
+        listed = sum(task.split == "train" for task in suite_class.tasks)
+        counts[suite_class.name] = listed or suite.tasks_per_class or 0
+    return counts
 
 
 def class_rows(evaluations: Sequence[Evaluation]) -> Json:
     """Return the classes of an entry from one evaluation per seed, ready for JSON."""
     rows = {}
     for name in evaluations[0].classes:
-        tasks = np.array([_success_of_tasks(evaluation.classes[name]) for evaluation in evaluations])
+        results = [evaluation.classes[name] for evaluation in evaluations]
+        tasks = np.array([result.task_means(result.successes) for result in results])
         mean = crossed_estimate(lambda tables: tables[0].mean(), [tasks])
         rows[name] = {"success": mean.value, "interval": mean.interval, "tasks": tasks.round(4).tolist()}
     return rows
-
-
-def _success_of_tasks(result: ClassResult) -> list[float]:
-    return [result.successes[result.tasks == task].mean() for task in np.unique(result.tasks)]
 
 
 def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:

@@ -1,31 +1,33 @@
 """The meta-test: the gain of adaptation from the meta-learned parameters after 0, 1, ..., K shots (docs/meta-test.md).
 
 Every evaluation plays the same episodes (tasks and starts), so that an agent that does not change gains exactly 0;
-starts of adaptation are others, in each shot. Every (class, task) is played equally often, however early its episodes
-end; Meta-World's ``metalearning_evaluation`` takes the first episodes that finish, of which the easy tasks' are most.
+each shot of adaptation has other starts. Every (class, task) is played equally often, however early its episodes end.
+Meta-World's ``metalearning_evaluation`` takes the first episodes that finish, most of which belong to easy tasks.
 """
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
+from msgspec import to_builtins
 from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import Protocol
-from bidex_meta.evaluation.gains import Gains, paired_gains
-from bidex_meta.evaluation.play import DEFAULT, check_world, play_tasks, quota
+from bidex_meta.evaluation.gains import paired_gains
+from bidex_meta.evaluation.play import DEFAULT, Episodes, check_world, joined_episodes, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Gains, SplitSummary
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
-from bidex_meta.world.contract import TaskWorld
+from bidex_meta.world.contract import Info, TaskWorld
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
 
@@ -36,75 +38,69 @@ class MetaEvaluation:
 
     by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
     adaptations: dict[str, np.ndarray]
-    """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
-    protocol: Protocol  # what was played, with the rollouts and the longest exploring episode that this came to
+    """Per class the number from 0 of the adaptation (a trial of a task) that each episode followed, ``(episodes,)``."""
+    protocol: Protocol  # as played, with the actual number of rollouts and length of the longest exploring episode
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
 
     @property
     def rollouts(self) -> int:
-        """Episodes of each task that a shot adapted to."""
+        """Return the number of episodes of each task that a shot adapted to."""
         return self.protocol.rollouts or 1
 
     @property
     def before(self) -> Evaluation:
-        """Without adaptation (or what was asked for first)."""
+        """Return the results without adaptation (or the first results that were asked for)."""
         return self.by_shot[0]
 
     @property
     def after(self) -> Evaluation:
-        """After all shots."""
+        """Return the results after all shots."""
         return self.by_shot[-1]
 
     def gains(self, shot: int = -1) -> Gains:
-        """The evaluation after some shot above that without adaptation; the last shot by default."""
+        """Return the gains from no adaptation to a shot, by default the last one."""
         return paired_gains(self.by_shot[shot], self.before, self.adaptations)
 
+    def summary(self) -> SplitSummary:
+        """Return the results without the single episodes."""
+        by_shot = [evaluation.summary() for evaluation in self.by_shot]
+        return SplitSummary(
+            split=self.protocol.split, shots=len(self.adapt_steps), rollouts=self.rollouts,
+            trials=self.protocol.trials, max_adapt_steps=self.protocol.max_adapt_steps,
+            adapt_steps=self.adapt_steps, before=by_shot[0], after=by_shot[-1], gain=self.gains(), by_shot=by_shot,
+        )  # fmt: skip
+
     def to_json(self) -> Json:
-        """Everything but the single episodes, ready for JSON."""
-        by_shot = [found.to_json() for found in self.by_shot]
-        return {
-            "split": self.protocol.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts,
-            "trials": self.protocol.trials, "max_adapt_steps": self.protocol.max_adapt_steps,
-            "adapt_steps": self.adapt_steps, "before": by_shot[0], "after": by_shot[-1],
-            "gain": self.gains().to_json(), "by_shot": by_shot,
-        }  # fmt: skip
+        """Return the results without the single episodes, ready for JSON."""
+        return to_builtins(self.summary())
 
 
 @checked_arguments
 def meta_evaluate(
-    agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
-    episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
-    max_adapt_steps: int | None = None, seed: int | None = None, protocol: Protocol = DEFAULT,
+    agent: Agent, world: TaskWorld, shots: int | None = None, *, protocol: Protocol = DEFAULT,
     references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
     evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
-    """Evaluate an agent as ``evaluate`` does, ``shots`` times after exploring episodes of each task and adaptation.
+    """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
 
-    Environments that play the same task share one adaptation. Where the world has fewer environments than tasks times
-    ``rollouts``, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The
-    world must be reset afterwards.
+    Environments that play the same task share one adaptation. If the world has fewer environments than tasks times
+    rollouts, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The world
+    must be reset afterwards. Before adaptation, and with all tasks in the world at once, starts are those of
+    ``evaluate``.
 
     Args:
-        agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
+        agent: A MetaLearningAgent; with no shots any Agent.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: Entry of ``protocol`` to replace, if not None; so are the next six.
-        rollouts: Likewise: exploring episodes of each task in a shot.
-        episodes_per_task: Likewise: evaluation episodes of each task, after each trial.
-        tasks: Likewise: only the first so many of each pool.
-        trials: Likewise: how often each task is adapted to, from the start and with other episodes.
-        max_adapt_steps: Likewise: steps after which exploring episodes are cut.
-        seed: Likewise. Without adaptation, and with all tasks in the world at once, starts are those of ``evaluate``.
-        protocol: What is played.
+        shots: Adaptation rounds; None: those of ``protocol``.
+        protocol: The tasks and episodes to play.
         references: As in ``evaluate``.
-        adapt_world: Where to play episodes of adaptation instead, with the same starts: of as many environments, tasks.
-        evaluated: After how many shots to evaluate (0: before all); None: always.
+        adapt_world: Another world for the episodes of adaptation, with the same starts and the same number of
+            environments and tasks.
+        evaluated: Numbers of shots after which to evaluate (0: before the first shot); None: all.
 
     Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
-    protocol = protocol.changed(
-        shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
-        max_adapt_steps=max_adapt_steps, seed=seed
-    )  # fmt: skip
+    protocol = protocol.changed(shots=shots)
     shots = protocol.shots
     seed = protocol.seed
     if adapt_world is None:
@@ -112,8 +108,8 @@ def meta_evaluate(
     else:
         worlds = [world, adapt_world]
     _check(agent, worlds, shots)
-    found = {s: list[dict[str, np.ndarray]]() for s in range(shots + 1) if evaluated is None or s in evaluated}
-    if not found:
+    by_shot = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
+    if not by_shot:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
     portions = Portions(world, protocol.rollouts, protocol.tasks, protocol.trials)
     field = worlds[-1]
@@ -126,14 +122,14 @@ def meta_evaluate(
                 if shot > 0:
                     starts = _seed(seed, "adaptation", number, shot)
                     adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, longest, starts)
-                if shot in found:
+                if shot in by_shot:
                     if number == 0:
                         starts = seed
                     else:
                         starts = _seed(seed, "evaluation", number)
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts)
-                    found[shot].append(portions.labelled(played, number))
-    joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
+                    by_shot[shot].append(portions.labelled(played, number))
+    joined = [joined_episodes(parts) for parts in by_shot.values()]
     if references is None:
         references = references_of(world)
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
@@ -146,13 +142,13 @@ def meta_evaluate(
 
 
 def _seed(seed: int, *key: object) -> int:
-    """Another seed for each key, so that no two of them, nor those of a neighbouring seed, share their starts."""
+    """Return a seed for a key, such that no two keys share their starts, not even those of neighbouring seeds."""
     digest = hashlib.sha256("/".join(map(str, ("meta-test", seed, *key))).encode()).digest()
     return int.from_bytes(digest[:4], "little")
 
 
 def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgent:
-    """The agent as it was meta-learned, with the environments that share a task assigned."""
+    """Return the agent in its meta-learned state, after assigning the environments that share a task."""
     shared = task_of_row(world)
     if not torch.equal(shared, task_of_row(field)):
         raise BidexError(
@@ -160,7 +156,7 @@ def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgen
             "data to adapt to; they differ. Give both the same num_envs and pools of one length (set_tasks)."
         )
     learner = cast(MetaLearningAgent, agent)
-    if hasattr(learner, "assign"):  # one written for Meta-World has none, a plain agent neither
+    if hasattr(learner, "assign"):  # agents written for Meta-World, and agents that do not adapt, lack it
         learner.assign(shared)
     if hasattr(learner, "init"):
         learner.init()
@@ -168,7 +164,7 @@ def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgen
 
 
 def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps: int, seed: int) -> int:
-    """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``; returns its valid transitions."""
+    """Play a shot: ``rollouts`` exploring episodes of each task, then ``adapt``; return its valid transitions."""
     obs, _ = world.reset(seed=seed)
     remaining = quota(world, rollouts)
     first = True
@@ -181,14 +177,14 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
         remaining = remaining - playing.long()
         first = False
     note("Adapting")
-    with torch.enable_grad():  # whatever the caller is in: to adapt is to learn
+    with torch.enable_grad():  # adaptation needs gradients, whatever the mode of the caller
         agent.adapt()
     return steps
 
 
 @torch.no_grad()
 def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: Tensor, max_steps: int) -> int:
-    """One exploring episode in each environment of ``playing``, given to the agent; returns its valid transitions."""
+    """Play an exploring episode in each environment of ``playing`` for the agent; return its valid transitions."""
     limit = world.max_episode_steps.clamp(max=max_steps)
     running = playing.clone()
     steps = torch.zeros((), dtype=torch.int64, device=playing.device)
@@ -210,14 +206,14 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
     return int(steps)
 
 
-def checked_outputs(agent: object, given: object) -> tuple[Any, dict[str, Any]]:
-    """Actions and the policy's other outputs, as ``adapt_action`` returned them; BidexError without the dict."""
+def checked_outputs(agent: object, given: object) -> tuple[Tensor, Info]:
+    """Return the result of ``adapt_action``: actions and other outputs; raise BidexError for a result without both."""
     if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], dict):
         raise BidexError(
             f"{type(agent).__name__}.adapt_action: expected actions and a dict of the policy's other outputs, got "
             f"{shortened(given)}. Return (actions, {{}})."
         )
-    return given
+    return cast(tuple[Tensor, Info], given)
 
 
 def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int) -> None:

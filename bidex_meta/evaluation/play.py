@@ -6,7 +6,7 @@ unscaled reward. An episode of broken physics is no success and counts with the 
 that is lower.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import TaskWorld
 
 DEFAULT = Protocol()
+Episodes = dict[str, np.ndarray]  # Results of episodes by name, one entry per episode; see :func:`play_tasks`.
 
 
 @checked_arguments
@@ -35,13 +36,13 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Play every task of ``world`` equally often, from the starts of the protocol's seed, and report per class.
 
-    The world is in autoreset mode DISABLED, with at least one environment for each task; those that share a task share
-    its episodes. ``episodes_per_task`` (4) and ``seed`` (``EVALUATION_SEED``, as in the commands) replace those of
-    ``protocol``. ``references``, by class, are what the normalised score and broken episodes are measured against; by
-    default those that the installation stores of the world's classes.
+    The world must be in autoreset mode DISABLED and have at least one environment for each task. Environments that
+    share a task share its episodes. ``episodes_per_task`` (4) and ``seed`` (``EVALUATION_SEED``, as in the commands)
+    replace those of ``protocol``. ``references``, by class, define the normalised score and the return of broken
+    episodes; the default is the references that the installation stores for the world's classes.
 
-    Raises BidexError where the world resets by itself or lacks environments, a number is out of range, the protocol
-    names fewer tasks than all, or torch's default precision is not single.
+    Raises BidexError if the world resets by itself or lacks environments, a number is out of range, the protocol names
+    fewer tasks than all, or torch's default precision is not single.
     """
     protocol = protocol.changed(episodes_per_task=episodes_per_task, seed=seed)
     if protocol.tasks is not None:
@@ -57,12 +58,12 @@ def evaluate(
     return Evaluation(results_by_class(world.task_names, episodes, references), protocol.episodes_per_task)
 
 
-def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int) -> dict[str, np.ndarray]:
-    """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them, as arrays ``(episodes,)``.
+def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int) -> Episodes:
+    """Play ``episodes_per_task`` episodes of every task, as ``evaluate`` does, and return arrays ``(episodes,)``.
 
-    They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule), ``once``
-    (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world and seed
-    give the same slots, tasks and starts in the same order.
+    The arrays are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule),
+    ``once`` (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world
+    and seed give the same slots, tasks and starts in the same order.
     """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()
@@ -79,8 +80,13 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
     return {"slot": world.task_id.cpu().numpy()[row], "task": tasks.cpu().numpy()[row], **episodes}
 
 
+def joined_episodes(parts: Sequence[Episodes]) -> Episodes:
+    """Return the episodes of several results of ``play_tasks`` as one."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def check_world(world: TaskWorld) -> None:
-    """Raises BidexError where a world cannot be evaluated on."""
+    """Raise BidexError if evaluations cannot use a world."""
     if not hasattr(world, "metadata") or not isinstance(world.metadata, Mapping):
         raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
     mode = world.metadata.get("autoreset_mode")
@@ -95,7 +101,10 @@ def check_world(world: TaskWorld) -> None:
 
 
 def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each environment has to play, (num_envs,); BidexError where a task has no environment."""
+    """Return the number of episodes that each environment has to play, (num_envs,).
+
+    Raises BidexError if a task has no environment.
+    """
     tasks = world.task_index
     shares = torch.zeros_like(tasks)
     for slot, name in enumerate(world.task_names):
@@ -114,7 +123,7 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
 
 @torch.no_grad()
 def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
-    """An episode in each environment of ``playing``: see ``play_tasks``, each ``(those playing,)``."""
+    """Play an episode in each environment of ``playing``; return results as ``play_tasks``, for these environments."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
@@ -143,22 +152,22 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
 
 
 class ZeroAgent:
-    """Does nothing: action 0 everywhere. Spaces are the world's batched one, ``(num_envs, action)``."""
+    """An agent whose actions are all 0. ``action_space`` is the world's batched space, ``(num_envs, action)``."""
 
     @checked_arguments
     def __init__(self, action_space: Box):
         self._shape = action_space.shape
 
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """Zeros ``(num_envs, action)`` on the device of ``obs``."""
+        """Return zeros ``(num_envs, action)`` on the device of ``obs``."""
         return torch.zeros(self._shape, device=obs.device)
 
     def reset(self, env_mask: torch.Tensor) -> None:
-        """Nothing is remembered."""
+        """Do nothing, because the agent has no memory."""
 
 
 class RandomAgent:
-    """Uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
+    """An agent of uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
 
     @checked_arguments
     def __init__(self, action_space: Box, seed: Seed = 0):
@@ -167,21 +176,21 @@ class RandomAgent:
         self._generator = torch.Generator().manual_seed(seed)
 
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """Uniform in the action space, ``(num_envs, action)`` on the device of ``obs``."""
-        # Drawn on the CPU: a generator on a GPU gives other numbers for the same seed.
+        """Return uniform actions, ``(num_envs, action)``, on the device of ``obs``."""
+        # Actions are drawn on the CPU, because a GPU's generator gives other numbers for the same seed.
         return (self._low + self._range * torch.rand(self._range.shape, generator=self._generator)).to(obs.device)
 
     def reset(self, env_mask: torch.Tensor) -> None:
-        """Nothing is remembered."""
+        """Do nothing, because the agent has no memory."""
 
 
 class HeldAgent(RandomAgent):
-    """The same uniform action throughout, one for each environment."""
+    """An agent that repeats one uniform action in each environment."""
 
     def __init__(self, action_space: Box, seed: int = 0):
         super().__init__(action_space, seed)
         self._held = super().eval_action(torch.zeros(1))
 
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """The action ``(num_envs, action)``, on the device of ``obs``."""
+        """Return the actions ``(num_envs, action)`` on the device of ``obs``."""
         return self._held.to(obs.device)

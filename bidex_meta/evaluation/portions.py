@@ -1,7 +1,7 @@
-"""The tasks of a world in portions of equal size that fit its environments, for the meta-test.
+"""Portions of a world's tasks, of equal size, that fit its environments, for the meta-test.
 
-Each adaptation (a trial of a task) takes as many environments as it has rollouts. The last portion is filled up with
-the first adaptations, played once more and not counted, so that every portion groups the environments alike.
+Each adaptation (a trial of a task) takes one environment per rollout. The last portion is filled up with the first
+adaptations, which are played once more and not counted. So every portion groups the environments in the same way.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,20 +12,21 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import Episodes, joined_episodes
 from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
 def task_of_row(world: TaskWorld) -> Tensor:
-    """Numbers of the tasks of all slots, int64 ``(num_envs,)``: environments with the same number share a task."""
+    """Return each environment's task, numbered over all slots, int64 ``(num_envs,)``."""
     before = torch.tensor([0, *world.num_slot_tasks[:-1]], device=world.task_id.device).cumsum(0)
     return world.task_index + before[world.task_id]
 
 
 class Portions:
-    """Which adaptations are played together: the first so many ``tasks`` of each pool (None: all), in all ``trials``.
+    """The adaptations that are played together: those to the first ``tasks`` of each pool (None: all), in all trials.
 
-    ``rollouts`` are episodes of each task in a shot; None: one in each of its environments, with all tasks at once.
-    The numbers are from 1 on; the world is not touched.
+    ``rollouts`` is the number of episodes of each task in a shot; None: one in each environment of the task, with all
+    tasks at once. All numbers are at least 1. The world is not changed.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
@@ -41,9 +42,10 @@ class Portions:
 
     @contextmanager
     def applied_to(self, worlds: Sequence[TaskWorld]) -> Iterator[Iterator[int]]:
-        """The portions' numbers; as each is taken, all worlds get its tasks. At the end their pools come back.
+        """Yield an iterator over the portions' numbers that gives each portion's tasks to all worlds.
 
-        Raises BidexError for a world whose tasks cannot be set, or with pools of other lengths.
+        Afterwards all worlds have their own pools again. Raises BidexError for a world whose tasks cannot be set, or
+        whose pools have other lengths.
         """
         for world in worlds:
             if list(world.num_slot_tasks) != self._pool_sizes:
@@ -68,22 +70,21 @@ class Portions:
             for world, own in zip(pooled, pools, strict=True):
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
-    def labelled(self, episodes: dict[str, np.ndarray], portion: int) -> dict[str, np.ndarray]:
-        """Episodes of a portion of ``play_tasks``, once each, with ``adaptation`` and ``task`` in the own pools."""
+    def labelled(self, episodes: Episodes, portion: int) -> Episodes:
+        """Return a portion's episodes without repeated ones; add ``adaptation``; ``task`` counts in the whole pool."""
         parts = []
         for slot, adaptations in enumerate(self._adaptations):
             own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}
             number = portion * self._sizes[slot] + own["task"]
             own |= {"adaptation": number, "task": adaptations[number % len(adaptations)]}
             parts.append({key: values[number < len(adaptations)] for key, values in own.items()})
-        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        return joined_episodes(parts)
 
     def _set(self, worlds: Sequence[PooledWorld], pools: Sequence[Sequence[np.ndarray]]) -> Iterator[int]:
         for portion in range(self.count):
-            chosen = [
-                adaptations[np.arange(portion * size, (portion + 1) * size) % len(adaptations)]
-                for adaptations, size in zip(self._adaptations, self._sizes, strict=True)
-            ]
+            chosen = []
+            for adaptations, size in zip(self._adaptations, self._sizes, strict=True):
+                chosen.append(adaptations[np.arange(portion * size, (portion + 1) * size) % len(adaptations)])
             for world, own in zip(worlds, pools, strict=True):
                 named = zip(world.task_names, own, chosen, strict=True)
                 world.set_tasks({name: tasks[numbers] for name, tasks, numbers in named})

@@ -1,18 +1,20 @@
-"""References of returns: the normalised score's two ends, and the return that an episode of broken physics counts with.
+"""Reference returns, which define the normalised score and the return of episodes with broken physics.
 
-They hold for classes with moving bases, as in every suite. Under ``assets/references/``: returns of random and of zero
-actions, the better of which is the score's zero; of experts (written by ``python -m tools.experts``); of witnesses in
-open-loop replay and of scripted policies in closed loop. ``bidex-meta baseline`` measures all but experts'.
+References were measured with moving bases, as in every suite. ``assets/references/`` holds returns of random actions
+and of zero actions (the better of which scores 0), of experts (``python -m tools.experts`` writes them), of witnesses
+in open-loop replay and of scripted policies. ``bidex-meta baseline`` measures all of them except experts.
 """
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict
 
+import msgspec
 import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json, write_json
+from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import exists, read_json
@@ -31,18 +33,18 @@ class Reference:
     """References of a class."""
 
     random: float  # mean return of uniform actions
-    expert: float | None = None  # mean return of the best known policy; None where none is above the floor
-    zero: float | None = None  # mean return of zero actions, where it is known
+    expert: float | None = None  # mean return of the best known policy; None if no policy is above the floor
+    zero: float | None = None  # mean return of zero actions; None if unknown
 
     @property
     def floor(self) -> float:
-        """The score's zero: what a policy that has learned nothing gets, by doing anything or nothing."""
+        """Return the return that scores 0: the better one of random actions and zero actions."""
         if self.zero is None:
             return self.random
         return max(self.random, self.zero)
 
     def scores(self, returns: np.ndarray) -> np.ndarray | None:
-        """100 · (R − R_floor) / (R_expert − R_floor) of every return R; None without an expert above the floor."""
+        """Return 100 · (R − R_floor) / (R_expert − R_floor) of returns R; None without an expert above the floor."""
         if self.expert is None or self.expert <= self.floor:
             return None
         return 100 * (returns - self.floor) / (self.expert - self.floor)
@@ -51,11 +53,11 @@ class Reference:
 def counted_returns(
     returns: np.ndarray, broken: np.ndarray, reference: Reference | None, finished: np.ndarray
 ) -> np.ndarray:
-    """Returns (episodes,) of a class's episodes, such that nothing is gained by breaking physics.
+    """Correct the returns (episodes,) of a class's episodes such that breaking physics gains nothing.
 
-    A ``broken`` episode (bool) ends early, which would pay where rewards are negative. So it counts with the return of
-    random actions or, where that is unknown, of the worst ``finished`` episode (n,) of this policy and those it is
-    compared with; with its own if that is lower, or without either.
+    A ``broken`` episode (bool) ends early, which would be an advantage if rewards are negative. So it counts with the
+    return of random actions. If that is unknown, it counts with the return of the worst ``finished`` episode (n,) of
+    this policy and the policies that it is compared with. A lower return of the episode itself stays as it is.
     """
     if reference is None:
         others = finished
@@ -66,23 +68,24 @@ def counted_returns(
 
 
 def load(kind: Kind) -> dict[str, Json]:
-    """The installation's references by class, such as ``{"return": 0.49, "source": ...}``; empty without a file."""
+    """Read the installed references by class, such as ``{"return": 0.49, "source": ...}``; empty without a file."""
     return load_from(paths.assets_dir() / "references" / f"{kind}.json")
 
 
 def store(path: Path, classes: dict[str, Json], made: Json) -> None:
-    """Writes references, by class ``return`` and other measures; those of other classes in the file stay.
+    """Write references, by class ``return`` and other measures; references of other classes in the file stay.
 
-    ``made`` is how they were measured, stored with each class. Raises BidexError where the file holds something else.
+    ``made`` says how they were measured and is stored with each class. Raises BidexError if the file is something else.
     """
     known = load_from(path)
-    known |= {name: {**numbers, "made": made} for name, numbers in classes.items()}
+    for name, numbers in classes.items():
+        known[name] = {**numbers, "made": made}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"classes": dict(sorted(known.items()))})
 
 
 def load_from(path: Path) -> dict[str, Json]:
-    """The references in a file, by class; empty without a file. Raises BidexError where it holds something else."""
+    """Read the references in a file by class; empty without a file. Raises BidexError for a file of something else."""
     if not exists(path):
         return {}
     try:
@@ -94,35 +97,42 @@ def load_from(path: Path) -> dict[str, Json]:
 
 
 def references() -> dict[str, Reference]:
-    """Those of every class with a return of random actions, without experts that are not above random and zero ones."""
-    kinds: tuple[Kind, ...] = ("random", "zero", "expert")
-    random, zero, expert = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
-    known = {name: Reference(random[name], expert.get(name), zero.get(name)) for name in random}
-    return {
-        name: each if each.expert is not None and each.expert > each.floor else replace(each, expert=None)
-        for name, each in known.items()
-    }
+    """Return the references of every class with a return of random actions, without experts below the floor."""
+    experts = _returns("expert")
+    zero = _returns("zero")
+    known = {}
+    for name, random in _returns("random").items():
+        reference = Reference(random, zero=zero.get(name))
+        expert = experts.get(name)
+        if expert is not None and expert > reference.floor:
+            reference = replace(reference, expert=expert)
+        known[name] = reference
+    return known
+
+
+def _returns(kind: Kind) -> dict[str, float]:
+    return {name: row["return"] for name, row in load(kind).items()}
 
 
 def references_of(world: object) -> dict[str, Reference]:
-    """Those of a world's classes by name; none of foreign classes, of version 2, nor where bases are fixed."""
+    """Return the references of a world's classes; empty for foreign classes, version 2, and fixed bases."""
     classes = [slot.task_class for slot in getattr(world, "slots", ())]
-    if classes and all(each.moving_base and each.rules.as_printed for each in classes):
+    if classes and all(task.moving_base and task.rules.as_printed for task in classes):
         return references()
     return {}
 
 
-def rescored(classes: Json, config: AnyConfig) -> Json:
-    """An evaluation's results by class, with scores by today's references: others would compare nothing.
+def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, ClassSummary]:
+    """Return an evaluation's results by class with scores by the present references, so that runs can be compared.
 
-    References hold for classes of these names with moving bases, by the run's config or since it was scored when it was
-    evaluated; other results stay as they are.
+    References exist for classes with moving bases. The bases moved if the run's config says so, or if the evaluation
+    has a score. Other results are returned unchanged.
     """
-    if config.base != "moving" and all(row["score"] is None for row in classes.values()):
+    if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes
     known = references()
     rows = dict(classes)
     for name in known.keys() & classes.keys():
-        scores = known[name].scores(np.array([classes[name]["return"]]))
-        rows[name] = {**classes[name], "score": None if scores is None else float(scores[0])}
+        scores = known[name].scores(np.array([classes[name].mean_return]))
+        rows[name] = msgspec.structs.replace(classes[name], score=None if scores is None else float(scores[0]))
     return rows

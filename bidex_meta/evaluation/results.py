@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import to_builtins
 
 from bidex_meta.evaluation.references import Reference, counted_returns
-from bidex_meta.evaluation.statistics import Estimate, aggregate, estimate, mean, mean_difference
+from bidex_meta.evaluation.statistics import aggregate, estimate, mean, mean_difference
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary
 from bidex_meta.utils.arguments import checked_arguments
 
-MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
+MANY_TASKS = 10  # number of tasks from which intervals resample tasks instead of episodes
 
 
 @dataclass(frozen=True)
@@ -61,20 +63,25 @@ class ClassResult:
 
         Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """
-        names, task = np.unique(self.tasks, return_inverse=True)
-        if len(names) < MANY_TASKS:
+        means = self.task_means(values)
+        if len(means) < MANY_TASKS:
             return values
+        return means
+
+    def task_means(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of ``values`` (episodes,) in each task, by rising number of the task."""
+        _, task = np.unique(self.tasks, return_inverse=True)
         return np.bincount(task, values) / np.bincount(task)
 
-    def to_json(self) -> Json:
-        """Return the numbers of this class, ready for JSON."""
-        return {
-            "success": self.success, "success_interval": estimate(mean, self.drawn(self.successes)).interval,
-            "success_once": self.once, "success_at_end": self.at_end,
-            "return": self.mean_return, "return_interval": estimate(mean, self.drawn(self.returns)).interval,
-            "length": float(self.lengths.mean()), "score": self.score, "episodes": self.episodes,
-            "tasks": len(np.unique(self.tasks)), "unstable": self.unstable,
-        }  # fmt: skip
+    def summary(self) -> ClassSummary:
+        """Return the results without the single episodes."""
+        return ClassSummary(
+            success=self.success, success_interval=estimate(mean, self.drawn(self.successes)).interval,
+            success_once=self.once, success_at_end=self.at_end,
+            mean_return=self.mean_return, return_interval=estimate(mean, self.drawn(self.returns)).interval,
+            length=float(self.lengths.mean()), score=self.score, episodes=self.episodes,
+            tasks=len(np.unique(self.tasks)), unstable=self.unstable,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,19 +91,24 @@ class Evaluation:
     classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
     episodes_per_task: int  # episodes of every task
 
-    def to_json(self) -> Json:
-        """Return everything but the single episodes, ready for JSON."""
-        return {
-            "episodes_per_task": self.episodes_per_task,
-            "classes": {name: result.to_json() for name, result in self.classes.items()},
-            "aggregate": {
-                "success": aggregate([result.drawn(result.successes) for result in self.classes.values()]),
-                "score": aggregate([_drawn_scores(result) for result in self.classes.values()]),
+    def summary(self) -> Summary:
+        """Return the results without the single episodes."""
+        results = self.classes.values()
+        return Summary(
+            episodes_per_task=self.episodes_per_task,
+            classes={name: result.summary() for name, result in self.classes.items()},
+            aggregate={
+                "success": aggregate([result.drawn(result.successes) for result in results]),
+                "score": aggregate([_drawn_scores(result) for result in results]),
             },
-        }
+        )
+
+    def to_json(self) -> Json:
+        """Return the results without the single episodes, ready for JSON."""
+        return to_builtins(self.summary())
 
 
-Difference = Estimate  # mean return of one policy above another's in a class; tasks of both (few: episodes) resampled
+Difference = Estimate  # of two policies' mean returns in a class; tasks of both (few: episodes) are resampled
 
 
 def results_by_class(
@@ -110,18 +122,25 @@ def results_by_class(
     classes = {}
     for slot, name in enumerate(names):
         own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}
-        finished = [
-            each["return"][(each["slot"] == slot) & ~each["unstable"].astype(bool)] for each in (episodes, *compared)
-        ]
+        finished = []
+        for played in (episodes, *compared):
+            finished.append(played["return"][(played["slot"] == slot) & ~played["unstable"].astype(bool)])
         broken = own["unstable"].astype(bool)
         reference = (references or {}).get(name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
-            unstable=int(broken.sum()), reference=reference,
-            **{kind: float((own[kind] & ~broken).mean()) for kind in ("once", "at_end") if kind in own},
+            unstable=int(broken.sum()), reference=reference, once=_share(own, "once", broken),
+            at_end=_share(own, "at_end", broken),
         )  # fmt: skip
     return classes
+
+
+def _share(episodes: dict[str, np.ndarray], name: str, broken: np.ndarray) -> float | None:
+    """Return the share of episodes that are solved and not broken; None if ``name`` was not recorded."""
+    if name not in episodes:
+        return None
+    return float((episodes[name] & ~broken).mean())
 
 
 @checked_arguments

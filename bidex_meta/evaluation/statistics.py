@@ -6,45 +6,19 @@ input gives an equal interval.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
-from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Aggregate, Estimate, Interval
 
 Statistic = Callable[..., np.ndarray]
 """Maps one array of shape ``(resamples, n, ...)`` per sample to values of shape ``(resamples,)``."""
-Interval = tuple[float, float]
-"""Lower and upper end of a 95 % bootstrap interval."""
 
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 0
 _BATCH = 200  # Drawing every resample at once would need 2000 times the memory of the sample.
 _TAIL = (1.0 - 0.95) / 2
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its uncertainty."""
-
-    value: float
-    interval: Interval | None  # 95 % bootstrap interval; None with fewer than two entries to resample
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Return True if the interval lies on one side of zero."""
-        if self.interval is None:
-            return False
-        low, high = self.interval
-        return low > 0 or high < 0
-
-    def text(self, factor: float = 1.0, unit: str = "", form: str = ".1f") -> str:
-        """Return the value times ``factor``, followed by the interval in brackets if there is one."""
-        value = f"{factor * self.value:{form}}{unit}"
-        if self.interval is None:
-            return value
-        low, high = self.interval
-        return f"{value} [{factor * low:{form}}, {factor * high:{form}}]"
 
 
 def generator_of_resamples() -> np.random.Generator:
@@ -163,8 +137,8 @@ def _iqm_of_tables(values: np.ndarray) -> np.ndarray:
     return iqm(values.reshape(len(values), -1))
 
 
-def aggregate(samples: Sequence[np.ndarray | None]) -> Json | None:
-    """Return mean, interval and interquartile mean over classes of the classes' means, ready for JSON.
+def aggregate(samples: Sequence[np.ndarray | None]) -> Aggregate | None:
+    """Return mean, interval and interquartile mean over classes of the classes' means.
 
     Args:
         samples: One sample ``(n,)`` per class, of tasks or episodes (``ClassResult.drawn``). If one of them is None the
@@ -175,7 +149,7 @@ def aggregate(samples: Sequence[np.ndarray | None]) -> Json | None:
         return None
     means = np.array([sample.mean() for sample in known])
     interval = estimate(mean_of_means, *known).interval
-    return {"mean": float(means.mean()), "interval": interval, "iqm": float(iqm(means))}
+    return Aggregate(float(means.mean()), interval, float(iqm(means)))
 
 
 def resampled_means(values: np.ndarray, generator: np.random.Generator | None = None) -> np.ndarray | None:
@@ -225,7 +199,7 @@ def crossed_estimate(statistic: Callable[..., float], *entries: Sequence[np.ndar
     entries. The interval is None if no class has more than one value.
     """
     value = float(statistic(*entries))
-    if max(table.size for entry in entries for table in entry) < 2:
+    if all(table.size < 2 for table in chain.from_iterable(entries)):
         return Estimate(value, None)
     levels = []
     for entry in entries:

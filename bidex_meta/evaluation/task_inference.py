@@ -1,12 +1,13 @@
-"""What a class of a suite can measure: how well one does without knowing its hidden parts, and whether rewards tell.
+"""Validity of a task class: the best success without knowing its hidden parts, and whether rewards identify them.
 
 Blind ceiling and identifiability need no policy. They assume that the hidden parts are drawn independently and
-uniformly, as ``TaskClass.variation_space`` is. Whether return and success agree is known from what policies got.
+uniformly, as in ``TaskClass.variation_space``. The alignment of return and success is computed from policies' results.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
@@ -25,44 +26,39 @@ from bidex_meta.world import World
 _CANDIDATES = 512
 _STARTS = 24
 _ROUNDS = 25
-_MOST_CENTRES = 1000
-"""Final states among which a blind policy chooses."""
-_SCORING = 25
-"""Tasks that score the chosen state for each task that chooses it."""
-_STEPS = 40
-"""Steps of an episode whose rewards are fitted, evenly spread."""
-_HOLD = 10
-"""Steps for which an exploring action is held."""
-_NOISE = 0.3
-"""Share of rough actions in those of a policy."""
+_MOST_CENTRES = 1000  # Final states among which a blind policy chooses.
+_SCORING = 25  # Tasks that score the chosen state for each task that chooses it.
+_STEPS = 40  # Number of an episode's steps whose rewards are fitted, evenly spread.
+_HOLD = 10  # Number of steps for which an exploring action is held.
+_NOISE = 0.3  # Weight of the rough action that is added to a policy's action.
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Whether who returns more also succeeds more, in a class."""
+    """The agreement of return and success in a class."""
 
     rank: float
-    """Rank-biserial correlation of return and success over all episodes: of a successful and an unsuccessful one, how
-    much more often the first returns more than less. It reaches 1 whatever the share of successes; Spearman's does
-    not."""
-    solved: float
-    """Mean return of the successful episodes."""
-    unsolved: float
-    """Largest mean return of a policy that never succeeds."""
+    """Rank-biserial correlation of return and success over all episodes: for pairs of a successful and an unsuccessful
+    episode, the share in which the successful one returns more minus the share in which it returns less. Unlike
+    Spearman's correlation it can reach 1 for any share of successes."""
+    solved: float  # Mean return of the successful episodes.
+    unsolved: float  # Largest mean return of a policy that never succeeds.
 
 
 def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
-    """Of policies' results in one class, by policy; None where no episode succeeds, or no policy always fails."""
-    returns, solved = (
-        np.concatenate([getattr(result, name) for result in results.values()]) for name in ("returns", "successes")
-    )
+    """Compute the alignment in one class from results by policy.
+
+    The result is None if no episode succeeds, or if no policy always fails.
+    """
+    returns = np.concatenate([result.returns for result in results.values()])
+    solved = np.concatenate([result.successes for result in results.values()])
     good = returns[solved > 0.0]
-    failing = [each for each in results.values() if not each.successes.any()]
+    failing = [result.mean_return for result in results.values() if not result.successes.any()]
     if not len(good) or not failing:
         return None
     pairs = len(good) * (len(returns) - len(good))
     wins = rankdata(returns)[solved > 0.0].sum() - len(good) * (len(good) + 1) / 2  # ties count half
-    return Alignment(2.0 * wins / pairs - 1.0, float(good.mean()), max(each.mean_return for each in failing))
+    return Alignment(2.0 * wins / pairs - 1.0, float(good.mean()), max(failing))
 
 
 def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
@@ -91,31 +87,30 @@ def _solved(part: Hidden, values: Tensor, centre: Tensor) -> float:
 
 
 def distances(part: Hidden, values: Tensor, centre: Tensor) -> Tensor:
-    """How far hidden values (n, k) are from others (k,) or (n, k), (n,): metres, rad, or 0 and infinity for a sign."""
+    """Return distances (n,) of hidden values (n, k) from (k,) or (n, k): m, rad, or 0 and infinity for a sign."""
     if part.kind == "sign":
         return torch.where((values < 0.0) == (centre < 0.0), 0.0, math.inf)[:, 0]
     if part.kind == "orientation":
-        turns = [random_orientation(*each.expand_as(values).unbind(1)) for each in (values, centre)]
-        return rotation_angle(multiply(turns[0], conjugate(turns[1])))
+        own = random_orientation(*values.unbind(1))
+        other = random_orientation(*centre.expand_as(values).unbind(1))
+        return rotation_angle(multiply(own, conjugate(other)))
     return (values - centre).norm(dim=1)
 
 
 @dataclass(frozen=True)
 class Identified:
-    """How well hidden parts are identified from the rewards of one exploring episode."""
+    """Errors of hidden parts that were inferred from the rewards of one exploring episode."""
 
-    share: float
-    """Of episodes: every part is fitted within its tolerance."""
-    errors: np.ndarray
-    """Largest error of a part in units of its tolerance, (episodes,)."""
+    share: float  # Share of episodes in which every part is fitted within its tolerance.
+    errors: np.ndarray  # Largest error of a part in units of its tolerance, (episodes,).
 
 
 def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) -> Identified:
-    """Plays one exploring episode in each environment, and fits the hidden parts to its rewards.
+    """Play one exploring episode in each environment, and fit the hidden parts to its rewards.
 
-    ``world`` has one class, in autoreset mode DISABLED, an environment for each task. Exploring actions are those of
-    ``explorer`` with noise, else rough ones: uniform, held for ten steps. The fit searches the class's ranges for what
-    gives the rewards seen, knowing all else of the task.
+    ``world`` has one class, one environment per task, and is in autoreset mode DISABLED. Exploring actions are those of
+    ``explorer`` with noise; without an explorer they are rough: uniform, each held for ten steps. The fit searches the
+    class's ranges for the hidden values that explain the rewards. It knows the rest of the task.
     """
     (part,) = world.parts
     (member,) = part.group.members
@@ -131,7 +126,7 @@ def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) 
 
 
 def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Sensors (T, n, s), rewards and whether the step was of a running episode, (T, n)."""
+    """Return sensors (T, n, s), rewards (T, n), and the steps that belong to a running episode, bool (T, n)."""
     obs, _ = world.reset(seed=seed)
     if explorer is not None:
         explorer.reset(torch.ones(world.num_envs, dtype=torch.bool))
@@ -158,7 +153,7 @@ def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, T
 
 
 class _EachWith(TaskState):
-    """States of some steps (T, s), each with every one of k variations: rows are step by step."""
+    """States of T steps (T, s), each combined with every one of k variations: (T k, ...), step by step."""
 
     def __init__(self, sensors: Tensor, scene: Scene, frozen: dict[str, Tensor], k: int) -> None:
         super().__init__(sensors, scene.sensors, {n: v.repeat(len(sensors), 1) for n, v in frozen.items()})
@@ -169,18 +164,19 @@ class _EachWith(TaskState):
 
 
 def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: int) -> float:
-    """Largest error of a hidden part in units of its tolerance (of a sign: infinite where it is wrong).
+    """Return the largest error of a hidden part in units of its tolerance (infinite for a wrong sign).
 
-    Least squares by Levenberg-Marquardt from the best of many random starts, derivatives by differences.
+    The fit minimises squares by Levenberg-Marquardt from the best of many random starts, with derivatives by finite
+    differences.
     """
     task = scene.task
     space = scene.task.variation_space
     parts = [(part, [space.names.index(name) for name in part.names]) for part in task.hides()]
-    columns = [i for _, where in parts for i in where]
+    columns = list(chain.from_iterable(where for _, where in parts))
     low, high = (torch.tensor(ends, dtype=torch.float64)[columns] for ends in (space.low, space.high))
 
     def residuals(tried: Tensor) -> Tensor:
-        """What hidden values (k, d) miss of the rewards, (k, T)."""
+        """Return the differences (k, T) between the rewards for hidden values (k, d) and the given rewards."""
         variations = truth.repeat(len(tried), 1)
         variations[:, columns] = tried
         state = _EachWith(sensors, scene, task.freeze(variations), len(tried))
@@ -205,7 +201,10 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
         x = torch.where(better[:, None], new, x)
         off = torch.where(better[:, None], new_off, off)
         damping = torch.where(better[:, None, None], 0.3 * damping, 5.0 * damping).clamp(1e-6, 1e6)
-    found = truth.clone()
-    found[columns] = x[off.square().sum(dim=1).argmin()]
-    offs = [(part, float(distances(part, found[None, where], truth[where])[0])) for part, where in parts]
-    return max(miss if part.kind == "sign" else miss / part.tolerance for part, miss in offs)
+    fitted = truth.clone()
+    fitted[columns] = x[off.square().sum(dim=1).argmin()]
+    errors = []
+    for part, where in parts:
+        error = float(distances(part, fitted[None, where], truth[where])[0])
+        errors.append(error if part.kind == "sign" else error / part.tolerance)
+    return max(errors)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
@@ -31,41 +30,45 @@ def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int 
     An evaluation has ten episodes, and a single one sometimes reaches one half by chance.
     """
     reached = success >= level
-    found = np.flatnonzero(reached[:-1] & reached[1:])
-    return int(steps[found[0]]) if len(found) else None
+    rows = np.flatnonzero(reached[:-1] & reached[1:])
+    return int(steps[rows[0]]) if len(rows) else None
 
 
-def median_steps(found: Sequence[int | None]) -> int | None:
+def median_steps(counts: Sequence[int | None]) -> int | None:
     """Return the median, the larger middle value of an even count; None counts as more steps than any number."""
-    ranked = sorted(found, key=lambda steps: np.inf if steps is None else steps)
+    ranked = sorted(counts, key=lambda steps: np.inf if steps is None else steps)
     return ranked[len(ranked) // 2]
 
 
 def at_the_end(folders: Sequence[RunFolder]) -> Json:
     """Return success and return in the final evaluation (4 episodes per task) of runs that differ only in the seed."""
-    classes = [folder.evaluation()["policy"]["classes"].values() for folder in folders]
-    measured = {}
-    for name in ("success", "return"):
-        measured[name] = over_seeds([float(np.mean([row[name] for row in rows])) for rows in classes])
-    return measured
+    success = []
+    returns = []
+    for folder in folders:
+        rows = folder.evaluation().results.values()
+        success.append(float(np.mean([row.success for row in rows])))
+        returns.append(float(np.mean([row.mean_return for row in rows])))
+    return {"success": over_seeds(success), "return": over_seeds(returns)}
 
 
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:
     """Return :func:`at_the_end` and measures of the evaluations during ``end`` environment steps of training."""
     curves = [series(folder.metrics(), TAG) for folder in folders]
-    curve: Any = over_runs(curves)
-    powers = [10**power for power in range(4, 15) if 10**power < end]
-    reached = [steps_to(*each) for each in curves]
+    at = {}
+    for power in range(4, 15):
+        step = 10**power
+        if step < end:
+            at[str(step)] = over_seeds([float(np.interp(step, *curve)) for curve in curves])
+    reached = [steps_to(*curve) for curve in curves]
+    curve = {}
+    for name, values in vars(over_runs(curves)).items():
+        curve[name] = None if values is None else values.tolist()
     return at_the_end(folders) | {
-        "curve": {name: None if values is None else values.tolist() for name, values in vars(curve).items()},
-        "at": {str(at): over_seeds(_success_at(at, curves)) for at in powers},
-        "area": over_seeds([area(*each, end) for each in curves]),
+        "curve": curve,
+        "at": at,
+        "area": over_seeds([area(*curve, end) for curve in curves]),
         "half": {"of_seeds": reached, "median": median_steps(reached)},
     }
-
-
-def _success_at(step: int, curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float]:
-    return [float(np.interp(step, *curve)) for curve in curves]
 
 
 def over_seeds(of_seeds: list[float]) -> Json:

@@ -6,17 +6,19 @@ from bidex_meta.data import Dataset
 from bidex_meta.errors import one_line
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.schemas import check_versions
+from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
+from bidex_meta.runs.provenance import versions_of
+from bidex_meta.runs.versions import Versions, parse_versions
 from bidex_meta.utils.files import portable
 
 
 def run_card(folder: RunFolder, name: str) -> str:
     """The card of a run's policy: the hub's header in YAML, then facts and results."""
     config = folder.config()
-    versions = folder.versions()
+    versions = versions_of(folder)
     subject = portable(config.suite or str(config.task))
     classes = _classes(folder)
-    mean = sum(row["success"] for row in classes.values()) / max(len(classes), 1)
+    mean = sum(row.success for row in classes.values()) / max(len(classes), 1)
     found = [{"type": "success rate", "value": round(mean, 4), "name": "mean over classes"}]
     header = {
         "library_name": "bidex-meta", "license": "apache-2.0", "pipeline_tag": "reinforcement-learning",
@@ -31,7 +33,7 @@ def run_card(folder: RunFolder, name: str) -> str:
         "suite or class": subject, "algorithm": config.algo, "preset": config.preset, "all settings": "config.json",
         "seed": config.seed, "steps": f"{folder.checkpoints.newest_step() or 0:,}", **_made(versions),
     }  # fmt: skip
-    if episodes := [row["episodes"] for row in classes.values() if "episodes" in row]:
+    if episodes := [row.episodes for row in classes.values() if row.episodes]:
         facts["evaluated on"] = f"{max(episodes)} episodes of a class"
     title = f"{config.algo} on {subject}, seed {config.seed}"
     plays = f"bidex-meta pull {name} --out policy\nbidex-meta evaluate policy"
@@ -46,7 +48,7 @@ def data_card(dataset: Dataset, name: str) -> str:
         "license": "apache-2.0", "task_categories": ["reinforcement-learning"],
         "tags": ["bidex-meta", "minari", "offline-rl", "mujoco", *tasks[:1]],
     }  # fmt: skip
-    versions = check_versions(ours.get("versions") or {}, f"{dataset.folder}: versions")
+    versions = parse_versions(ours.get("versions") or {}, f"{dataset.folder}: versions")
     facts = {
         "data set": dataset.name, "kind": ours["kind"], "classes": ", ".join(tasks),
         "transitions": f"{dataset.num_steps:,}", "episodes": f"{dataset.num_episodes:,}", **_made(versions),
@@ -55,11 +57,9 @@ def data_card(dataset: Dataset, name: str) -> str:
     return _card(header, dataset.name, use, facts)
 
 
-def _made(versions: Json) -> Json:
-    packages = versions.get("packages") or {}
-    git = versions.get("git") or {}
-    made = {"commit": git.get("commit")}
-    made |= {each: packages.get(each) for each in ("bidex-meta", "mujoco", "torch")}
+def _made(versions: Versions) -> Json:
+    made = {"commit": versions.git.commit if versions.git else None}
+    made |= {name: versions.packages.get(name) for name in ("bidex-meta", "mujoco", "torch")}
     return {key: value for key, value in made.items() if value}
 
 
@@ -77,13 +77,18 @@ def _cell(value: object) -> str:
     return one_line(value).replace("|", "\\|")
 
 
-def _classes(folder: RunFolder) -> Json:
-    found = folder.evaluation() if folder.evaluated else {}
-    return found.get("policy", found).get("classes", {})
+def _classes(folder: RunFolder) -> dict[str, ClassSummary]:
+    """Return the results of a policy that does not adapt; empty if there are none."""
+    evaluation = folder.evaluation() if folder.evaluated else None
+    if isinstance(evaluation, PolicyEvaluation):
+        return evaluation.policy.classes
+    return {}
 
 
-def _table(classes: Json) -> str:
-    lines = [f"| {_cell(name)} | {100 * row['success']:.1f} % | {row['return']:.4g} |" for name, row in classes.items()]
+def _table(classes: dict[str, ClassSummary]) -> str:
+    lines = []
+    for name, row in classes.items():
+        lines.append(f"| {_cell(name)} | {100 * row.success:.1f} % | {row.mean_return:.4g} |")
     if lines:
         return "\n".join(["", "| class | success | return |", "|---|---|---|", *lines, ""])
     return ""

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.provenance import Difference, differences
+from bidex_meta.runs.evaluations import Conditions
+from bidex_meta.runs.provenance import Difference, differences, versions_of
 from bidex_meta.runs.versions import package_versions
 from bidex_meta.training.launch import say
 from bidex_meta.worlds import Worlds
@@ -13,26 +14,26 @@ from bidex_meta.worlds import Worlds
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
-def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:
+def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
     """Return what an evaluation's numbers depend on besides the policy: ``conditions`` of ``evaluation.json``.
 
     ``num_envs`` is the number of environments that was asked for; None: the default.
     """
     wanted = [*_PACKAGES]
-    identity = worlds.identity()
+    identity: Json = worlds.identity()
     if worlds.device.startswith("cuda") or worlds.engine == "warp":
         wanted.append("mujoco-warp")
     if identity["physics"] is None:
         wanted.append("metaworld")
     installed = package_versions()
     packages = {name: installed[name] for name in wanted}
-    where = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
-    return {**where, "packages": packages, **identity}
+    where: Json = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
+    return Conditions(packages=packages, **where, **identity)
 
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
     """Return how a run's record differs from this installation and the run's own worlds, here ``worlds`` if known."""
-    return differences(folder.versions(), conditions(worlds or Worlds.open(folder.config().to_json())))
+    return differences(versions_of(folder), conditions(worlds or Worlds.open(folder.config().to_json())))
 
 
 def say_differences(folder: RunFolder) -> None:

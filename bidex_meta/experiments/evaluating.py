@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
@@ -16,9 +17,18 @@ from bidex_meta.experiments.metatest import Options
 from bidex_meta.experiments.policies import checkpoint as load_checkpoint
 from bidex_meta.experiments.policies import policy_of
 from bidex_meta.runs import RunFolder
-from bidex_meta.runs.atomic import Json, write_json
+from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import (
+    Conditions,
+    MetaTestEvaluation,
+    OtherTasks,
+    PolicyEvaluation,
+    evaluation_json,
+    write_evaluation,
+)
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
@@ -45,13 +55,13 @@ class PlayedTasks:
         rates = [result.success for result in self.policy.classes.values()]
         return sum(rates) / len(rates)
 
-    def to_json(self, steps: int) -> Json:
-        """Return the numbers, ready for JSON."""
-        found: Json = {"steps": steps, "split": self.split, "seed": self.seed, "policy": self.policy.to_json()}
+    def entries(self) -> dict[str, Any]:
+        """Return the entries that :class:`PolicyEvaluation` and :class:`OtherTasks` have in common."""
+        entries = {"split": self.split, "seed": self.seed, "policy": self.policy.summary()}
         if self.random is not None:
-            differences = {name: asdict(each) for name, each in compare(self.policy, self.random).items()}
-            found |= {"random": self.random.to_json(), "return_above_random": differences}
-        return found
+            differences = compare(self.policy, self.random)
+            entries |= {"random": self.random.summary(), "return_above_random": differences}
+        return entries
 
 
 @dataclass(frozen=True)
@@ -66,19 +76,27 @@ class RunEvaluation:
     own: PlayedTasks
     others: PlayedTasks | None
     """The evaluation on tasks that the run was not trained on, if that was asked for."""
-    conditions: Json
+    conditions: Conditions
 
     @property
     def success(self) -> float:
         """Return the mean over classes of the success rate, in [0, 1]."""
         return self.own.success
 
+    def record(self) -> PolicyEvaluation:
+        """Return the record of the evaluation, as ``evaluation.json`` holds it."""
+        if self.others is None:
+            others = None
+        else:
+            others = OtherTasks(task_seed=self.others.worlds.seed, steps=self.steps, **self.others.entries())
+        return PolicyEvaluation(
+            run=portable(str(self.run.path)), steps=self.steps, other_tasks=others, conditions=self.conditions,
+            randomisation=_randomised(self.worlds), **self.own.entries()
+        )  # fmt: skip
+
     def to_json(self) -> Json:
         """Return the content of ``evaluation.json``."""
-        found = {"run": portable(str(self.run.path)), **self.own.to_json(self.steps)}
-        if self.others is not None:
-            found["other_tasks"] = {"task_seed": self.others.worlds.seed, **self.others.to_json(self.steps)}
-        return found | _closing(self.conditions, self.worlds)
+        return evaluation_json(self.record())
 
 
 @dataclass(frozen=True)
@@ -93,13 +111,19 @@ class RunMetaTest:
     seed: int
     splits: dict[str, MetaEvaluation]
     """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
-    conditions: Json
+    conditions: Conditions
+
+    def record(self) -> MetaTestEvaluation:
+        """Return the record of the meta-test, as ``evaluation.json`` holds it."""
+        splits = {split: found.summary() for split, found in self.splits.items()}
+        return MetaTestEvaluation(
+            run=portable(str(self.run.path)), steps=self.steps, seed=self.seed, splits=splits,
+            conditions=self.conditions, randomisation=_randomised(self.worlds)
+        )  # fmt: skip
 
     def to_json(self) -> Json:
         """Return the content of ``evaluation.json``."""
-        splits = {split: found.to_json() for split, found in self.splits.items()}
-        found = {"run": portable(str(self.run.path)), "steps": self.steps, "seed": self.seed}
-        return {**found, "splits": splits, **_closing(self.conditions, self.worlds)}
+        return evaluation_json(self.record())
 
 
 @checked_arguments
@@ -138,7 +162,7 @@ def evaluate(
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
-    if learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
         raise BidexError(f"{config.algo} adapts to tasks: its policy alone says little. Use meta_test(run).")
     state, steps = load_checkpoint(folder, checkpoint)
     policy = policy_of(folder, state, config.device)
@@ -156,7 +180,7 @@ def evaluate(
         others = None
     found = RunEvaluation(folder, config.algo, worlds, steps, own, others, conditions(worlds, num_envs))
     if save:
-        write_json(folder.evaluation_path, found.to_json())
+        write_evaluation(folder.evaluation_path, found.record())
     return found
 
 
@@ -201,7 +225,7 @@ def meta_test(
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
-    if not learner_kind(config.algo, config.task).make.adapts:
+    if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
         raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
     metatest.check_worlds(worlds, config.algo)
     splits = metatest.splits_of(worlds, split)
@@ -213,17 +237,15 @@ def meta_test(
     found = metatest.meta_test(worlds, config, load, options, splits)
     result = RunMetaTest(folder, config.algo, worlds, steps, options.seed, found, conditions(worlds, options.num_envs))
     if save:
-        write_json(folder.evaluation_path, result.to_json())
+        write_evaluation(folder.evaluation_path, result.record())
     return result
 
 
-def _closing(conditions: Json, worlds: Worlds) -> Json:
-    """Return the last entries of ``evaluation.json``."""
+def _randomised(worlds: Worlds) -> Json | None:
+    """Return the randomisation of some worlds; None without one."""
     if worlds.randomisation is None:
-        randomised = {}
-    else:
-        randomised = {"randomisation": asdict(worlds.randomisation)}
-    return {"conditions": conditions, **randomised}
+        return None
+    return asdict(worlds.randomisation)
 
 
 def _opened(run: RunFolder | str | Path) -> RunFolder:

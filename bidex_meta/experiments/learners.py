@@ -30,7 +30,7 @@ ALGOS: dict[str, str] = {
     "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
     "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
     # For a single task.
-    "ppo": "bidex_algos.onpolicy.mtppo:PPO",
+    "ppo": "bidex_algos.onpolicy.single_task:PPO",
     "trpo": "bidex_algos.onpolicy.mttrpo:TRPO",
     "sac": "bidex_algos.offpolicy.mtsac:SAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",

@@ -11,6 +11,7 @@ from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
@@ -110,7 +111,7 @@ def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int)
             counts = [len(pool) for pool in worlds.tasks("train").values()]
             of_class = config.num_envs // len(counts)
             asked = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
-    if learner_kind(config.algo).make.independent_adaptation:
+    if Capability.ADAPTS_INDEPENDENTLY in learner_kind(config.algo).make.capabilities:
         return min(asked, most)
     return asked
 

@@ -13,6 +13,7 @@ from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 from bidex_meta.training.launch import launch, resume_command
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
 from bidex_meta.worlds import Worlds
@@ -36,8 +37,8 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     kind = learner_kind(config.algo, source.class_name)
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
-    num_envs, steps = source.rows_and_steps(device, kind.make.adapts)
-    if kind.make.offline:
+    num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.make.capabilities)
+    if Capability.OFFLINE in kind.make.capabilities:
         num_envs = max(1, len(source.tasks("train")))  # it takes sizes and names from its world
         steps = run_data.UPDATES
     config = replace(

@@ -14,6 +14,7 @@ from bidex_meta.runs.versions import collect_versions
 from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.training.launch import launch, say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
@@ -97,9 +98,9 @@ def task_seed(datasets: Sequence[Dataset]) -> int | None:
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
     """Refuses a learner and data sets that do not go together."""
-    if not kind.make.offline:
+    if Capability.OFFLINE not in kind.make.capabilities:
         if datasets:
-            names = ", ".join(name for name in ALGOS if learner_kind(name).make.offline)
+            names = ", ".join(name for name in ALGOS if Capability.OFFLINE in learner_kind(name).make.capabilities)
             raise BidexError(f"{kind.name} learns by playing; --dataset goes with {names}. Leave one of them out.")
         return
     if not datasets:
@@ -114,8 +115,8 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
 
 def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
     """Refuses, by the metadata alone, what could not be imitated: of other classes or bases, or with other goals."""
-    if names and not kind.make.imitates:
-        takers = ", ".join(name for name in ALGOS if learner_kind(name).make.imitates)
+    if names and Capability.IMITATES not in kind.make.capabilities:
+        takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).make.capabilities)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
     for dataset in open_datasets(names):
         classes = source.task_classes()

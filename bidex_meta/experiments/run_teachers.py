@@ -14,6 +14,7 @@ from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.experiments.policies import load_policy, slots_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.launch import launch, say
+from bidex_meta.training.learner import Capability
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor
@@ -31,13 +32,13 @@ def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
 def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None:
     """Refuses teachers that do not go with the learner or its worlds, before anything is built."""
     if not config.teacher:
-        if kind.make.taught:
+        if Capability.TAUGHT in kind.make.capabilities:
             raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
         return
     if not _takes(kind):
         takers = ", ".join(name for name in ALGOS if _takes(learner_kind(name)))
         raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
-    if source.hides_goals and not kind.make.adapts:
+    if source.hides_goals and Capability.ADAPTS not in kind.make.capabilities:
         raise BidexError(
             f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite, or take "
             "--algo icl."
@@ -49,7 +50,7 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
 
 
 def _takes(kind: LearnerKind) -> bool:
-    return kind.make.taught or kind.make.imitates
+    return bool(kind.make.capabilities & {Capability.TAUGHT, Capability.IMITATES})
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
@@ -77,7 +78,7 @@ def _scripted(source: Worlds) -> set[str]:
 def _known_to(name: str, source: Worlds) -> set[str]:
     """Classes that the policy of a run has learned, in the same form."""
     config = RunFolder.open(Path(name)).config()
-    if learner_kind(config.algo).make.adapts:
+    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
     other = Worlds.open(config.to_json())
     own = source.task_classes()
@@ -124,7 +125,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
                 width = int(world.single_observation_space.shape[0])
             tutors.append(Tutor(policy, rows, width))
     if untaught := [task for task in classes if task not in assigned]:
-        rest = ", and not learned" * learner_kind(config.algo).make.taught
+        rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     inner: Any = getattr(world, "unwrapped", world)  # without a recorder

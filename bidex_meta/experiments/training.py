@@ -25,7 +25,7 @@ from bidex_meta.runs.folder import AnyConfig, check_new, new_folder_name
 from bidex_meta.training import distributed, runner
 from bidex_meta.training.distributed import together
 from bidex_meta.training.launch import launch, resume_command, say
-from bidex_meta.training.learner import NO_SOURCES, Sources
+from bidex_meta.training.learner import NO_SOURCES, Capability, Sources
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
@@ -151,7 +151,7 @@ def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: cont
             name = new_folder_name(config)
             check_new(new or name.with_name(f"{name.name}_0"))
         watching.check(config, worlds)
-    if kind.make.adapts:
+    if Capability.ADAPTS in kind.make.capabilities:
         metatest.check_worlds(worlds, config.algo)
     if old is None and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))

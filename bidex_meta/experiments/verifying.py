@@ -4,68 +4,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NotRequired, TypedDict
 
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.experiments.metatest import TASKS, Options, meta_test
 from bidex_meta.experiments.policies import checkpoint, policy_of
-from bidex_meta.runs import RunFolder, schemas
+from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import (
+    ClassSummary,
+    Conditions,
+    Evaluated,
+    MetaTestEvaluation,
+    PolicyEvaluation,
+    read_evaluation,
+)
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.runs.provenance import differences
+from bidex_meta.runs.provenance import differences, versions_of
+from bidex_meta.runs.versions import Versions
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
-from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
-from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
-
-Engine = Literal["auto", "c", "warp"]
-
-
-class _Row(TypedDict):
-    episodes: NotRequired[Few]
-    tasks: NotRequired[Few]
-    length: NotRequired[Finite]
-
-
-class _Part(TypedDict):
-    episodes_per_task: Few
-    classes: dict[str, _Row]
-
-
-class _Split(TypedDict):
-    shots: Shots
-    rollouts: Few
-    trials: Few
-    max_adapt_steps: NotRequired[Few]
-    before: _Part
-    after: _Part
-
-
-class _Conditions(TypedDict):
-    device: NotRequired[Text]
-    engine: NotRequired[Engine]
-    num_envs: NotRequired[Environments | None]
-    packages: NotRequired[Json]
-    physics: NotRequired[Text | None]
-    suite_version: NotRequired[Whole | None]
-    suite_digest: NotRequired[Text | None]
-
-
-class _Recorded(TypedDict):
-    """The entries that ``evaluation.json`` needs beyond :mod:`bidex_meta.runs.schemas` for a verification."""
-
-    steps: Whole
-    seed: Seed
-    conditions: NotRequired[_Conditions]
-    splits: NotRequired[dict[str, _Split]]
-    policy: NotRequired[_Part]
 
 
 @dataclass(frozen=True)
@@ -119,53 +84,60 @@ def verify(
     folder = RunFolder.open(run.path if isinstance(run, RunFolder) else run)
     config = folder.config()
     recorded = recorded_evaluation(folder.path, evaluation)
-    then = recorded_conditions(recorded, schemas.read_versions(folder.path), config)
+    then = recorded_conditions(recorded, versions_of(folder), config)
     config = _where(device, engine, then, config)
     worlds = Worlds.open(config.to_json())
     set_up_torch(config.threads)
     if num_envs is None:
-        environments = then["num_envs"]
+        environments = then.num_envs
     else:
         environments = num_envs
-    state, step = _checkpoint(folder, recorded["steps"])
+    state, step = _checkpoint(folder, recorded.steps or 0)
     apart = others(then, conditions(worlds, environments))
     for line in apart:
         say(f"Conditions: {one_line(line)}.")
     again = _again(folder, config, worlds, recorded, environments, state)
-    found = agreements(classes_of(recorded), classes_of(again))
+    found = agreements(recorded.all_results, again)
     return Verification(folder, f"{config.algo} on {worlds.name}, {step:,} steps", step, apart, found)
 
 
-def recorded_evaluation(run: Path, named: Path | None = None) -> Json:
-    """The evaluation of a run folder, or another file of it, to compare with; all that is read of it checked.
+def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
+    """Return the evaluation of a run folder, or of another file, to compare with.
 
-    Raises BidexError where there is none, or it is damaged, or does not say how it was made.
+    Raises BidexError if the file is missing or damaged, or lacks entries that are needed to evaluate again.
     """
     path = named or run / "evaluation.json"
     again = f"bidex-meta evaluate {run} --json > {path}"
     if named is None and not exists(path):
         raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
-    found = schemas.read_evaluation(path, again)
-    if "randomisation" in found:
+    evaluation = read_evaluation(path, again)
+    if evaluation.randomisation is not None:
         raise BidexError(f"{path}: expected an evaluation without --randomisation, got one with it. Name another.")
-    parse_content(found, _Recorded, str(path))
-    if "splits" not in found and "policy" not in found:
-        parse_content(found, _Part, str(path))
-    return found
+    needed = {"steps": evaluation.steps, "seed": evaluation.seed}
+    if isinstance(evaluation, PolicyEvaluation):
+        needed["policy.episodes_per_task"] = evaluation.policy.episodes_per_task
+    else:
+        for name, split in evaluation.splits.items():
+            needed[f"splits.{name}.before.episodes_per_task"] = split.before.episodes_per_task
+    for name, value in needed.items():
+        if value is None:
+            raise BidexError(f"{path}: {name}: expected it to be there, found none.")
+    return evaluation
 
 
-def _where(device: str, engine: str | None, then: Json, config: AnyConfig) -> AnyConfig:
+def _where(device: str, engine: str | None, then: Conditions, config: AnyConfig) -> AnyConfig:
     """Return the run's config with the device and engine to evaluate with."""
     on_gpu = Worlds.open(config.to_json()).on_gpu
+    recorded = then.device or config.device
     try:
-        found = resolve_device(then["device"] if device == "auto" else device, on_gpu)
+        found = resolve_device(recorded if device == "auto" else device, on_gpu)
     except BidexError:
         if device != "auto":
             raise
         found = "cpu"
-    same = found.partition(":")[0] == then["device"].partition(":")[0]
-    usual = then["engine"] if same else "auto"
-    return replace(config, device=found, engine=engine or usual)
+    same = found.partition(":")[0] == recorded.partition(":")[0]
+    usual = then.engine if same else None
+    return replace(config, device=found, engine=engine or usual or "auto")
 
 
 def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
@@ -185,58 +157,64 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
 
 
 def _again(
-    folder: RunFolder, config: AnyConfig, worlds: Worlds, recorded: Json, num_envs: int | None, state: Json
-) -> Json:
-    """The recorded evaluation, made again."""
+    folder: RunFolder, config: AnyConfig, worlds: Worlds, recorded: Evaluated, num_envs: int | None, state: Json
+) -> dict[str, ClassSummary]:
+    """Return the results of the recorded evaluation, made again."""
     load = partial(policy_of, folder, state, config.device)
-    if learner_kind(config.algo).make.adapts != ("splits" in recorded):
-        if "splits" in recorded:
+    seed = recorded.seed or 0
+    adapts = Capability.ADAPTS in learner_kind(config.algo).make.capabilities
+    if adapts != isinstance(recorded, MetaTestEvaluation):
+        if isinstance(recorded, MetaTestEvaluation):
             kind = "a meta-test"
         else:
             kind = "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
-    if "splits" not in recorded:
-        split = recorded.get("split", "train")
-        episodes = recorded.get("policy", recorded)["episodes_per_task"]
-        world = worlds.world(split, num_envs)
-        found = worlds.judge(load(), world, worlds.protocol(split, episodes, recorded["seed"]))
+    if isinstance(recorded, PolicyEvaluation):
+        world = worlds.world(recorded.split, num_envs)
+        protocol = worlds.protocol(recorded.split, recorded.policy.episodes_per_task, seed)
+        found = worlds.judge(load(), world, protocol)
         world.close()
-        return {"policy": found.to_json()}
+        return found.summary().classes
     splits = {}
-    for split, part in recorded["splits"].items():
+    for split, part in recorded.splits.items():
         if split not in (*worlds.splits, OTHERS):
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
-        before = part["before"]
         options = Options(
-            shots=part["shots"], rollouts=part["rollouts"], trials=part["trials"], episodes=before["episodes_per_task"],
-            tasks=max(row.get("tasks", TASKS) for row in before["classes"].values()),
-            num_envs=num_envs, seed=recorded["seed"],
+            shots=part.shots, rollouts=part.rollouts, trials=part.trials, episodes=part.before.episodes_per_task,
+            tasks=max(row.tasks or TASKS for row in part.before.classes.values()), num_envs=num_envs, seed=seed,
         )  # fmt: skip
-        if "max_adapt_steps" in part:
-            config = replace(config, learner={**config.learner, "max_adapt_steps": part["max_adapt_steps"]})
-        splits[split] = meta_test(worlds, config, load, options, [split])[split].to_json()
-    return {"splits": splits}
+        if part.max_adapt_steps is not None:
+            config = replace(config, learner={**config.learner, "max_adapt_steps": part.max_adapt_steps})
+        splits[split] = meta_test(worlds, config, load, options, [split])[split].summary()
+    return MetaTestEvaluation(splits=splits).all_results
 
 
-def recorded_conditions(evaluation: Json, versions: Json, config: AnyConfig) -> Json:
-    """The same of an evaluation as it was recorded; of an older one what its run was trained with.
+def recorded_conditions(evaluation: Evaluated, versions: Versions, config: AnyConfig) -> Conditions:
+    """Return the conditions of a recorded evaluation; entries that it lacks are those of the run's training."""
+    recorded = evaluation.conditions
+    return replace(
+        recorded,
+        device=recorded.device or config.device,
+        engine=recorded.engine or config.engine,
+        packages=recorded.packages or versions.packages,
+        physics=recorded.physics or versions.physics,
+        suite_version=versions.suite_version if recorded.suite_version is None else recorded.suite_version,
+        suite_digest=recorded.suite_digest or versions.suite_digest,
+    )
 
-    Of the contents of ``evaluation.json`` and ``versions.json`` (empty where there is none), and the run's config.
-    """
-    found = {"device": config.device, "engine": config.engine, "num_envs": None}
-    found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version", "suite_digest")}
-    found |= evaluation.get("conditions", {})
-    packages = found["packages"]
-    return found | {"packages": packages if isinstance(packages, dict) else {}}
 
-
-def others(then: Json, now: Json) -> list[str]:
-    """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
+def others(then: Conditions, now: Conditions) -> list[str]:
+    """Return a text for each difference of recorded and present conditions; the last names what was not recorded."""
     texts = list(map(str, differences(then, now)))
-    where = ("device", "engine", "threads")
-    texts += [f"{name} {then[name]} then, {now[name]} now" for name in where if then.get(name) not in (None, now[name])]
-    packages = then["packages"]
-    unknown = [name for name in now["packages"] if packages.get(name) is None]
-    names = ("device", "engine", "physics", "suite_version")
-    unknown += [name.replace("_", " ") for name in names if then.get(name) is None and now[name] is not None]
-    return texts + ([f"not recorded: {', '.join(unknown)}"] if unknown else [])
+    for name in ("device", "engine", "threads"):
+        recorded = getattr(then, name)
+        present = getattr(now, name)
+        if recorded not in (None, present):
+            texts.append(f"{name} {recorded} then, {present} now")
+    unknown = [name for name in now.packages if then.packages.get(name) is None]
+    for name in ("device", "engine", "physics", "suite_version"):
+        if getattr(then, name) is None and getattr(now, name) is not None:
+            unknown.append(name.replace("_", " "))
+    if unknown:
+        texts.append(f"not recorded: {', '.join(unknown)}")
+    return texts

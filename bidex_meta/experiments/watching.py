@@ -11,7 +11,7 @@ import torch
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.filming import film_tiles
+from bidex_meta.evaluation.filming import Look, film_tiles
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments import metatest
@@ -23,14 +23,14 @@ from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.training.launch import launch, say
-from bidex_meta.training.learner import Learner
+from bidex_meta.training.learner import Capability, Learner
 from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds
 
 TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
 _LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
-_FILM = {"width": 240, "height": 180}
+_FILM: Look = {"width": 240, "height": 180}
 _FILM_EVERY = 2
 _MOST_FILM_STEPS = 300
 
@@ -86,7 +86,7 @@ class Watch:
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        if self._kind.make.adapts:
+        if Capability.ADAPTS in self._kind.make.capabilities:
             metrics = self._meta_test()
         else:
             metrics = _metrics(self._judge())

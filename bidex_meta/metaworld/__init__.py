@@ -5,7 +5,6 @@ environments in this process, which MuJoCo 4 breaks (``library.mended``), and ma
 """
 
 from contextlib import suppress
-from typing import Any
 
 from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.metaworld.benchmarks import ML1, ML4, ML20, MT1, MT4, MT20, CustomML, CustomMT
@@ -24,7 +23,7 @@ _ABSENT = {"MT10": "MT4 or MT20", "MT25": "MT20", "MT50": "MT20", "ML10": "ML4 o
 _CLASSES = "ALL_V3_ENVIRONMENTS"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Return Meta-World's wrappers by name; raise an error that names the alternative for its suites and classes."""
     if name == _CLASSES:
         return {task: MT1(task).train_classes[task] for task in MT1.ENV_NAMES}

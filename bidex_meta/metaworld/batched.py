@@ -10,7 +10,7 @@ from torch import Tensor
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
-from bidex_meta.evaluation.play import check_world, play_tasks
+from bidex_meta.evaluation.play import Episodes, check_world, joined_episodes, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.metaworld.library import (
     ACTION_SIZE,
@@ -66,8 +66,8 @@ class MetaWorldWorld(ForeignWorld):
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
             if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
-                what = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
-                raise BidexError(f"{what}, got {numbers.tolist()}.")
+                fault = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
+                raise BidexError(f"{fault}, got {numbers.tolist()}.")
             chosen[name] = [int(number) for number in numbers.flatten()]
         self._pools = chosen
         self._set_pool_sizes([len(chosen[name]) for name in self.task_names])
@@ -145,11 +145,10 @@ def evaluate_all_tasks(
     protocol = Protocol(seed=seed, episodes_per_task=episodes_per_task)
     check_world(world)
     at_once = min(rows.stop - rows.start for rows in world.slot_env_ids)
-    parts: list[dict[str, np.ndarray]] = []
+    parts: list[Episodes] = []
     for first in range(0, TASKS_PER_CLASS, at_once):
         pool = np.arange(first, min(first + at_once, TASKS_PER_CLASS))
         world.set_tasks({name: pool for name in world.task_names})
         played = play_tasks(agent, world, protocol.episodes_per_task, protocol.seed)
         parts.append(played | {"task": played["task"] + first})
-    episodes = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return Evaluation(results_by_class(world.task_names, episodes), episodes_per_task)
+    return Evaluation(results_by_class(world.task_names, joined_episodes(parts)), episodes_per_task)

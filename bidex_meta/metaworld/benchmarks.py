@@ -6,6 +6,7 @@ As in Meta-World, `MT1` and `ML1` take any one class; the suites of these names 
 """
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -15,7 +16,7 @@ from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass, plain_name, versi
 from bidex_meta.tasks import registry
 from bidex_meta.utils.arguments import checked_arguments
 
-_ENV_NAMES = [versioned_name(name, rules) for rules in (V1, V2) for name in registry.names()]
+_ENV_NAMES = [versioned_name(name, rules) for rules, name in product((V1, V2), registry.names())]
 
 
 class MT1(Benchmark):
@@ -88,16 +89,22 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
     versions = {entry != plain_name(entry) for entry in splits}
     if len(versions) > 1:
         raise BidexError(f"{name}: expected classes of one version, got {', '.join(splits)}.")
-    (second,) = versions
+    if True in versions:
+        rules = V2
+        full_name = f"{name}-v2"
+    else:
+        rules = V1
+        full_name = name
     splits = {plain_name(entry): where for entry, where in splits.items()}
+    kind: Literal["meta", "multi-task"] = "meta" if "test" in classes else "multi-task"
     return Suite(
-        name=f"{name}-v2" if second else name,
-        version=1 + second,
-        kind="meta" if "test" in classes else "multi-task",
+        name=full_name,
+        version=2 if rules == V2 else 1,
+        kind=kind,
         description=", ".join(splits),
         observation=observation,
         task_id="class",
-        rules=V2 if second else V1,
+        rules=rules,
         base="moving",
         tasks_per_class=50,
         classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),

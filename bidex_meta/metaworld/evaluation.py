@@ -6,34 +6,39 @@ so easy tasks are counted more often than hard ones. `bidex_meta.evaluation` pla
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import cast
 
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from metaworld import evaluation as library
 from metaworld.evaluation import Agent, MetaLearningAgent, Timestep
+
+from bidex_meta.metaworld.adapters import MetaWorldEnvs
+
+_CLASSES = "ALL_V3_ENVIRONMENTS"
+Envs = MetaWorldEnvs | SyncVectorEnv | AsyncVectorEnv
 
 __all__ = ["Agent", "MetaLearningAgent", "Timestep", "evaluation", "known_to_metaworld", "metalearning_evaluation"]
 
 
-def evaluation(agent: Agent, eval_envs: Any, num_episodes: int = 50) -> tuple[float, float, dict, dict]:
+def evaluation(agent: Agent, eval_envs: Envs, num_episodes: int = 50) -> tuple[float, float, dict, dict]:
     """Return success rate and return over all classes, and both per class; see Meta-World's function."""
     with known_to_metaworld(eval_envs):
-        return library.evaluation(agent, eval_envs, num_episodes)
+        return library.evaluation(agent, cast(SyncVectorEnv, eval_envs), num_episodes)
 
 
-def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Any, *args: Any, **kwargs: Any) -> tuple:
+def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Envs, *args: int, **kwargs: int) -> tuple:
     """Return success rate and return after adaptation, and success per class; see Meta-World's function."""
     with known_to_metaworld(eval_envs):
-        return library.metalearning_evaluation(agent, eval_envs, *args, **kwargs)
+        return library.metalearning_evaluation(agent, cast(SyncVectorEnv, eval_envs), *args, **kwargs)
 
 
 @contextmanager
-def known_to_metaworld(envs: Any) -> Iterator[None]:
+def known_to_metaworld(envs: Envs) -> Iterator[None]:
     """Add the classes of ``envs`` to the names in `metaworld.evaluation` (a copy: other modules share its dict)."""
-    module: Any = library
-    before = module.ALL_V3_ENVIRONMENTS
-    ours: dict[str, Any] = {name: type(name, (), {}) for name in envs.get_attr("task_name")}
-    module.ALL_V3_ENVIRONMENTS = {**before, **ours}
+    before = vars(library)[_CLASSES]
+    ours = {str(name): type(str(name), (), {}) for name in envs.get_attr("task_name")}
+    setattr(library, _CLASSES, {**before, **ours})
     try:
         yield
     finally:
-        module.ALL_V3_ENVIRONMENTS = before
+        setattr(library, _CLASSES, before)

@@ -3,10 +3,10 @@
 import functools
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
 
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import metaworld_classes
@@ -31,7 +31,7 @@ def mended() -> ModuleType:
     return import_module("metaworld")
 
 
-def _reset_mocap_welds(self: Any) -> None:
+def _reset_mocap_welds(self: MujocoEnv) -> None:
     welds = np.flatnonzero(self.model.eq_type == mujoco.mjtEq.mjEQ_WELD)
     self.model.eq_data[welds, : len(_WELD)] = _WELD
 
@@ -41,8 +41,8 @@ def _library() -> ModuleType:
     try:
         library = mended()
     except ModuleNotFoundError as error:
-        what = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
-        raise BidexError(f"{what}. Mend: pip install metaworld==3.0.0") from None
+        fault = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
+        raise BidexError(f"{fault}. Mend: pip install metaworld==3.0.0") from None
     # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
     mujoco.set_mju_user_warning(lambda message: None)
     return library
@@ -55,16 +55,12 @@ def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     MT10's tasks come from ``metaworld.MT10(seed)``, other suites' from ``metaworld.MT1(name, seed)``. Raises BidexError
     for an unknown suite, or if Meta-World is not installed.
     """
-    # the range of NumPy's old generator
     names = metaworld_classes(suite)
     library = _library()
-    seed = seed % 2**32
-    whole = suite == "metaworld/MT10"
-    if whole:
-        benchmarks = [library.MT10(seed=seed)]
-    else:
-        benchmarks = [library.MT1(name, seed=seed) for name in names]
-    tasks = [task for benchmark in benchmarks for task in benchmark.train_tasks]
+    seed = seed % 2**32  # the range of NumPy's old generator
+    if suite != "metaworld/MT10":
+        return {name: tuple(library.MT1(name, seed=seed).train_tasks) for name in names}
+    tasks = library.MT10(seed=seed).train_tasks
     return {name: tuple(task for task in tasks if task.env_name == name) for name in names}
 
 

@@ -25,13 +25,18 @@ from bidex_meta.config import RunConfig, read_config
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, Json, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.runs.checkpoints import Checkpoints
+from bidex_meta.runs.evaluations import Evaluated, read_evaluation
 from bidex_meta.runs.metrics import last_rows, read_metrics
-from bidex_meta.runs.schemas import read_evaluation, read_versions
-from bidex_meta.runs.versions import collect_versions
+from bidex_meta.runs.versions import collect_versions, read_versions
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 from bidex_meta.utils.validation import Whole
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None
 
 AnyConfig = RunConfig[Any]  # A run's config, with its learner's settings in any form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
@@ -136,7 +141,7 @@ class RunFolder:
         """Return the content of ``versions.json``; empty if there is none."""
         return read_versions(self.path)
 
-    def evaluation(self) -> Json:
+    def evaluation(self) -> Evaluated:
         """Return the final evaluation, or the meta-test of learners that adapt; raises BidexError if there is none."""
         if not exists(self.evaluation_path):
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
@@ -170,9 +175,7 @@ class RunFolder:
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
-            with contextlib.suppress(ImportError):  # Windows has no such locks
-                import fcntl
-
+            if fcntl is not None:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -206,16 +209,25 @@ def _torn_start(path: Path) -> bool:
     """Return whether a folder only holds files that a run makes before the end of its first iteration."""
     try:
         entries = list(path.iterdir())
-        found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
-        known = all(entry.name in _ENTRIES or entry.name.startswith(_EVENTS) for entry in found)
-        # A single temporary file belongs to the config: the check that the config can be written was killed.
-        known = known and (bool(found) or all(entry.name.startswith(".config.json.") for entry in entries))
-        known = known and not any(entry.is_symlink() for entry in found or entries)
-        inner = [each for entry in found if entry.name in _ENTRIES[:2] for each in entry.iterdir()]
-        empty = all(each.name.endswith(TEMPORARY_SUFFIX) for each in inner)  # such as the room of a checkpoint
-        return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
+        whole = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
+        if not whole:
+            # A single temporary file belongs to the config: the check that the config can be written was killed.
+            checked = [entry for entry in entries if entry.name.startswith(".config.json.")]
+            return bool(entries) and checked == entries and not any(entry.is_symlink() for entry in entries)
+        return all(_is_of_a_start(entry) for entry in whole)
     except OSError:
         return False
+
+
+def _is_of_a_start(entry: Path) -> bool:
+    """Return whether an entry of a run folder can be there before the end of the first iteration."""
+    if entry.is_symlink():
+        return False
+    if entry.name in ("checkpoints", "videos"):  # a checkpoint's room is reserved by temporary files
+        return all(inner.name.endswith(TEMPORARY_SUFFIX) for inner in entry.iterdir())
+    if entry.name == "metrics.jsonl":
+        return entry.stat().st_size == 0
+    return entry.name in _ENTRIES or entry.name.startswith(_EVENTS)
 
 
 def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:

@@ -1,22 +1,24 @@
-"""Curves and points of runs as figures: learning, metrics, adaptation, comparison."""
+"""Figures of runs: learning curves, metrics, adaptation, comparison."""
 
 import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import chain, product
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import Json, write_atomic
-from bidex_meta.runs.schemas import check_evaluation
-from bidex_meta.utils.files import exists, read_json
+from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.evaluations import ClassSummary, Evaluated, Interval, MetaTestEvaluation
 
-Figure = Any  # matplotlib's, which is only imported for drawing
-Axes = Any
+if TYPE_CHECKING:  # matplotlib is imported only for drawing, because it takes half a second
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -30,34 +32,33 @@ class Curve:
 
 
 Group = tuple[str, Mapping[str, Curve]]  # runs drawn in one colour: a label, and curves by tag
-Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval if known
+Bar = tuple[str, float, Interval | None]  # a label, a value, and its interval if known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
-_STYLES = ("-", "--")
+_STYLES = {"Train": "-", "Eval": "--"}  # of lines, by family of tags
 _FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
 _MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
-_AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
-def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "Eval")) -> Figure:
+def draw_learning(groups: Sequence[Group]) -> "Figure":
     """Draw return and success of every task against environment steps, a line for each group of runs.
 
-    Each task has its own panels, because returns differ by orders of magnitude. Each family of tags has its line style;
-    evaluations during training are dashed. Raises BidexError if no episode has ended yet.
+    Each task has its own panels, because returns differ by orders of magnitude. Evaluations during training are dashed.
+    Raises BidexError if no episode has ended yet.
     """
-    starts = [f"{family}/{measure}/" for measure in _MEASURES for family in families]
-    tags = [tag for _, curves in groups for tag in curves]
-    names = list(dict.fromkeys(tag[len(start) :] for tag in tags for start in starts if tag.startswith(start)))
+    starts = tuple(f"{family}/{measure}/" for measure, family in product(_MEASURES, _STYLES))
+    tags = [tag for tag in chain.from_iterable(curves for _, curves in groups) if tag.startswith(starts)]
+    names = list(dict.fromkeys(tag.split("/", 2)[2] for tag in tags))
     if not names:
         raise BidexError("There is no finished episode yet: nothing to plot.")
     figure, axes = _task_panels([names])
     for name, panels in zip(names, axes[0], strict=True):
         for axis, measure in zip(panels, _MEASURES, strict=True):
             for number, (label, curves) in enumerate(groups):
-                for family, style in zip(families, _STYLES, strict=False):
+                for family, style in _STYLES.items():
                     _draw_curve(axis, curves.get(f"{family}/{measure}/{name}"), label, number, style)
             axis.grid(alpha=0.3)
         panels[0].set_title(_plain(name))
@@ -68,7 +69,7 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
     return figure
 
 
-def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
+def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
     """Draw metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
     figure = _figure(5.2 * len(tags), 3.0)
     labels = [label for label, _ in groups]
@@ -82,12 +83,12 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
 
 def draw_panels(
     panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
-) -> Figure:
+) -> "Figure":
     """Draw a metric, labelled ``title``, against environment steps; a panel per name, all on one scale.
 
     ``unit``: the size of one unit of ``Curve.steps``, and its name.
     """
-    labels = list(dict.fromkeys(label for groups in panels.values() for label, _ in groups))
+    labels = list(dict.fromkeys(label for label, _ in chain.from_iterable(panels.values())))
     figure = _figure(5.2 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axis, (name, groups) in zip(axes, panels.items(), strict=True):
@@ -98,7 +99,7 @@ def draw_panels(
     return figure
 
 
-def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
+def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> "Figure":
     """Draw groups' numbers next to each other, as points with intervals, a panel for each title."""
     figure = _figure(5.2 * len(panels), 1.2 + 0.45 * max(len(bars) for bars in panels.values()))
     for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
@@ -113,60 +114,55 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
     return figure
 
 
-def draw_adaptation(evaluation: Json, where: object) -> Figure:
+def draw_adaptation(evaluation: Evaluated, where: object) -> "Figure":
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if ``evaluation`` (of evaluation.json or
-    of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names the source in messages) holds no meta-test.
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is no meta-test;
+    ``where`` names its source.
     """
-    if isinstance(evaluation, dict):
-        splits = evaluation.get("splits")
-    else:
-        splits = None
-    if not splits:
-        raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {_AGAIN.format(where)}")
-    check_evaluation(evaluation, str(where))
-    figure, blocks = _task_panels([list(part["before"]["classes"]) for part in splits.values()])
+    if not isinstance(evaluation, MetaTestEvaluation):
+        again = f"Write one: bidex-meta evaluate RUN --shots 3 --json > {where}"
+        raise BidexError(f"{where} holds no meta-test: its learner does not adapt. {again}")
+    splits = evaluation.splits
+    figure, blocks = _task_panels([list(part.before.classes) for part in splits.values()])
     for (split, part), axes in zip(splits.items(), blocks, strict=True):
-        for name, panels in zip(part["before"]["classes"], axes, strict=True):
-            rows = [shot["classes"][name] for shot in part["by_shot"]]
-            for axis, measure in zip(panels, _MEASURES, strict=True):
-                _draw_shots(axis, rows, measure, _COLOURS.get(split))
+        for name, panels in zip(part.before.classes, axes, strict=True):
+            rows = [shot.classes[name] for shot in part.by_shot]
+            _draw_shots(panels, rows, _COLOURS.get(split))
             panels[0].set_title(_plain(f"{split}: {name}"), fontsize=10)
     return figure
 
 
-def read_evaluation(path: Path) -> Json:
-    """Return the content of an evaluation's file; raises BidexError if it is missing or not JSON."""
-    if not exists(path):
-        raise BidexError(f"There is no {path}. {_AGAIN.format(path)}")
-    return read_json(path, "an evaluation")
+def _draw_shots(panels: "tuple[Axes, Axes]", rows: list[ClassSummary], colour: str | None) -> None:
+    """Draw the return after each shot into the upper panel, and the success rate into the lower one."""
+    upper, lower = panels
+    _draw_band(upper, [row.mean_return for row in rows], [row.return_interval for row in rows], colour)
+    _draw_band(lower, [row.success for row in rows], [row.success_interval for row in rows], colour)
+    lower.set_ylim(-0.02, 1.02)
+    lower.set_xlabel("shots")
 
 
-def _draw_shots(axis: Axes, rows: list[Json], measure: str, colour: str | None) -> None:
-    shots = list(range(len(rows)))
-    axis.plot(shots, [row[measure] for row in rows], marker="o", markersize=3, linewidth=1.2, color=colour)
-    ends = [row[f"{measure}_interval"] for row in rows]
-    if all(ends):
-        axis.fill_between(shots, [low for low, _ in ends], [high for _, high in ends], alpha=0.2, color=colour)
+def _draw_band(axis: "Axes", values: list[float], intervals: list[Interval | None], colour: str | None) -> None:
+    shots = list(range(len(values)))
+    axis.plot(shots, values, marker="o", markersize=3, linewidth=1.2, color=colour)
+    if all(intervals):
+        low, high = np.array(intervals).T
+        axis.fill_between(shots, low, high, alpha=0.2, color=colour)
     axis.grid(alpha=0.3)
     axis.set_xticks(shots)
-    if measure == "success":
-        axis.set_ylim(-0.02, 1.02)
-        axis.set_xlabel("shots")
 
 
-def _matplotlib() -> Any:
-    import_module("matplotlib.figure")  # imported only for drawing, because it takes half a second
+def _matplotlib() -> ModuleType:
+    import_module("matplotlib.figure")
     return import_module("matplotlib")
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float) -> "Figure":
     """Return an empty figure, without matplotlib's global state."""
     return _matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
-def _task_panels(blocks: Sequence[Sequence[str]]) -> tuple[Figure, list[list[tuple[Axes, Axes]]]]:
+def _task_panels(blocks: Sequence[Sequence[str]]) -> "tuple[Figure, list[list[tuple[Axes, Axes]]]]":
     """Return a figure with a panel of return above one of success for each name; each block begins a new row."""
     columns = [min(_COLUMNS, len(names)) for names in blocks]
     heights = [-(-len(names) // width) for names, width in zip(blocks, columns, strict=True)]
@@ -188,7 +184,7 @@ def _task_panels(blocks: Sequence[Sequence[str]]) -> tuple[Figure, list[list[tup
     return figure, panels
 
 
-def save(figure: Figure, out: Path, metadata: Mapping[str, str] | None = None) -> None:
+def save(figure: "Figure", out: Path, metadata: Mapping[str, str] | None = None) -> None:
     """Write a figure, in the format of the file's ending, with ``metadata``; raises BidexError for another ending."""
     known = figure.canvas.get_supported_filetypes()
     ending = out.suffix[1:].lower()
@@ -198,7 +194,7 @@ def save(figure: Figure, out: Path, metadata: Mapping[str, str] | None = None) -
     write_atomic(out, lambda file: figure.savefig(file, format=ending, dpi=120, metadata=metadata))
 
 
-def svg(figure: Figure) -> bytes:
+def svg(figure: "Figure") -> bytes:
     """Return a figure as SVG, with words stored as text."""
     out = io.BytesIO()
     with _matplotlib().rc_context({"svg.fonttype": "none"}):
@@ -206,10 +202,10 @@ def svg(figure: Figure) -> bytes:
     return out.getvalue()
 
 
-def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style: str, one: float = 1e6) -> None:
+def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, style: str, unit: float = 1e6) -> None:
     if curve is None:
         return
-    steps = curve.steps / one
+    steps = curve.steps / unit
     colour = _colour(number)
     if len(steps) == 1 or (style != "-" and len(steps) <= _FEW):
         marker = "."
@@ -221,7 +217,7 @@ def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style:
 
 
 def _draw_groups(
-    axis: Axes, groups: Sequence[Group], tag: str, numbers: Sequence[int], unit: tuple[float, str] = _MILLIONS
+    axis: "Axes", groups: Sequence[Group], tag: str, numbers: Sequence[int], unit: tuple[float, str] = _MILLIONS
 ) -> None:
     for (label, curves), number in zip(groups, numbers, strict=True):
         _draw_curve(axis, curves.get(tag), label, number, "-", unit[0])
@@ -229,13 +225,13 @@ def _draw_groups(
     axis.set_xlabel(unit[1])
 
 
-def _colour(number: int) -> Any:
+def _colour(number: int) -> tuple[float, float, float]:
     """Return the colour of a group: ten strong colours, then ten light ones, then again from the first."""
     colours = _matplotlib().colormaps["tab20"].colors
     return (colours[0::2] + colours[1::2])[number % len(colours)]
 
 
-def _add_legend(figure: Figure, labels: Sequence[str]) -> None:
+def _add_legend(figure: "Figure", labels: Sequence[str]) -> None:
     lines = [_matplotlib().lines.Line2D([], [], color=_colour(number)) for number in range(len(labels))]
     inches = figure.get_size_inches()[0]
     words = ["\n".join(textwrap.wrap(_plain(label), max(20, int(12 * inches)))) for label in labels]

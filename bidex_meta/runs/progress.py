@@ -5,7 +5,7 @@ import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, TextIO, TypeVar
+from typing import TextIO, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -63,7 +63,7 @@ class Progress:
         if self._live is not None:
             self._live.start()
 
-    def update(self, metrics: Mapping[str, Any], step: int) -> None:
+    def update(self, metrics: Mapping[str, float], step: int) -> None:
         """Show an iteration's metrics; earlier values stay, because an iteration may end no episode.
 
         Raises BrokenPipeError if the reader has ended or the terminal is gone; later output is discarded.
@@ -89,8 +89,8 @@ class Progress:
                 self._print(self._overall(self._step))
 
     def _tasks(self) -> list[str]:
-        starts = (_SUCCESS, _RETURN)
-        return list(dict.fromkeys(tag[len(s) :] for tag in self._shown for s in starts if tag.startswith(s)))
+        tags = [tag for tag in self._shown if tag.startswith((_SUCCESS, _RETURN))]
+        return list(dict.fromkeys(tag.split("/", 2)[2] for tag in tags))
 
     def _of_tasks(self) -> list[str]:
         return [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
@@ -148,12 +148,12 @@ class Progress:
         return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
-def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
+def counted(items: Iterable[Item], total: int, subject: str) -> Iterator[Item]:
     """Yield the items and show their count out of ``total`` on stderr: a bar in a terminal, plain lines elsewhere."""
-    console = PlainConsole(file=stream or sys.stderr)
+    console = PlainConsole(file=sys.stderr)
     if console.is_terminal:
         note("")  # the bar moves by itself
-        yield from track(items, description=what, total=total, console=console, transient=True)
+        yield from track(items, description=subject, total=total, console=console, transient=True)
         return
     reported = time.monotonic()
     for number, item in enumerate(items, start=1):
@@ -161,7 +161,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
         if time.monotonic() - reported >= _COUNTED_SECONDS:
             reported = time.monotonic()
             told()
-            console.print(f"{number} of {total} {what}", highlight=False, markup=False)
+            console.print(f"{number} of {total} {subject}", highlight=False, markup=False)
 
 
 def _lines(parts: Iterable[str], width: int) -> list[str]:

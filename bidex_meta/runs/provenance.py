@@ -6,17 +6,19 @@ records has is no difference.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.stored import Run
+from bidex_meta.runs.versions import Versions, parse_versions
 
 _WORLD = ("physics", "suite_version", "suite_digest")
 _ENGINES = ("mujoco", "mujoco-warp", "metaworld")
 Value = str | int
+Record = Versions | Conditions
 Subject = tuple[str | None, ...]
 """The subject that runs are trained on: two runs of one subject have the same worlds, if nobody changed the worlds."""
 
@@ -37,14 +39,14 @@ class Difference(NamedTuple):
         return f"{self.name} {self.then} then, {self.now} now"
 
 
-def differences(then: Json, now: Json) -> list[Difference]:
+def differences(then: Record, now: Record) -> list[Difference]:
     """Return the entries of both records whose values differ; packages missing in ``now`` do not count."""
     before = _values(then)
-    return [
-        Difference(name, before[name], value)
-        for name, value in _values(now).items()
-        if name in before and before[name] != value
-    ]
+    differing = []
+    for name, value in _values(now).items():
+        if name in before and before[name] != value:
+            differing.append(Difference(name, before[name], value))
+    return differing
 
 
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
@@ -57,11 +59,12 @@ def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
     for run, record in zip(runs, records, strict=True):
         for name, value in record.items():
             seen[_subject(run), name].add(value)
-    found = []
+    differing = []
     for run, record in zip(runs, records, strict=True):
         own = _subject(run)
-        found.append({name: record.get(name) for (of, name), values in seen.items() if of == own and len(values) > 1})
-    return found
+        names = [name for (subject, name), values in seen.items() if subject == own and len(values) > 1]
+        differing.append({name: record.get(name) for name in names})
+    return differing
 
 
 def check_alike(runs: Sequence[Run]) -> None:
@@ -78,21 +81,25 @@ def check_alike(runs: Sequence[Run]) -> None:
 
 def release_of(run: Run) -> Value | None:
     """Return the version of this package that a run was made with; None if it is not recorded."""
-    return _values(run.versions()).get("bidex-meta")
+    return _values(versions_of(run)).get("bidex-meta")
 
 
-def _values(record: Mapping[str, object]) -> dict[str, Value]:
+def versions_of(run: Run) -> Versions:
+    """Return the versions that a run was made with. Raises BidexError if an entry has a wrong type."""
+    return parse_versions(run.versions(), f"{run.path}: versions")
+
+
+def _values(record: Record) -> dict[str, Value]:
     """Return the known values of a record by name."""
-    packages = record.get("packages")
-    values: dict[str, object] = dict(packages) if isinstance(packages, dict) else {}
-    values |= {name.replace("_", " "): record.get(name) for name in _WORLD}
-    return {name: value for name, value in values.items() if isinstance(value, str | int)}
+    values: dict[str, Value | None] = dict(record.packages)
+    values |= {name.replace("_", " "): getattr(record, name) for name in _WORLD}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
     """Yield the entries that decide the worlds of a run's training and evaluation."""
     config = run.config()
-    trained = _values(run.versions())
+    trained = _values(versions_of(run))
     engines = ["mujoco"]
     if config.engine == "warp" or (config.engine == "auto" and config.device.startswith("cuda")):
         engines.append("mujoco-warp")
@@ -102,7 +109,7 @@ def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
     yield from ((name, trained[name]) for name in names if name in trained)
     if run.evaluated:
         with suppress(BidexError):  # an unreadable evaluation is reported by the code that needs it
-            evaluated = _values(run.evaluation().get("conditions", {}))
+            evaluated = _values(run.evaluation().conditions)
             yield from ((f"evaluated with {name}", evaluated[name]) for name in names if name in evaluated)
 
 

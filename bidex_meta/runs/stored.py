@@ -14,6 +14,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, TypedDict
 
@@ -22,8 +23,9 @@ from msgspec import Meta
 from bidex_meta.config import RunConfig, config_of
 from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Evaluated, parse_evaluation
 from bidex_meta.runs.folder import RunFolder
-from bidex_meta.runs.schemas import check_evaluation, check_versions
+from bidex_meta.runs.versions import parse_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
@@ -49,14 +51,18 @@ class _Content(TypedDict):
 class StoredRun:
     """A run of a study's file, created by :func:`read_study`; methods as those of :class:`RunFolder`."""
 
-    path: Path
-    """``FILE:RUN``, which names it in messages and on the command line."""
+    path: Path  # ``FILE:RUN``, which names it in messages and on the command line.
     content: Json
 
     @property
     def again(self) -> str:
         """Return the command that writes the file again, for messages."""
         return f"python -m tools.collect RUN --into {str(self.path).rpartition(':')[0]}"
+
+    @property
+    def evaluation_path(self) -> Path:
+        """Return the name of the run: its file also holds the evaluation."""
+        return self.path
 
     @property
     def evaluated(self) -> bool:
@@ -95,9 +101,13 @@ class StoredRun:
         """Return packages, machine and git state."""
         return self.content["versions"]
 
-    def evaluation(self) -> Json:
+    def evaluation(self) -> Evaluated:
         """Return the final evaluation."""
-        return self.content["evaluation"]
+        return self._evaluation
+
+    @cached_property
+    def _evaluation(self) -> Evaluated:
+        return parse_evaluation(self.content["evaluation"], f"{self.path}: evaluation")
 
 
 Run = RunFolder | StoredRun
@@ -122,9 +132,10 @@ def read_study(file: Path) -> list[StoredRun]:
     contents = read_json(file, "a study's runs")
     if not isinstance(contents, dict) or not contents:
         raise BidexError(f"{file}: expected a table of runs by name. Collect them again.")
-    for name, content in contents.items():
-        _check(name, content, f"{file}:{name}")
-    return [StoredRun(Path(f"{file}:{name}"), content) for name, content in contents.items()]
+    runs = [StoredRun(Path(f"{file}:{name}"), content) for name, content in contents.items()]
+    for name, run in zip(contents, runs, strict=True):
+        _check(name, run)
+    return runs
 
 
 def study_text(contents: Mapping[str, Json]) -> str:
@@ -137,13 +148,15 @@ def _run_text(content: Json) -> str:
     return "{\n" + ",\n".join(entries) + "\n}"
 
 
-def _check(name: str, content: Json, where: str) -> None:
+def _check(name: str, run: StoredRun) -> None:
+    where = str(run.path)
+    content = run.content
     parse(content, _Content, where)
     if content["name"] != name:
         raise BidexError(f"{where}: expected the name {name}, got {shortened(content['name'])}. Collect the run again.")
-    config_of(content["config"], f"{where}: config")
-    check_versions(content["versions"], f"{where}: versions")
-    check_evaluation(content["evaluation"], f"{where}: evaluation")
+    run.config()
+    parse_versions(content["versions"], f"{where}: versions")
+    run.evaluation()
     curves = content["curves"]
     steps = curves.get("step", [])
     if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):

@@ -1,16 +1,55 @@
-"""The environment that a result depends on in addition to its config: versions, machine and state of the source."""
+"""``versions.json``, the environment that a result depends on in addition to its config: packages, machine, commit."""
 
 import contextlib
 import os
 import platform
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 
 from bidex_meta.runs.atomic import Json
+from bidex_meta.utils.files import exists, read_json
+from bidex_meta.utils.validation import Text, Whole, parse
 
 _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "metaworld", "numpy", "scipy")
+
+
+@dataclass(frozen=True)
+class GitState:
+    """The commit of the source; ``dirty`` if files differed from it."""
+
+    commit: Text | None = None
+    dirty: bool = False
+
+
+@dataclass(frozen=True)
+class Versions:
+    """The entries of ``versions.json`` that are read; other entries are allowed, and any entry may be missing."""
+
+    packages: dict[str, Text | None] = field(default_factory=dict)
+    physics: Text | None = None
+    suite_version: Whole | None = None
+    suite_digest: Text | None = None
+    cpus: Whole | None = None
+    gpus: list[Text] | None = None
+    git: GitState | None = None
+
+
+def parse_versions(content: Json, where: str) -> Versions:
+    """Return the content of a ``versions.json``; raises BidexError, which begins with ``where``, for a wrong entry."""
+    return parse(content, Versions, where)
+
+
+def read_versions(folder: Path) -> Json:
+    """Return a run's ``versions.json``, checked; empty if the file is missing."""
+    path = folder / "versions.json"
+    if not exists(path):
+        return {}
+    content = read_json(path, "a run's versions")
+    parse_versions(content, str(path))
+    return content
 
 
 def collect_versions() -> Json:

@@ -1,4 +1,4 @@
-"""Which processes of a run are still there, for the message after one of them was lost."""
+"""Watch which processes of a run are alive, for the message after one of them was lost."""
 
 import os
 import signal
@@ -22,10 +22,10 @@ _JOIN_SECONDS = 10.0
 
 
 class Attendance(threading.Thread):
-    """Counts up in torchrun's store twice a second, to show the other processes of ``count`` that this one lives.
+    """Counts up in torchrun's store twice a second, to show the other processes of ``count`` that this process lives.
 
-    It may wait in a collective operation for one that does not live. So if a signal asked it to end, it has not done so
-    for 12 seconds and another is missing, the thread calls ``on_loss`` and ends the process.
+    This process may wait in a collective operation for a lost process. If a signal asked this process to end, it is
+    still waiting after 12 seconds and another process is missing, the thread calls ``on_loss`` and ends the process.
     """
 
     def __init__(self, store: Any, rank: int, count: int):
@@ -45,7 +45,10 @@ class Attendance(threading.Thread):
         self.start()
 
     def report(self) -> list[int] | None:
-        """Reports the end of this process to the others, and returns the lost ones; None where another reports them."""
+        """Report the end of this process to the others.
+
+        Returns the numbers of the lost processes, or None if another process reports them.
+        """
         self._closed.set()
         try:
             self._store.set(f"reported {self._rank}", "")
@@ -56,7 +59,7 @@ class Attendance(threading.Thread):
             return []  # the store is gone too
 
     def close(self) -> None:
-        """Ends the thread; returns when it has ended, or waits for a store that no longer answers."""
+        """End the thread; return when it has ended, or after 10 seconds if the store no longer answers."""
         self._closed.set()
         self.join(_JOIN_SECONDS)
         if threading.current_thread() is threading.main_thread():
@@ -80,7 +83,7 @@ class Attendance(threading.Thread):
                 os._exit(1)
 
     def _missing(self) -> list[int]:
-        """Processes that neither count up nor have reported."""
+        """Return the processes that neither count up nor have reported."""
         before = self._beats()
         time.sleep(_LISTEN_SECONDS)
         silent = [i for i, (a, b) in enumerate(zip(before, self._beats(), strict=True)) if a == b and i != self._rank]
@@ -97,9 +100,9 @@ class Attendance(threading.Thread):
 
 
 def end_patiently() -> None:
-    """Leaves ten seconds between SIGTERM and the end of the process, unless another handler takes over.
+    """Leave ten seconds between SIGTERM and the end of the process, unless another handler takes over.
 
-    torchrun sends it to all others as soon as one process is gone, just when they report that.
+    As soon as one process is gone, torchrun sends SIGTERM to all others, just when they report the loss.
     """
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -1,6 +1,6 @@
 """One run in several processes, started by torchrun and joined by torch.distributed: sums, broadcasts, agreement.
 
-Each steps a world of its own. In a single process every function here returns its input, and nothing is sent.
+Each process steps its own world. In a single process every function here returns its input, and nothing is sent.
 """
 
 import atexit
@@ -35,22 +35,22 @@ class LostProcess(RuntimeError):
 
 
 def rank() -> int:
-    """Number of this process, from 0."""
+    """Return the number of this process, from 0."""
     return dist.get_rank() if _joined() else 0
 
 
 def world_size() -> int:
-    """Number of processes."""
+    """Return the number of processes."""
     return dist.get_world_size() if _joined() else 1
 
 
 def is_main() -> bool:
-    """Whether this is process 0, which alone writes and prints."""
+    """Return whether this is process 0, which alone writes and prints."""
     return rank() == 0
 
 
 def own_seed(seed: int) -> int:
-    """A seed of this process alone (starts, sampled actions): ``seed`` itself in process 0."""
+    """Return a seed for this process alone (starts, sampled actions); in process 0 it is ``seed`` itself."""
     if is_main():
         return seed
     # 32 bits: torch's CPU generator reads no more, so that seed + (rank << 32) would be the same in all processes.
@@ -58,9 +58,9 @@ def own_seed(seed: int) -> int:
 
 
 def init_from_environment() -> None:
-    """Joins the processes that torchrun announces in the environment; does nothing in a single process.
+    """Join the processes that torchrun announces in the environment; do nothing in a single process.
 
-    Tensors on the CPU travel by gloo, those on CUDA devices by NCCL. Raises LostProcess where some did not come.
+    Tensors on the CPU travel by gloo, tensors on CUDA devices by NCCL. Raises LostProcess if a process does not join.
     """
     global _attendance
     if "MASTER_ADDR" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) == 1 or _joined():
@@ -78,7 +78,7 @@ def init_from_environment() -> None:
 
 
 def shut_down() -> None:
-    """Leaves the other processes once all have come here."""
+    """Leave the other processes once all have called this."""
     if _joined():
         with _collective():
             dist.barrier()
@@ -94,10 +94,10 @@ def _end_threads() -> None:
 
 
 def _leave() -> None:
-    """Ends all threads in a process that ends without :func:`shut_down`.
+    """End all threads in a process that ends without :func:`shut_down`.
 
-    One that asks for the interpreter when it is gone (the attendance, gloo's own) is unwound through C++ that may not
-    throw: "terminate called without an active exception".
+    A thread that asks for the interpreter after it is gone (the attendance's, gloo's own) is unwound through C++ that
+    may not throw: "terminate called without an active exception".
     """
     _end_threads()
     # With NCCL this might wait for a process that is lost.
@@ -106,25 +106,25 @@ def _leave() -> None:
 
 
 def report_loss() -> list[int] | None:
-    """Which processes are missing, after a :class:`LostProcess`; None where another process reports it."""
+    """Return the missing processes after a :class:`LostProcess`, or None if another process reports them."""
     if _attendance is None:
         return []
     return _attendance.report()
 
 
 def on_loss(function: Callable[[], None]) -> None:
-    """Calls ``function`` before a process ends that cannot stop when asked, since it waits for a lost one."""
+    """Set the function to call before a process ends that cannot stop when asked, because it waits for a lost one."""
     if _attendance is not None:
         _attendance.on_loss = function
 
 
 def all_sum(x: Tensor) -> Tensor:
-    """Sum of ``x``, of one shape in all processes, over the processes."""
+    """Sum ``x`` over the processes; it has the same shape in all of them."""
     return _reduced(x, dist.ReduceOp.SUM)
 
 
 def all_max(x: Tensor) -> Tensor:
-    """Maximum of each entry of ``x``, likewise."""
+    """Return the maximum of each entry of ``x`` over the processes; it has the same shape in all of them."""
     return _reduced(x, dist.ReduceOp.MAX)
 
 
@@ -138,7 +138,7 @@ def _reduced(x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
 
 
 def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance and count of all processes' samples from those of each; three tensors of one shape."""
+    """Pool mean, biased variance and count over the processes; three tensors of one shape."""
     if world_size() == 1:
         return mean, var, count
     n = count.double()
@@ -151,9 +151,9 @@ def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tens
 
 
 def sum_gradients(parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
-    """Sums the gradients over the processes, in place, and returns the sum of ``numbers`` (n,), in one operation.
+    """Sum the gradients over the processes, in place, and return the sum of ``numbers`` (n,), in one operation.
 
-    For the gradient of a mean over all samples, each process divides its loss by the samples of all.
+    For the gradient of a mean over all samples, each process divides its loss by the samples of all processes.
     """
     if world_size() == 1:
         return numbers
@@ -167,7 +167,7 @@ def sum_gradients(parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor
 
 @torch.no_grad()
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Overwrites tensors with those of process 0."""
+    """Overwrite tensors with those of process 0."""
     if world_size() > 1:
         with _collective():
             for tensor in tensors:
@@ -175,12 +175,12 @@ def broadcast(tensors: Iterable[Tensor]) -> None:
 
 
 def any_process(flag: bool) -> bool:
-    """Whether ``flag`` is true in at least one process."""
+    """Return whether ``flag`` is true in at least one process."""
     return bool(all_sum(torch.tensor(int(flag))) > 0)
 
 
 def share(value: Value) -> list[Value]:
-    """The values of all processes, in all processes: small ones, that pickle can copy."""
+    """Return the values of all processes to all processes. The values are small and can be pickled."""
     if world_size() == 1:
         return [value]
     values = [value] * world_size()
@@ -190,7 +190,7 @@ def share(value: Value) -> list[Value]:
 
 
 def gather(state: State) -> list[State] | None:
-    """The states of all processes, in process 0, tensors on the CPU; None in the others."""
+    """Return the states of all processes in process 0, tensors on the CPU; return None in the others."""
     if world_size() == 1:
         return [state]
     data = io.BytesIO()
@@ -205,7 +205,10 @@ def gather(state: State) -> list[State] | None:
 
 
 def together(function: Callable[[], Value]) -> Value:
-    """``function()``; with BidexError in any process, the first of these raises it and all others SystemExit."""
+    """Return ``function()`` in all processes, or end all of them.
+
+    After a BidexError in any process, the first such process raises it and all others raise SystemExit.
+    """
     error = None
     value = None
     try:

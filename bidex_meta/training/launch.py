@@ -1,4 +1,4 @@
-"""How this process was started: alone, or by torchrun as one of several that share a run."""
+"""The way this process was started: alone, or by torchrun as one of several that share a run."""
 
 import logging
 import os
@@ -10,7 +10,7 @@ _LOG = logging.getLogger("bidex_meta")
 
 
 def say(text: str) -> None:
-    """Log a line at level INFO; of several processes, the first alone does."""
+    """Log a line at level INFO; with several processes, only process 0 logs it."""
     if launch().rank == 0:
         _LOG.info(text)
 
@@ -25,14 +25,17 @@ class Launch:
     local_count: int = 1  # on its machine
 
     def own_device(self, device: str) -> str:
-        """The device of this process: of several on one machine, each takes the GPU of its number."""
+        """Return the device of this process.
+
+        With several processes per machine, each takes the GPU of its local rank.
+        """
         if self.count > 1 and device == "cuda":
             return f"cuda:{self.local_rank}"
         return device
 
 
 def launch() -> Launch:
-    """The environment's description, read anew each time."""
+    """Read this process's description from the environment, on every call."""
     # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
     if "MASTER_ADDR" not in os.environ:
         return Launch()
@@ -47,7 +50,7 @@ BATCH_SIGNALS = tuple(signal.Signals[name] for name in ("SIGUSR1", "SIGUSR2") if
 def notices() -> tuple[signal.Signals, ...]:
     """Return the signals beside SIGINT and SIGTERM that ask a process to end, without those that it ignores.
 
-    SIGHUP comes when the terminal closes (``nohup`` ignores it), the others are ``BATCH_SIGNALS``. Each may come
+    SIGHUP comes when the terminal closes (``nohup`` ignores it), the others are ``BATCH_SIGNALS``. Each signal may come
     several times: from the terminal and its shell, or from the batch system and the job that it runs.
     """
     if os.name == "posix":
@@ -58,7 +61,7 @@ def notices() -> tuple[signal.Signals, ...]:
 
 
 def resume_command(path: Path, processes: int) -> str:
-    """The command that continues a run of so many processes."""
+    """Return the command that continues a run of this number of processes."""
     if processes == 1:
         return f"bidex-meta run --resume {path}"
     here = launch()

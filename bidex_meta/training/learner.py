@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum, auto
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from bidex_meta.errors import BidexError
@@ -62,11 +63,30 @@ class Sources:
 NO_SOURCES = Sources()
 
 
+class Capability(StrEnum):
+    """A promise of a learner's class to the commands and to the training."""
+
+    ADAPTS = auto()
+    """Its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
+    explores by its own generator, seeded equally by each call. The meta-test reads ``max_adapt_steps`` (longest episode
+    of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, if there."""
+    ADAPTS_INDEPENDENTLY = auto()
+    """Each environment adapts from its own episodes alone, even if several play the same task."""
+    OFFLINE = auto()
+    """It learns from data sets (``Sources.data``) and never steps the world."""
+    IMITATES = auto()
+    """It may take demonstrations and teachers while it learns by playing (``Sources``)."""
+    TAUGHT = auto()
+    """It learns from teachers alone (``Sources.teachers``): it plays, and they label the states that it visits."""
+    DISCOUNTS_BY_CLASS = auto()
+    """It learns with a discount per class, if the world has these (``world.gammas``)."""
+
+
 class Learner(ABC):
     """Base of all learners, of a world in the mode that :meth:`autoreset_mode` returns.
 
     ``config`` is an instance of the dataclass of its presets; ``seed`` is of everything random, the world's first reset
-    too. Learners that set ``offline``, ``imitates`` or ``taught`` take a fourth argument, ``sources``.
+    too. Learners that are capable of ``OFFLINE``, ``IMITATES`` or ``TAUGHT`` take a fourth argument, ``sources``.
     """
 
     name: ClassVar[str] = "learner"
@@ -75,18 +95,8 @@ class Learner(ABC):
     """Configs by name, all of one dataclass. ``auto``: ``laptop`` on a CPU, ``paper`` on a GPU, else the first."""
     task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Presets where it learns a single task class, by that class; they go before those of the same name."""
-    adapts: ClassVar[bool] = False
-    """Whether its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
-    explores by its own generator, seeded alike by each call. The meta-test reads ``max_adapt_steps`` (longest episode
-    of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, if there."""
-    independent_adaptation: ClassVar[bool] = False
-    """Whether each environment adapts from its own episodes alone, even where several play the same task."""
-    offline: ClassVar[bool] = False
-    """Whether it learns from data sets (``Sources.data``) and never steps the world."""
-    imitates: ClassVar[bool] = False
-    """Whether it may take demonstrations and teachers while it learns by playing (``Sources``)."""
-    taught: ClassVar[bool] = False
-    """Whether teachers are all that it learns from: it plays, they label what it comes to."""
+    capabilities: ClassVar[frozenset[Capability]] = frozenset()
+    """What the commands and the training may ask of the learner."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int

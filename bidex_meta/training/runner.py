@@ -11,9 +11,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
 
-import gymnasium
+from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.recorder import Recorder
@@ -43,7 +42,7 @@ def train(
     enough: Callable[[Mapping[str, float]], bool] | None = None,
     last: Mapping[str, float] | None = None,
 ) -> int:
-    """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
+    """Train until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
     Both include those of a run that is resumed (``spent_seconds``). Time, which metrics get as ``Perf/training_time``,
     counts from the first world step to the end of an iteration, with checkpoints; there is at least one iteration.
@@ -127,9 +126,9 @@ def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None
 
 
 def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
-    """The state of a run: ``{"learner": ..., "env": ...}``; all processes must call it.
+    """Return the state of a run: ``{"learner": ..., "env": ...}``; all processes must call this function.
 
-    Process 0 gets its own state with, under ``others``, the entries that differ in each of the others; they get None.
+    Process 0 gets its own state and, under ``others``, the entries that differ in each of the others; they get None.
     """
     state = {"learner": learner.state_dict(), "env": world.state_dict()}
     if world_size() == 1:
@@ -152,11 +151,11 @@ def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps
     return world_size() * (own + stored)
 
 
-def _numbers(space: gymnasium.Space[Any]) -> int:
+def _numbers(space: Box) -> int:
     return math.prod(space.shape or (0,))
 
 
-def _tensor_bytes(state: Any) -> int:
+def _tensor_bytes(state: object) -> int:
     if isinstance(state, dict):
         return sum(_tensor_bytes(part) for part in state.values())
     if isinstance(state, list | tuple):
@@ -165,7 +164,10 @@ def _tensor_bytes(state: Any) -> int:
 
 
 def resume(learner: Learner, world: VectorWorld, state: State) -> None:
-    """Restores a :func:`checkpoint` of as many processes; training continues bit for bit (CPU, as many threads)."""
+    """Restore a :func:`checkpoint` written by the same number of processes.
+
+    On the CPU, with the same number of threads, training continues bit for bit.
+    """
     parts = [state, *state.get("others", [])]
     if len(parts) != world_size():
         raise BidexError(f"The checkpoint is of {len(parts)} processes, but here are {world_size()}. Start as many.")

@@ -1,1 +1,1 @@
-"""What every package may use: validation, files, rotations, memory, plugins, streams."""
+"""Helpers that every package may use: validation, files, rotations, memory, plugins, streams."""

@@ -1,6 +1,6 @@
 """Reads files that others may have written or damaged: opened, bounded, parsed and checked, errors on one line.
 
-Nothing is read that is larger than its kind can be, and nothing waits for a writer.
+No file is read that is larger than its kind can be, and no function waits for a writer.
 """
 
 import json
@@ -16,18 +16,18 @@ from bidex_meta.errors import BidexError, one_line, shortened
 
 Json = Any
 JsonObject = dict[str, Any]
-"""What a file of JSON or TOML holds."""
+"""Content of a file of JSON or TOML."""
 MOST_TEXT = 64_000_000
 """Bytes of a file of JSON or TOML: far above the largest evaluation."""
 _DATA_SETS = ("dataset", "demonstrations", "drawn_from")
 """Entries that name data sets."""
 _DEEPEST = 64
 _LARGEST = 2**63 - 1
-"""Whole numbers beyond are no count, step or seed of ours; and Python takes long for some thousand digits."""
+"""Larger whole numbers are no count, step or seed of ours, and Python takes long for some thousand digits."""
 
 
 def expanded(path: str | Path) -> Path:
-    """A path with ``~`` and ``~name`` replaced; raises BidexError without such a user or home folder."""
+    """Replace ``~`` and ``~name`` in a path; raises BidexError for an unknown user or without a home folder."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -35,7 +35,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def absolute(path: str | Path) -> Path:
-    """A path from the root on, ``~`` replaced and links followed; raises BidexError where they lead in a circle."""
+    """Return a path from the root on, ``~`` replaced and links followed; raises BidexError if links form a circle."""
     try:
         return expanded(path).resolve()
     except (RuntimeError, OSError) as error:
@@ -43,9 +43,9 @@ def absolute(path: str | Path) -> Path:
 
 
 def portable(content: Json) -> Json:
-    """Return content without the folders of this machine, to be published: of an absolute path its last part alone.
+    """Return content for publication: absolute paths are cut to their last part, which drops this machine's folders.
 
-    Data sets keep two parts (``CatchUnderarm/random-v0``), since these are their names.
+    Data sets keep two parts (``CatchUnderarm/random-v0``), because these are their names.
     """
     return _portable(content, 1)
 
@@ -61,23 +61,23 @@ def _portable(content: Json, parts: int) -> Json:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a regular file; false, not an error, for a path that cannot be one."""
+    """Return whether there is a regular file; False, not an error, for a path that cannot be one."""
     with suppress(OSError, ValueError):
         return path.is_file()
     return False
 
 
 def exists(path: Path) -> bool:
-    """Whether there is anything, a link that leads nowhere too; false for a path that cannot be one."""
+    """Return whether a path exists; a link that leads nowhere counts, a path that cannot exist does not."""
     with suppress(OSError, ValueError):
         return os.path.lexists(path)
     return False
 
 
 def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
-    """Opens a regular file of at most ``most`` bytes for reading; messages call it ``what``: ``"a run's config"``.
+    """Open a regular file of at most ``most`` bytes for reading; messages call it ``what``: ``"a run's config"``.
 
-    Raises BidexError where there is none, it cannot be read, is something else than a file, or is too large.
+    Raises BidexError if the file is missing, unreadable or too large, or is no regular file.
     """
     try:
         # Opening a pipe would wait for somebody to write into it.
@@ -102,7 +102,7 @@ def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
 
 
 def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
-    """A file's content; see :func:`open_regular`."""
+    """Return a file's content; see :func:`open_regular`."""
     with open_regular(path, what, most) as file:
         try:
             return file.read(most + 1)
@@ -111,7 +111,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """A file's content in UTF-8; raises BidexError as :func:`open_regular`, or where it is not UTF-8."""
+    """Return a file's content as text; raises BidexError as :func:`open_regular`, or if it is not UTF-8."""
     try:
         return read_bytes(path, what).decode()
     except UnicodeDecodeError as error:
@@ -119,15 +119,15 @@ def read_text(path: Path, what: str) -> str:
 
 
 def read_json(path: Path, what: str) -> Json:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
-    Raises BidexError as :func:`read_text`, or where it is not JSON, is nested too deep or has a number beyond 64 bits.
+    Raises BidexError as :func:`read_text`, or if it is not JSON, is nested too deep or has a number beyond 64 bits.
     """
     return _parsed(path, what, "JSON", json.loads)
 
 
 def read_toml(path: Path, what: str) -> JsonObject:
-    """The content of a TOML file; errors as of :func:`read_json`."""
+    """Return the content of a TOML file; raises BidexError as :func:`read_json`."""
     return _parsed(path, what, "TOML", tomllib.loads)
 
 
@@ -142,7 +142,7 @@ def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Json]) 
 
 
 def bounded(content: Json) -> Json:
-    """The same content; raises ValueError where it is nested too deep, or has a whole number beyond 64 bits."""
+    """Return the same content; raises ValueError if it is nested too deep, or has a whole number beyond 64 bits."""
     level = [content]
     for _ in range(_DEEPEST):
         if not level:
@@ -150,6 +150,11 @@ def bounded(content: Json) -> Json:
         for value in level:
             if isinstance(value, int) and abs(value) > _LARGEST:
                 raise ValueError(f"a number has more than {len(str(_LARGEST)) - 1} digits")
-        inner = [value for value in level if isinstance(value, dict | list)]
-        level = [each for value in inner for each in (value.values() if isinstance(value, dict) else value)]
+        inner: list[Json] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+        level = inner
     raise ValueError(f"it is nested more than {_DEEPEST} deep")

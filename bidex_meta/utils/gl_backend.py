@@ -1,7 +1,7 @@
-"""How MuJoCo draws on this machine: a screen, else EGL, else OSMesa, chosen when the first picture is drawn.
+"""The choice of how MuJoCo draws on this machine: a screen, else EGL, else OSMesa, made before the first picture.
 
-MuJoCo decides when it is imported, by ``MUJOCO_GL`` alone, and its import fails where that names what is missing; most
-runs draw nothing and shall not fail on it.
+MuJoCo chooses at import, by ``MUJOCO_GL`` alone, and its import fails if the variable names a missing library. Most
+runs draw nothing and must not fail on that.
 """
 
 import os
@@ -24,7 +24,7 @@ _impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine 
 
 
 def set_aside_what_is_missing() -> None:
-    """Takes ``MUJOCO_GL`` out of the environment where MuJoCo's import would fail with it; drawing then raises."""
+    """Remove ``MUJOCO_GL`` from the environment if MuJoCo's import would fail with it; drawing then raises."""
     global _impossible
     asked = _asked()
     if not sys.platform.startswith("linux") or "mujoco" in sys.modules or asked in {"", *_OTHERS}:
@@ -34,13 +34,13 @@ def set_aside_what_is_missing() -> None:
 
 
 def has_screen() -> bool:
-    """Whether windows can be opened here, as far as the environment shows."""
+    """Return whether windows can be opened here, as far as the environment shows."""
     return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 @cache
 def prepare() -> None:
-    """Makes sure that ``mujoco.Renderer`` works; raises BidexError where nothing, or not ``MUJOCO_GL``, can draw."""
+    """Ensure that ``mujoco.Renderer`` works; raises BidexError if ``MUJOCO_GL``, or every backend, cannot draw."""
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
@@ -55,7 +55,8 @@ def prepare() -> None:
             raise BidexError(f"Drawing by {_VARIABLE}={asked or 'default'} failed ({reason}). Unset it, or mend that.")
         return
     reasons = []
-    for backend in [*(["glfw"] if has_screen() else []), *_LIBRARIES]:
+    with_screen = ["glfw"] if has_screen() else []
+    for backend in [*with_screen, *_LIBRARIES]:
         reason = _reason(lambda backend=backend: _load(backend, gl_context))
         if reason is None:
             return
@@ -70,7 +71,7 @@ def _asked() -> str:
 
 
 def _reason(attempt: Callable[[], None]) -> str | None:
-    """Why an attempt failed, on one line; None where it did not."""
+    """Return why an attempt failed, on one line, or None if it succeeded."""
     try:
         attempt()
     except Exception as error:  # drawing libraries raise errors of many kinds
@@ -79,7 +80,10 @@ def _reason(attempt: Callable[[], None]) -> str | None:
 
 
 def _load(backend: str, gl_context: Any) -> None:
-    """Makes a backend MuJoCo's, and tries it; what a failed one imported is forgotten, or it would spoil the next."""
+    """Install and try a backend in MuJoCo.
+
+    After a failure the modules that the backend imported are removed, because they would spoil the next backend.
+    """
     before = set(sys.modules)
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
@@ -96,7 +100,10 @@ def _load(backend: str, gl_context: Any) -> None:
 
 
 def _try(context: Any) -> None:
-    """Makes a context; MuJoCo must not meet one that failed: it would not draw with the next one either."""
+    """Create a context.
+
+    MuJoCo must not meet a context that failed: it would not draw with the next one either.
+    """
     with warnings.catch_warnings():  # GLFW's are what the caller is told
         warnings.simplefilter("ignore")
         made = context(16, 16)

@@ -39,9 +39,9 @@ def available() -> int:
 
 
 def check_memory(needed: float, what: str, mend: str) -> None:
-    """Raises BidexError where fewer than ``needed`` bytes are free.
+    """Raise BidexError if fewer than ``needed`` bytes are free.
 
-    ``what`` takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
+    ``what`` is the object that takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
     """
     there = available()
     if needed > there:
@@ -83,7 +83,8 @@ def _groups(controller: str) -> Iterator[Path]:
             continue
         place = Path(path.lstrip("/"))
         # Version 2 has one tree, which lies in a folder "unified" where the machine has version 1 too.
-        for tree in (controller, controllers) if controllers else (".", "unified"):
+        trees = (controller, controllers) if controllers else (".", "unified")
+        for tree in trees:
             yield from (root / tree / group for group in (place, *place.parents))
 
 

@@ -8,12 +8,12 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def suites_dir() -> Path:
-    """The folder of the shipped suite files."""
+    """Return the folder of the shipped suite files."""
     return _room("suites")
 
 
 def assets_dir() -> Path:
-    """The folder of the models (MJCF) of hands, objects and scene."""
+    """Return the folder of the models (MJCF) of hands, objects and scene."""
     return _room("assets")
 
 

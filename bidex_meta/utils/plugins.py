@@ -15,17 +15,17 @@ _files: dict[str, str] = {}
 
 
 def is_outside(name: object) -> bool:
-    """Whether a name is of the form ``package.module:Class``."""
+    """Return whether a name is of the form ``package.module:Class``."""
     return isinstance(name, str) and ":" in name
 
 
 def short_name(name: str) -> str:
-    """The class's name of ``package.module:Class``; any other name as it is."""
+    """Return the class's name of ``package.module:Class``; return any other name unchanged."""
     return name.rpartition(":")[2]
 
 
 def name_with_object(name: str, thing: str | None) -> str:
-    """The name of a task class with another object: ``CatchUnderarm-block``; of a file without ``.xml``."""
+    """Return the name of a task class with another object: ``CatchUnderarm-block``; for a file without ``.xml``."""
     # Names of the shelf are taken in any case, and written in one.
     if thing is None:
         return name
@@ -33,14 +33,14 @@ def name_with_object(name: str, thing: str | None) -> str:
 
 
 def name_without_object(name: str) -> str:
-    """The task class of a name that ``name_with_object`` made."""
+    """Return the task class of a name that ``name_with_object`` made."""
     return name.partition("-")[0]
 
 
 def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
-    """A class of the user's own, ``package.module:Class``, and its module; ``role`` is for messages, e.g. ``--algo``.
+    """Import a class of the user's own, ``package.module:Class``; return it and its module.
 
-    Raises BidexError where there is no such module or class, or its import raises.
+    ``role`` is for messages, e.g. ``--algo``. Raises BidexError if module or class do not exist, or the import raises.
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
@@ -68,7 +68,7 @@ def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
 
 
 def own_fault(error: BaseException) -> str | None:
-    """Message and location of an error that was raised in a class of the user's own or below it; None for any other."""
+    """Return message and location of an error that was raised in a class of the user's own or below it, else None."""
     at = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError):
         at.append((error.filename or "", error.lineno))

@@ -12,9 +12,9 @@ _WIDTHS = (40, 1000)  # columns that tables and help texts can be laid out in
 
 
 def open_missing() -> None:
-    """Opens the null device for each standard stream that this process was started without (``2>&-``).
+    """Open the null device for each standard stream that this process was started without (``2>&-``).
 
-    The next file that is opened would get its number, and a library's messages would be written into a checkpoint.
+    Otherwise the next opened file would get its number, and a library's messages would be written into a checkpoint.
     """
     for number in range(3):
         try:
@@ -37,9 +37,9 @@ def print_anything() -> None:
 
 
 def bound_width() -> None:
-    """Set COLUMNS to a width that text can be laid out in, where it or the terminal is of another one.
+    """Set COLUMNS to a usable width if COLUMNS or the terminal has a width outside 40 to 1,000 columns.
 
-    Every library that wraps lines reads COLUMNS first; of one column the help of ``run`` would take minutes.
+    Every library that wraps lines reads COLUMNS first. With one column the help of ``run`` would take minutes.
     """
     width = shutil.get_terminal_size().columns
     bounded = min(max(width, _WIDTHS[0]), _WIDTHS[1])
@@ -48,14 +48,14 @@ def bound_width() -> None:
 
 
 def output_width(unknown: int) -> int:
-    """Return the columns of what stdout is printed on: COLUMNS, else the terminal's, else ``unknown``."""
+    """Return the width of stdout in columns: COLUMNS, else the terminal's, else ``unknown``."""
     if "COLUMNS" in os.environ or sys.stdout.isatty():
         return shutil.get_terminal_size().columns
     return unknown
 
 
 def silence(stream: IO[str]) -> None:
-    """Sends later output, and what could not be written before, to the null device."""
+    """Send later output, and output that could not be written before, to the null device."""
     with contextlib.suppress(OSError, ValueError):  # a stream within Python has no number
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -63,7 +63,7 @@ def silence(stream: IO[str]) -> None:
 
 
 def unread(stream: IO[str]) -> bool:
-    """Whether a stream's reader has ended (``| head``)."""
+    """Return whether a stream's reader has ended (``| head``)."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # Windows has no poll
         poll = select.poll()
         poll.register(stream.fileno(), 0)

@@ -6,6 +6,7 @@ the field, what was expected and the value.
 
 import dataclasses
 import functools
+import itertools
 import math
 import operator
 import re
@@ -59,8 +60,8 @@ class Checked:
 def check_fields(settings: object, name: str, as_flags: bool = False, unresolved: Collection[str] = ()) -> None:
     """Raise BidexError for the first field of a dataclass's instance that does not fit its annotation.
 
-    Fields whose annotation is no plain type (a path, a function) are left alone. ``name`` is the instance in messages,
-    which name the field as a flag of the command line if ``as_flags``. Fields named in ``unresolved`` may be None.
+    Fields whose annotation is no plain type (a path, a function) are not checked. Messages call the instance ``name``;
+    with ``as_flags`` they name the field as a flag of the command line. Fields in ``unresolved`` may be None.
     """
     for field, hint in _hints(type(settings)).items():
         value = getattr(settings, field)
@@ -77,7 +78,7 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
 
 
 def check_rising(settings: object, name: str, *fields: str) -> None:
-    """Raises BidexError for the first pair of numbers that falls."""
+    """Raise BidexError for the first pair of numbers that falls."""
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -85,10 +86,10 @@ def check_rising(settings: object, name: str, *fields: str) -> None:
 
 
 def parse(content: object, kind: type[Kind], where: str, exact: bool = False) -> Kind:
-    """The content of a file (JSON's or TOML's) as an instance of a dataclass or another type.
+    """Return the content of a file (JSON or TOML) as an instance of a dataclass or another type.
 
-    Raises BidexError for the first entry that does not fit, with ``exact`` also for unknown names; ``where`` is the
-    file and the place in it.
+    Raises BidexError for the first entry that does not fit, with ``exact`` also for unknown names. ``where`` is the
+    file and the location in it.
     """
     try:
         if exact:
@@ -99,9 +100,9 @@ def parse(content: object, kind: type[Kind], where: str, exact: bool = False) ->
 
 
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
-    """An argument as a whole number within bounds, of whatever integer type.
+    """Return an argument of any integer type as an int within bounds.
 
-    Raises BidexError for no whole number (1.0, True and "1" are none), or one out of bounds.
+    Raises BidexError if it is no whole number (1.0, True and "1" are none), or out of bounds.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -117,16 +118,16 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
 
 
 def true_or_false(name: str, value: object) -> bool:
-    """An argument as a truth value, Python's or NumPy's; raises BidexError for any other value."""
+    """Return a truth value, Python's or NumPy's, as a bool; raises BidexError for any other value."""
     if not isinstance(value, bool | np.bool_):
         raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
     return bool(value)
 
 
 def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
-    """An argument as an array of float64 numbers, a copy, whatever type they had.
+    """Return an argument as an array of float64 numbers, always a copy.
 
-    Raises BidexError where it is no array of real numbers of so many dimensions.
+    Raises BidexError unless it is an array of real numbers with this number of dimensions.
     """
     try:
         array = np.asarray(value)
@@ -145,7 +146,7 @@ def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
 
 @functools.cache
 def _hints(kind: type) -> dict[str, object]:
-    """The annotations of a dataclass's fields that msgspec can check."""
+    """Return the annotations of a dataclass's fields that msgspec can check."""
     hints = get_type_hints(kind, include_extras=True)
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if _plain(hints[f.name])}
 
@@ -161,7 +162,7 @@ def _plain(hint: object) -> bool:
 
 
 def _refuse_unknown(content: object, kind: object, where: str, place: str = "") -> None:
-    """Raises BidexError for names in tables that no field of their dataclass has, with the nearest one."""
+    """Raise BidexError for the first name in a table that is no field of its dataclass, with the nearest field."""
     if get_origin(kind) is Annotated:
         _refuse_unknown(content, get_args(kind)[0], where, place)
     elif dataclasses.is_dataclass(kind) and isinstance(content, dict):
@@ -188,7 +189,7 @@ def _refuse_unknown(content: object, kind: object, where: str, place: str = "") 
 
 
 def _message(error: msgspec.ValidationError, content: object, kind: object, field: str = "") -> str:
-    """Msgspec's complaint as ``place: expected ..., got ....``."""
+    """Rewrite msgspec's complaint as ``place: expected ..., got ....``."""
     complaint, _, path = str(error).rpartition(" - at `$") if " - at `$" in str(error) else (str(error), "", "")
     path = path.rstrip("`")
     place = (field + path).removeprefix(".")
@@ -220,10 +221,11 @@ _WORDS |= {"true or false": "bool"}
 
 
 def _choices(hint: object) -> list[object]:
-    """All values that literals within an annotation allow."""
+    """Return all values that literals within an annotation allow."""
     if get_origin(hint) is Literal:
         return list(get_args(hint))
-    return [value for part in get_args(hint) if not isinstance(part, Meta) for value in _choices(part)]
+    parts = [part for part in get_args(hint) if not isinstance(part, Meta)]
+    return list(itertools.chain.from_iterable(map(_choices, parts)))
 
 
 # A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.
@@ -231,7 +233,7 @@ _STEP = re.compile(r"\.([^.\[]+)|\[([^\]]*)\]")
 
 
 def _at(content: object, path: str) -> object:
-    """The value at a path; MISSING where that cannot be said."""
+    """Return the value at a path, or MISSING if the path does not say which."""
     try:
         for name, number in _STEP.findall(path):
             content = content[name] if name else content[int(number)]  # type: ignore[index]
@@ -241,7 +243,7 @@ def _at(content: object, path: str) -> object:
 
 
 def _annotation_at(kind: object, path: str) -> object:
-    """The annotation of the value at a path."""
+    """Return the annotation of the value at a path."""
     for name, _ in _STEP.findall(path):
         parts = [kind]
         while parts and name and not (dataclasses.is_dataclass(parts[0]) or is_typeddict(parts[0])):

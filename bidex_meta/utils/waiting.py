@@ -1,6 +1,7 @@
 """Signs of life of a command: a line on stderr whenever it has printed none for a while.
 
-``watched`` keeps a thread that looks at the clock; whatever takes long notes what it is at. Nothing is printed outside.
+``watched`` keeps a thread that looks at the clock; slow code notes its activity. Nothing is printed outside a
+``watched`` block.
 """
 
 import contextlib
@@ -16,7 +17,7 @@ _SECONDS = 14.0
 
 
 class _Watch:
-    """What the command is at, since when, and when its last line was printed."""
+    """The command's activity, its begin, and the time of the last printed line."""
 
     def __init__(self, what: str, clock: Callable[[], float]):
         self.clock = clock
@@ -41,7 +42,7 @@ _watch: _Watch | None = None
 
 
 def note(what: str, detail: str = "") -> None:
-    """Say what the command is at, for the next sign of life; nothing (``""``) stops them until the next note."""
+    """Note the command's current activity for the next sign of life; ``""`` stops the signs until the next note."""
     if _watch is None:
         return
     if what != _watch.what:

@@ -16,25 +16,27 @@ _SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
-    """Geoms that a viewer shows, without planes."""
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if model.geom_group[geom] < _SHOWN_GROUPS
-        and model.geom_type[geom] != _TYPE.mjGEOM_PLANE
-        and colour(model, geom)[3] > 0.0
-    ]
+    """Return the geoms that a viewer shows, without planes."""
+    geoms = []
+    for geom in range(model.ngeom):
+        in_shown_group = model.geom_group[geom] < _SHOWN_GROUPS
+        if in_shown_group and model.geom_type[geom] != _TYPE.mjGEOM_PLANE and colour(model, geom)[3] > 0.0:
+            geoms.append(geom)
+    return geoms
 
 
 def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
-    """Red, green, blue, alpha in [0, 1]: the geom's, or its material's."""
+    """Return red, green, blue, alpha in [0, 1] of a geom, or of its material."""
     material = int(model.geom_matid[geom])
     red, green, blue, alpha = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).tolist()
     return red, green, blue, alpha
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom; BidexError for height fields."""
+    """Return points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
+
+    Raises BidexError for kinds that the browser cannot show, e.g. height fields.
+    """
     make = import_module("trimesh.creation")  # of viser's packages
     kind = model.geom_type[geom]
     size = model.geom_size[geom]
@@ -95,11 +97,11 @@ class Browser:
             gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))
 
     def is_open(self) -> bool:
-        """Until it is interrupted."""
+        """Return True: the view is open until it is interrupted."""
         return True
 
     def obey(self, stage: Stage) -> None:
-        """The controls."""
+        """Apply the state of the controls to the stage."""
         self.paused = bool(self._pause.value)
         self.speed = float(self._pace.value)
         stage.tour = bool(self._tour.value)
@@ -109,7 +111,10 @@ class Browser:
             self._tour.value = False
             self.show(stage)
         while self._asked:
-            stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
+            if self._asked.pop(0) == "Another episode":
+                stage.restart()
+            else:
+                stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
         scene = self._server.scene
@@ -139,7 +144,7 @@ class Browser:
             client.camera.look_at = camera.look_at
 
     def show(self, stage: Stage) -> None:
-        """Poses of all shapes and goals, and the status."""
+        """Show the poses of all shapes and goals, and the status."""
         if stage.names[stage.row] != self._chosen:
             self._set_the_scene(stage)
         data = stage.data()
@@ -156,16 +161,15 @@ class Browser:
     def _show_ghosts(self, stage: Stage) -> None:
         ghosts = stage.ghosts()
         if len(ghosts) != len(self._ghosts):
-            self._ghosts = [
-                self._server.scene.add_icosphere(
-                    f"/goals/{i}", radius=1.0, scale=ghost.size, color=ghost.colour, opacity=GHOST_ALPHA, subdivisions=3
-                )
-                for i, ghost in enumerate(ghosts)
-            ]
+            self._ghosts = []
+            for i, ghost in enumerate(ghosts):
+                look = {"scale": ghost.size, "color": ghost.colour, "opacity": GHOST_ALPHA}
+                handle = self._server.scene.add_icosphere(f"/goals/{i}", radius=1.0, subdivisions=3, **look)
+                self._ghosts.append(handle)
         for handle, ghost in zip(self._ghosts, ghosts, strict=True):
             handle.position = ghost.position
             handle.wxyz = ghost.quaternion
 
     def close(self) -> None:
-        """Stops the server."""
+        """Stop the server."""
         self._server.stop()

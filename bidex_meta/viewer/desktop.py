@@ -20,7 +20,7 @@ class Desktop:
     """A ``Screen`` as a window; its keys are ``KEYS``."""
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
-        """Opens the window, or raises BidexError."""
+        """Open the window, or raise BidexError."""
         self.paused = False
         self.speed = speed
         self._asked: list[int] = []
@@ -50,11 +50,11 @@ class Desktop:
             camera.azimuth, camera.elevation = angle
 
     def is_open(self) -> bool:
-        """Until the window is closed."""
+        """Return whether the window is open."""
         return self._viewer.is_running()
 
     def obey(self, stage: Stage) -> None:
-        """The keys."""
+        """Apply the pressed keys to the stage."""
         while self._asked:
             key = self._asked.pop(0)
             if key == _SPACE:
@@ -67,7 +67,7 @@ class Desktop:
                 self.speed = min(4.0, max(1.0 / 16.0, self.speed * (2.0 if key == _EQUAL else 0.5)))
 
     def show(self, stage: Stage) -> None:
-        """State, goals and status; of another class in a window of its own."""
+        """Show state, goals and status; open a new window for another class."""
         if stage.row != self._row:
             self._viewer.close()
             self._open(stage)
@@ -86,5 +86,5 @@ class Desktop:
         self._viewer.sync()
 
     def close(self) -> None:
-        """Closes the window."""
+        """Close the window."""
         self._viewer.close()

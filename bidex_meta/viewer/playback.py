@@ -14,9 +14,9 @@ from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 
 
 class Stage:
-    """Episodes in all environments of a world in mode DISABLED, one a slot.
+    """Episodes in all environments of a world in mode DISABLED, one environment per slot.
 
-    ``row``, which may be set, is shown; on a ``tour`` the next one after each of its episodes.
+    The environment ``row`` is shown; it may be set. On a ``tour`` the next environment follows after each episode.
     """
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0, tour: bool = False) -> None:
@@ -45,7 +45,7 @@ class Stage:
 
     @torch.no_grad()
     def step(self) -> None:
-        """One control step of all environments; those whose episodes ended begin the next."""
+        """Take one control step in all environments; those whose episodes ended begin the next."""
         self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
@@ -61,7 +61,7 @@ class Stage:
             self._restart(ended)
 
     def restart(self) -> None:
-        """The shown environment begins another episode; the unfinished one does not count."""
+        """Begin another episode in the shown environment; the unfinished one does not count."""
         mask = torch.zeros(len(self.names), dtype=torch.bool, device=self._obs.device)
         mask[self.row] = True
         self._restart(mask)
@@ -71,34 +71,34 @@ class Stage:
         self._start(mask)
 
     def next_task(self) -> None:
-        """Each class goes on to the next task of its pool."""
+        """Move each class on to the next task of its pool."""
         pools = zip(self._world.task_names, self._world.pools, strict=True)
         self._world.set_tasks({name: np.roll(pool, -1, axis=0) for name, pool in pools})
         self._seed += 1
         self._begin()
 
     def model(self) -> mujoco.MjModel:
-        """The model that shows the environment: its bodies and joints, hands with their looks."""
+        """Return the model that shows the environment: its bodies and joints, hands with their looks."""
         return simulation(self._world, self.row)[2].dressed
 
     def data(self) -> mujoco.MjData:
-        """Its present pose, in that model."""
+        """Return the environment's present pose in that model."""
         engine, row, scene = simulation(self._world, self.row)
         data = mujoco.MjData(scene.dressed)
         pose(scene.dressed, data, engine.placement()[row])
         return data
 
     def ghosts(self) -> list[DrawnGhost]:
-        """Its goals; none in a world that hides them."""
+        """Return the environment's goals; none in a world that hides them."""
         return ghosts(self._world, self.row)
 
     def camera(self) -> tuple[tuple[float, float, float], float, tuple[float, float]]:
-        """The camera's target, world, metres, its distance from it, azimuth and elevation, degrees."""
+        """Return the camera's target (world, metres), its distance (metres), azimuth and elevation (degrees)."""
         task = self._world.slots[int(self._world.task_id[self.row])].task_class
         return task.camera_target, task.camera_distance, task.camera_angle
 
     def status(self) -> dict[str, str]:
-        """Labels and values to show beside it."""
+        """Return labels and values to show beside the environment."""
         row = self.row
         most = int(self._world.max_episode_steps[row])
         return {
@@ -121,21 +121,21 @@ class Screen(Protocol):
     speed: float
 
     def is_open(self) -> bool:
-        """Whether it has not been closed."""
+        """Return whether the viewer is open."""
         ...
 
     def obey(self, stage: Stage) -> None:
-        """Applies the user's requests since the last call to the stage."""
+        """Apply the user's requests since the last call to the stage."""
 
     def show(self, stage: Stage) -> None:
-        """Shows its present state."""
+        """Show the stage's present state."""
 
     def close(self) -> None:
-        """Ends the view."""
+        """End the view."""
 
 
 def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
-    """Plays until the viewer is closed, or for so many seconds, in real time or slower."""
+    """Play until the viewer is closed, or for ``seconds``, in real time or slower."""
     began = shown = due = time.monotonic()
     screen.show(stage)
     try:

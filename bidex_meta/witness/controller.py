@@ -1,7 +1,7 @@
 """Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script is a generator: for each control step it yields where the hands shall go (:class:`Lead`), and reads the state
-in which that is taken. :class:`HandActions` makes the actions of many environments at once.
+A script is a generator: in each control step it reads the state and yields targets for the hands (:class:`Lead`).
+:class:`HandActions` computes the actions of many environments together.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, quaternion_product, rotate, xyzw
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
@@ -23,11 +23,11 @@ _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2")
 _MIDDLES = ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
-_Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
+_Quaternion = tuple[float, float, float, float]  # (w, x, y, z)
 
 
 class Lead(NamedTuple):
-    """What a script asks for in a control step; pairs are of the right and the left hand."""
+    """Targets of a script in a control step; pairs are of the right and the left hand."""
 
     points: tuple[Point, Point]  # where the hands' points shall go, world, metres
     speed: float  # at most, m/s
@@ -40,18 +40,18 @@ Actions = Iterator[Lead]
 
 
 def beside(point: Tensor, x: float, y: float, height: float) -> Point:
-    """A point beside another, at a height above the floor, metres."""
+    """Return a point beside another one, at a height above the floor, metres."""
     return float(point[0]) + x, float(point[1]) + y, height
 
 
 def point(position: Tensor) -> Point:
-    """A position (3,) as three numbers, metres."""
+    """Return a position (3,) as three numbers, metres."""
     x, y, z = position.tolist()
     return x, y, z
 
 
 def rest_action(size: int) -> Tensor:
-    """The action (size,) of zero joint angles and no force on the bases."""
+    """Return the action (size,) of zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
     one = torch.zeros(size // 2)
     one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
@@ -59,10 +59,10 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Leads both hands of an environment of a class to points, by the state that it reads.
+    """Leads both hands of an environment of a class to points, from the state that it reads.
 
-    ``sensor`` gives a sensor's present values by its name, (k,) in double precision, ``frozen`` a frozen number of the
-    task, (k,).
+    ``sensor`` returns a sensor's present values by its name, (k,) in double precision. ``frozen`` returns a frozen
+    number of the task, (k,).
     """
 
     def __init__(self, task: TaskClass, sensor: Callable[[str], Tensor], frozen: Callable[[str], Tensor]):
@@ -72,43 +72,46 @@ class HandController:
         self.taken = 0
         self.wide = task.rules.wide  # whether a task asks for more than version 1's
         self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
-        self._first = {side: _numbers(xyzw(self.where(f"{side}/mount_quaternion"))) for side in SIDES}
+        self._first = {side: _numbers(self.where(f"{side}/mount_quaternion")) for side in SIDES}
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
 
     def orientation(self, sensor: str) -> Tensor:
-        """A sensor's quaternion, (x, y, z, w), (4,)."""
+        """Return a sensor's quaternion, (x, y, z, w), (4,)."""
         value = self.where(sensor)
         return xyzw(value / value.norm())
 
     @property
     def steps_left(self) -> int:
-        """Control steps to the end of the episode."""
+        """Return the control steps to the end of the episode."""
         return self.episode_steps - self.taken
 
     def at(self, side: str) -> Tensor:
-        """Position of a hand's point, metres, (3,)."""
+        """Return the position of a hand's point, metres, (3,)."""
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
-        """Bends the four fingers of a hand, and sets other joints by their names (the rest to 0), rad."""
+        """Bend the four fingers of a hand, and set other joints by their names (the rest to 0), rad."""
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
-    def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
-        """From now on holds a hand's start orientation, turned about the world's axes, rad; a free hand may turn."""
-        w, x, y, z = quaternion_from_rpy((roll, pitch, yaw))
-        self._held[side] = _product((x, y, z, w), self._first[side])
+    def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
+        """Hold a hand's start orientation, turned about the world's axes, rad, from now on.
+
+        A hand that no script holds may turn.
+        """
+        self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
     def turn(self, side: str, way: Tensor) -> None:
-        """Turns a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
+        """Turn a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
         x, y, z = way.tolist()
         angle = math.sqrt(x * x + y * y + z * z)
         sine = math.sin(0.5 * angle) / (angle + 1e-9)
-        turn = sine * x, sine * y, sine * z, math.cos(0.5 * angle)
-        self._held[side] = _product(turn, _numbers(self.orientation(f"{side}/mount_quaternion")))
+        turn = math.cos(0.5 * angle), sine * x, sine * y, sine * z
+        now = self.where(f"{side}/mount_quaternion")
+        self._held[side] = quaternion_product(turn, _numbers(now / now.norm()))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Moves the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
+        """Move the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
         a, b = SIDES
         for _ in range(min(steps, self.steps_left)):
             self.taken += 1
@@ -117,26 +120,24 @@ class HandController:
             yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
-        """``lead`` for a step, to the right and the left hand's point."""
+        """Lead the hands for one step, to the points of the right and the left hand."""
         right, left = points
         yield from self.lead(right, left, 1, speed)
 
 
 class HandActions:
-    """The actions of environments of a class whose hands are led."""
+    """Computes the actions of environments of a class whose hands are led."""
 
     def __init__(self, task: TaskClass):
         self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
         self._full_torque = TORQUE_PER_SCALE * task.orientation_scale
 
     def __call__(self, leads: Sequence[Lead], sensor: Callable[[str], Tensor]) -> Tensor:
-        """Actions (n, action_size) of n environments, whose values of a sensor are (n, k), in double precision."""
-        at, now = (
-            torch.stack([sensor(f"{side}/{name}") for side in SIDES], 1)
-            for name in ("hand_point_position", "mount_quaternion")
-        )
+        """Return actions (n, action_size) of n environments; ``sensor`` returns values (n, k), in double precision."""
+        at = torch.stack([sensor(f"{side}/hand_point_position") for side in SIDES], 1)
+        now = torch.stack([sensor(f"{side}/mount_quaternion") for side in SIDES], 1)
         goals = at.new_tensor([lead.points for lead in leads])
-        held = at.new_tensor([lead.held for lead in leads])
+        held = xyzw(at.new_tensor([lead.held for lead in leads]))
         speed = at.new_tensor([lead.speed for lead in leads])[:, None, None]
         way = GAIN * (goals - at)
         way *= (speed / (way.norm(dim=-1, keepdim=True) + 1e-9)).clamp_max(1.0)
@@ -145,7 +146,10 @@ class HandActions:
         return quantised(torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1))
 
     def _torque(self, held: Tensor, now: Tensor) -> Tensor:
-        """The actions (n, 2, 3) that turn hands to where they are held, from ``now``, (w, x, y, z); zeros if free."""
+        """Return the actions (n, 2, 3) that turn hands to the orientations ``held``, zeros for a free hand.
+
+        ``now`` are their present orientations, (w, x, y, z).
+        """
         now = xyzw(now / now.norm(dim=-1, keepdim=True))
         error = multiply(held, conjugate(now))
         way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rad, for small angles
@@ -154,31 +158,19 @@ class HandActions:
 
 
 def _numbers(quaternion: Tensor) -> _Quaternion:
-    x, y, z, w = quaternion.tolist()
-    return x, y, z, w
-
-
-def _product(a: _Quaternion, b: _Quaternion) -> _Quaternion:
-    """As ``multiply``, of plain numbers: an operation on a tensor takes fifty times as long."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    w, x, y, z = quaternion.tolist()
+    return w, x, y, z
 
 
 @cache
 def _joints() -> tuple[dict[str, int], np.ndarray, np.ndarray]:
-    """The place of each actuated joint by its name, and the bounds of their targets, rad, float32."""
+    """Return the index of each actuated joint by its name, and the bounds of their targets, rad, float32."""
     low, high = (np.asarray(x, np.float32) for x in (hand().control_low, hand().control_high))
     return {hand().joints[joint]: i for i, joint in enumerate(hand().actuated)}, low, high
 
 
 def _joint_actions(angles: Iterable[tuple[str, float]]) -> np.ndarray:
-    """The actions (20,) of joint angles by name, rad, the others 0."""
+    """Return the actions (20,) of joint angles by name, rad, the others 0."""
     places, low, high = _joints()
     all_angles = np.zeros_like(low)
     for joint, angle in angles:

@@ -17,31 +17,7 @@ from bidex_meta.world.part import Part, base_rotations
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
-class ActionSequences:
-    """Plays ``sequences`` (n, steps, action), ``which`` of them in each environment, and repeats the last action."""
-
-    def __init__(self, sequences: Tensor, which: Tensor):
-        self._sequences = sequences
-        self._which = which
-        self._step = torch.zeros_like(which)
-
-    def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
-        action = self._sequences[self._which, self._step.clamp_max(self._sequences.shape[1] - 1)]
-        self._step += 1
-        return action
-
-    def reset(self, env_mask: Tensor) -> None:
-        """These environments begin again."""
-        self._step[env_mask] = 0
-
-    def _store(self, sequence: int, actions: Tensor) -> None:
-        """Puts actions (T, a) into the first columns of a sequence, and repeats the last one to its end."""
-        into = self._sequences[sequence]
-        into[:, : actions.shape[1]] = actions[torch.arange(len(into)).clamp_max(len(actions) - 1)]
-
-
-class OpenLoopReplay(ActionSequences):
+class OpenLoopReplay:
     """Plays the witness of each environment's class, without observations; a class without one gets zero actions.
 
     ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, ``actions`` the size
@@ -52,30 +28,39 @@ class OpenLoopReplay(ActionSequences):
         self, witnesses: Mapping[str, Witness], task_names: Sequence[str], task_id: Tensor, actions: int,
         noise: float = 0.0, seed: int = 0
     ):  # fmt: skip
-        longest = max((len(each.actions) for each in witnesses.values()), default=1)
-        super().__init__(torch.zeros(len(task_names), longest, actions, device=task_id.device), task_id)
+        longest = max((len(witness.actions) for witness in witnesses.values()), default=1)
+        self._sequences = torch.zeros(len(task_names), longest, actions, device=task_id.device)
         for slot, name in enumerate(task_names):
             if name in witnesses:
-                self._store(slot, torch.from_numpy(witnesses[name].actions))
+                recorded = torch.from_numpy(witnesses[name].actions)
+                steps = torch.arange(longest).clamp_max(len(recorded) - 1)  # repeats the last action
+                self._sequences[slot, :, : recorded.shape[1]] = recorded[steps]
+        self._task_id = task_id
+        self._step = torch.zeros_like(task_id)
         self._noise = noise
         self._generator = torch.Generator(task_id.device).manual_seed(seed)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
-        action = super().eval_action(obs)
+        """Return the next actions (num_envs, action)."""
+        action = self._sequences[self._task_id, self._step.clamp_max(self._sequences.shape[1] - 1)]
+        self._step += 1
         if self._noise:
             noise = torch.randn(action.shape, generator=self._generator, device=action.device)
             action = (action + self._noise * noise).clamp(-1.0, 1.0)
         return action
 
+    def reset(self, env_mask: Tensor) -> None:
+        """Restart the sequences of the environments of a mask."""
+        self._step[env_mask] = 0
+
 
 class Scripted:
-    """Plays the scripts of a world's classes, each row's from the state that it is in.
+    """Plays the scripts of a world's classes, in each environment from its present state.
 
-    ``world`` is on C MuJoCo and has moving bases; ``names``: of the slots that play, None for all, others get zero
-    actions. A script begins with its row's episode, and reacts to whatever moved the hands: noise (of this standard
-    deviation), or another policy's actions. After its end it repeats its last action. ``misled``: each row's is given
-    the next task of its pool, as one that has to guess. Raises BidexError for a class without a script.
+    ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots that play (None: all); other slots get zero
+    actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise`` (a
+    standard deviation) or another policy's actions. After its end it repeats its last action. With ``misled`` each
+    script is given the next task of its pool, as if it had to guess. Raises BidexError for a class without a script.
     """
 
     def __init__(
@@ -87,16 +72,15 @@ class Scripted:
         self._generator = torch.Generator().manual_seed(seed)
         if names is None:
             names = world.task_names
-        self._classes = [
-            _Class(world, part, k, member, int(misled))
-            for part in world.parts
-            for k, member in enumerate(part.group.members)
-            if world.slots[member.slot].name in names
-        ]
+        self._classes: list[_Class] = []
+        for part in world.parts:
+            for number, member in enumerate(part.group.members):
+                if world.slots[member.slot].name in names:
+                    self._classes.append(_Class(world, part, number, member, int(misled)))
         self._actions = torch.zeros(world.num_envs, world.action_size)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions (num_envs, action)."""
+        """Return the next actions (num_envs, action)."""
         for each in self._classes:
             each.write(self._actions)
         if not self._noise:
@@ -105,13 +89,13 @@ class Scripted:
         return (self._actions + self._noise * noise).clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """These environments are at the start of an episode."""
+        """Restart the scripts of the environments of a mask, which are at the start of an episode."""
         for each in self._classes:
             each.begin(env_mask)
 
 
 class _Class:
-    """The scripts of a class's environments, which are led together."""
+    """The scripts of a class's environments, whose actions are computed together."""
 
     def __init__(self, world: World, part: Part, number: int, member: Member, ahead: int):
         task = world.slots[member.slot].task_class
@@ -128,7 +112,7 @@ class _Class:
         self._sensors = part.group.engine.sensordata[member.engine_rows]
 
     def write(self, actions: Tensor) -> None:
-        """Puts the next actions of scripts that have not ended into those (N, a) of the world."""
+        """Write the next actions of scripts that have not ended into the world's actions (N, a)."""
         self._sensors = self._part.group.engine.sensordata[self._member.engine_rows].clone()
         leads = {row: lead for row, script in self._playing.items() if (lead := next(script, None)) is not None}
         if leads:
@@ -138,12 +122,12 @@ class _Class:
             actions[self._member.env_ids][rows, : found.shape[1]] = found
 
     def begin(self, env_mask: Tensor) -> None:
-        """A new script in the environments of the class among a mask (N,)."""
+        """Begin a new script in the class's environments among a mask (N,)."""
         for row in env_mask[self._member.env_ids].nonzero().flatten().tolist():
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
-        """The script of a row; reads nothing before its first action is asked for."""
+        """Play the script of an environment; nothing is read before its first action is requested."""
         place = self._member.env_ids.start + row
         given = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
         frozen = self._part.frozen(self._number, given)
@@ -164,7 +148,7 @@ class ShiftedStarts(PooledWorldWrapper):
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes of all environments, shifted by the seed; raises BidexError for options."""
+        """Start episodes of all environments, shifted by the seed; raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
-from bidex_meta.suite import plain_name
+from bidex_meta.rules import plain_name
 from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig
@@ -35,9 +35,9 @@ class Trace:
 
 
 def task_slot(name: str) -> Slot:
-    """The slot of a class with the one task that witnesses are about; raises BidexError for another class.
+    """Return the slot of a class with the one task of the witnesses; raises BidexError for an unknown class.
 
-    ``DoorOpenInward-v2`` has the rules of version 2, and a task of them.
+    ``DoorOpenInward-v2`` has the rules of version 2, and a task drawn by them.
     """
     plain = plain_name(name)
     benchmark = Benchmark(SUITE if plain == name else f"{SUITE}-v2", seed=SEED)
@@ -65,7 +65,10 @@ class Simulator:
         self._engine.reset(self._everyone, self._start.expand(num, -1))
 
     def starts(self, shifted: int, seed: int = SEED) -> list[State]:
-        """The start state, and so many with every object or fixture shifted by 0.1 mm in the plane."""
+        """Return the start state, followed by ``shifted`` shifted ones.
+
+        In a shifted start every object or fixture is moved by 0.1 mm in the plane.
+        """
         generator = torch.Generator().manual_seed(seed)
         places = self._part.group.members[0].scene.qpos
         objects = [where for part, where in places.items() if "/" not in part]
@@ -80,17 +83,17 @@ class Simulator:
         return states
 
     def save(self, row: int) -> State:
-        """The state of an environment, copied."""
+        """Return the state of an environment, copied."""
         return {name: value[row].clone() for name, value in self._engine.state_dict().items()}
 
     def load(self, states: list[State]) -> None:
-        """Puts equal consecutive shares of the environments into these states, whose number must divide theirs."""
+        """Set equal consecutive shares of the environments to these states; their number must divide ``num``."""
         stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
         share = self.num // len(states)
         self._engine.load_state_dict({name: each.repeat_interleave(share, dim=0) for name, each in stacked.items()})
 
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
-        """Plays actions (T, N, action_size) in [-1, 1] from the present state, with a callback after each step."""
+        """Play actions (T, N, action_size) in [-1, 1] from the present state, with a callback after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
         rewards = []
         least = []
@@ -110,7 +113,10 @@ class Simulator:
         return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
 
     def led(self, script: Callable[[HandController], Actions]) -> Iterator[tuple[Tensor, Trace]]:
-        """Plays a script by the means of sensors over all environments; yields its actions (action_size,) and steps."""
+        """Play a script on the mean sensor values over all environments.
+
+        Yields the actions (action_size,) and the trace of each step.
+        """
         hands = HandController(self.task, lambda name: self.sensor(name).mean(0), lambda name: self.frozen(name)[0])
         actions = HandActions(self.task)
         for lead in script(hands):
@@ -118,23 +124,23 @@ class Simulator:
             yield action, self.play(action.expand(1, self.num, -1))
 
     def sensor(self, name: str) -> Tensor:
-        """A sensor's values, (N, k), a copy."""
+        """Return a sensor's values, (N, k), a copy."""
         return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
 
     def frozen(self, name: str) -> Tensor:
-        """A frozen number of the task, (N, k)."""
+        """Return a frozen number of the task, (N, k)."""
         return self._part.frozen(0, self._world.task_index)[name]
 
     def contact_depth(self, row: int) -> float:
-        """Deepest penetration among an environment's contacts, metres."""
+        """Return the deepest penetration among an environment's contacts, metres."""
         return self._engine.contact_depth(row)
 
     def picture(self, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
-        """Picture of the first environment, (height, width, 3) uint8."""
+        """Draw the first environment, (height, width, 3) uint8."""
         return self._world.render(env_id=0, width=width, height=height, camera=camera)
 
     def close(self) -> None:
-        """Ends the engine."""
+        """End the engine."""
         self._world.close()
 
 
@@ -149,19 +155,22 @@ class Replay:
 
     @property
     def deepest(self) -> float:
-        """Deepest contact from the unshifted start, metres: small unless something was passed through."""
+        """Return the deepest contact from the unshifted start, metres: small unless something was passed through."""
         return float(self.depths[:, 0].max())
 
     @property
     def found(self) -> bool:
-        """Whether this counts as a witness: it succeeds, and so do eight of ten shifted starts."""
+        """Return whether this counts as a witness: it succeeds, and so do eight of ten shifted starts."""
         return self.first_success is not None and self.succeeded >= 8
 
 
 def frames(
     name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
 ) -> Iterator[np.ndarray]:
-    """Pictures (height, width, 3) uint8 of a witness after these numbers of steps, from 0 on; None: after each."""
+    """Yield pictures (height, width, 3) uint8 of a witness.
+
+    ``at`` lists the numbers of steps after which to draw, from 0 on; None: after each.
+    """
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):
         if at is None or played in at:
@@ -172,7 +181,7 @@ def frames(
 
 
 def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
-    """Plays a witness of a class from its start and from ten shifted ones."""
+    """Play a witness of a class from its start and from ten shifted ones."""
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
     actions = torch.from_numpy(witness.actions)[:, None].expand(-1, simulator.num, -1)

@@ -1,4 +1,4 @@
-"""Teachers: policies and scripts that say what they would do in the states of a world, whoever plays there."""
+"""Teachers: policies and scripts that label the states of a world, whoever acts there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,11 +50,11 @@ class Teachers:
 
     @property
     def follow(self) -> bool:
-        """Whether a teacher knows more than the state: it follows each episode from its start, as a script does."""
+        """Return whether a teacher knows more than the state: a script follows each episode from its start."""
         return self._scripted is not None
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
+        """Return the teachers' actions, (N, a) in [-1, 1], for observations (N, d); zeros outside ``known``."""
         if self._scripted is None:
             labels = obs.new_zeros(self._shape)
         else:
@@ -67,7 +67,7 @@ class Teachers:
         return labels
 
     def reset(self, env_mask: Tensor) -> None:
-        """These environments are at the start of an episode."""
+        """Restart the teachers in the environments of a mask, which are at the start of an episode."""
         if self._scripted is not None:
             self._scripted.reset(env_mask)
         for tutor in self._tutors:

@@ -159,7 +159,7 @@ class TaskWorld(VectorWorld, Protocol):
     max_episode_steps: Tensor
     """Time limit of each environment, int64 (N,)."""
     success_at_end: bool
-    """Whether an episode must hold its goal at the end to be a success; else it must meet the goal at any step."""
+    """True if an episode must hold its goal at the end to be a success; else it must meet the goal at any step."""
 
 
 @runtime_checkable

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import HELD_STEPS
+from bidex_meta.rules import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import true_or_false, whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
@@ -29,15 +29,15 @@ class Episodes:
     elapsed: Tensor
     """Control steps since its start."""
     counts: Tensor
-    """Whether it enters statistics (a shortened first episode does not)."""
+    """True if the episode enters statistics (a shortened first episode does not)."""
     finished: Tensor
-    """Whether it has ended and waits for a reset (never in SAME_STEP); its flags are the next two."""
+    """True if the episode has ended and waits for a reset (never in SAME_STEP); its flags are the next two."""
     terminated: Tensor
     truncated: Tensor
     success: Tensor
-    """Whether it was solved at any step."""
+    """True if the episode was solved at any step."""
     held: Tensor
-    """Steps for which it has been solved without a break."""
+    """Steps for which the episode has been solved without a break."""
     reward: Tensor
     unscaled: Tensor
     """Sum of the rewards by the printed formula."""
@@ -71,7 +71,7 @@ class Episodes:
 
     @property
     def solved_at_end(self) -> Tensor:
-        """Whether an episode that ends now is a success at the end, (n,), bool."""
+        """Return whether an episode that ends now is a success at the end, (n,), bool."""
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
@@ -93,7 +93,7 @@ class Episodes:
             setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))
 
 
-def ended_info(info: Info) -> dict[str, Any]:
+def ended_info(info: Info) -> Info:
     """Return Gymnasium's keys for what ended in a step, from the contract's keys; zero outside each mask.
 
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last

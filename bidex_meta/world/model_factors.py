@@ -1,6 +1,6 @@
-"""How the numbers of a scene's model follow from the factors of a randomisation.
+"""The dependence of a scene's model on the factors of a randomisation.
 
-All of them are multiplied by powers of factors, so that nothing is left to ``mj_setConst``, which would cost a step.
+All numbers are multiplied by powers of factors, so that nothing is left to ``mj_setConst``, which would cost a step.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,13 +19,13 @@ Exponents = dict[str, dict[str, Tensor]]
 
 
 def object_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Which bodies are of objects, (nbody,), bool: those behind the hands'."""
+    """Return which bodies belong to objects, (nbody,), bool: those behind the hands'."""
     names = [model.body(i).name for i in range(model.nbody)]
     return np.array([i > 0 and name.partition("/")[0] not in SIDES for i, name in enumerate(names)])
 
 
 def _free(model: mujoco.MjModel) -> np.ndarray:
-    """Which bodies are free objects without joints, (nbody,), bool."""
+    """Return which bodies are free objects without joints, (nbody,), bool."""
     parents = np.isin(np.arange(model.nbody), model.body_parentid)
     free = np.array(
         [n == 1 and model.jnt_type[a] == 0 for n, a in zip(model.body_jntnum, model.body_jntadr, strict=True)]
@@ -34,7 +34,10 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
 
 
 def heights(scene: Scene) -> dict[int, float]:
-    """How far free objects without joints reach below their origin at the start, metres, by qpos column of z."""
+    """Return how far free objects without joints reach below their origin at the start, metres.
+
+    The keys are the ``qpos`` columns of z.
+    """
     model = scene.model
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
@@ -50,7 +53,10 @@ def heights(scene: Scene) -> dict[int, float]:
 
 
 def exponents(scene: Scene, varied: Sequence[str], device: torch.device) -> Exponents:
-    """How the model's fields (n, k) depend on the factors; exponents (n, 1) or (n, k)."""
+    """Return the exponents, (n, 1) or (n, k), by which the model's fields (n, k) depend on the factors.
+
+    Raises BidexError if an object's size varies and the object has a mesh.
+    """
     found: Exponents = {}
     for factor, name, exponent in _laws(scene.model):
         if factor in varied:
@@ -66,7 +72,10 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Factor, field and exponents (n, 1) or (n, k): sizes leave masses, inverse inertias follow both."""
+    """Yield factor, field and exponents (n, 1) or (n, k).
+
+    Sizes leave masses as they are; inverse inertias follow both.
+    """
     objects = object_bodies(model)
     free = _free(model)
     of_object = objects[model.dof_bodyid]
@@ -97,7 +106,7 @@ def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _volumes(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
-    """Which of the bodies' bounding volumes are of some bodies, bool."""
+    """Return which of the bounding volumes belong to some bodies, bool."""
     found = np.zeros(int(model.body_bvhnum.sum()), dtype=bool)
     for body in bodies.nonzero()[0]:
         found[model.body_bvhadr[body] :][: model.body_bvhnum[body]] = True

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple, Protocol
 
 import torch
@@ -84,7 +85,7 @@ class Part:
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
         self.looks = self._engine.device.type == "cpu"
-        """Whether the numbers of the user's own classes are checked in every step; on a GPU that would stall it."""
+        """True if every step checks the numbers of the user's own classes; on a GPU that would stall the step."""
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
@@ -105,10 +106,10 @@ class Part:
         return mounts
 
     def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
-        self._pools = [
-            m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata))
-            for m in self.group.members
-        ]
+        self._pools = []
+        for member in self.group.members:
+            tasks = torch.as_tensor(slots[member.slot].tasks).to(self._engine.sensordata)
+            self._pools.append(member.scene.task.freeze(tasks))
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
         """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
@@ -260,7 +261,7 @@ class PartedWorld(Protocol):
     task_index: Tensor
     observation_size: int
     hides_goals: bool
-    """Whether observations have zeros in place of goals."""
+    """True if observations have zeros in place of goals."""
 
     @property
     def hidden_size(self) -> int:
@@ -339,7 +340,7 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
 
     rotations = base_rotations(parts)
     together([partial(look, part, rotation) for part, rotation in zip(parts, rotations, strict=True)])
-    names = list(dict.fromkeys(name for _, own in found for name in own))
+    names = list(dict.fromkeys(chain.from_iterable(own for _, own in found)))
     terms = dict(zip(names, torch.zeros(len(names), n, device=device), strict=True))
     for env_ids, own in found:
         for name, value in own.items():

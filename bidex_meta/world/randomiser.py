@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.suite import FACTORS, Randomisation
+from bidex_meta.rules import FACTORS, Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP, Layout
 from bidex_meta.world.model_factors import exponents, heights, object_bodies
@@ -46,7 +46,7 @@ class Randomiser:
 
     @property
     def remembered(self) -> int:
-        """How many actions are remembered, the last one among them; 0 without delay."""
+        """Return the number of actions that are remembered, the last one among them; 0 without delay."""
         most = self._rule.action_delay[1]
         return most + 1 if most else 0
 
@@ -134,10 +134,9 @@ class _Models:
         self._rules = [{name: rule[name] for name in self._fields} for rule in rules]
         self._bases = [{n: f[m.engine_rows.start].clone() for n, f in self._fields.items()} for m in members]
         self._first = [int(object_bodies(member.scene.model).argmax()) for member in members]
-        self._masses = [
-            torch.as_tensor(m.scene.model.body_mass[first:], device=engine.device)
-            for m, first in zip(members, self._first, strict=True)
-        ]
+        self._masses = []
+        for member, first in zip(members, self._first, strict=True):
+            self._masses.append(torch.as_tensor(member.scene.model.body_mass[first:], device=engine.device))
         self._heights = [heights(member.scene) for member in members]
 
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:

@@ -1,7 +1,7 @@
 """Pictures of an environment: its scene from a fixed camera, with its goal as a ghost if observations show it."""
 
 import threading
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -49,7 +49,7 @@ class Painter(threading.local):
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int, int], tuple[mujoco.Renderer, mujoco.MjData]] = {}
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type["Painter"], tuple[()]]:
         return Painter, ()
 
     def picture(self, world: "PartedWorld", env_id: int, width: int, height: int, camera: str | None) -> np.ndarray:

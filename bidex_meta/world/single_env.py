@@ -4,9 +4,10 @@ For code that is written so; all environments of a suite at once are `Benchmark.
 """
 
 import copyreg
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import gymnasium
 import numpy as np
@@ -14,7 +15,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, Rules, versioned_name
+from bidex_meta.rules import V1, Rules, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.utils.arguments import checked_arguments
@@ -31,7 +32,7 @@ _FAR = 2**31
 
 
 class AnyTask(Protocol):
-    """What `set_task` needs to know of a task (`bidex_meta.Task`)."""
+    """The part of a task (`bidex_meta.Task`) that `set_task` reads."""
 
     @property
     def env_name(self) -> str:
@@ -67,7 +68,7 @@ class EnvRecipe:
 
     @property
     def env_name(self) -> str:
-        """The name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
+        """Return the name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
@@ -79,8 +80,11 @@ class _Remade(type):
     """Of classes that no module holds: they are pickled as their recipes."""
 
 
-def _reduced(made: Any) -> str | tuple[Any, ...]:
-    return (_make_class, (made.recipe,)) if "recipe" in vars(made) else made.__qualname__  # one of a module's own
+def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
+    recipe = vars(made).get("recipe")
+    if recipe is None:
+        return made.__qualname__  # one of a module's own
+    return _make_class, (recipe,)
 
 
 copyreg.pickle(_Remade, _reduced)
@@ -105,7 +109,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
     recipe: ClassVar[EnvRecipe]
     task_class: ClassVar[TaskClass]
-    """What the class is: scene, variations, observation, reward, success."""
+    """The class: scene, variations, observation, reward, success."""
 
     @checked_arguments
     def __init__(
@@ -129,6 +133,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         recipe = self.recipe
         space = self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
+        points = PointsRule(*recipe.points) if recipe.points[0] else None
         config = WorldConfig(
             num_envs=1,
             engine="c",
@@ -136,7 +141,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             autoreset_mode="DISABLED",
             observation="masked" if recipe.hides_goal else "plain",
             pad_to=recipe.padded_size,
-            points=PointsRule(*recipe.points) if recipe.points[0] else None,
+            points=points,
         )
         self._world = World([slot], config)
         self.observation_space = self._world.single_observation_space
@@ -149,12 +154,12 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @property
     def task_name(self) -> str:
-        """The task class's name with its version, as the class's tasks have it."""
+        """Return the task class's name with its version, as the class's tasks have it."""
         return self.recipe.env_name
 
     @property
     def max_path_length(self) -> int:
-        """Time limit of an episode, steps of 1/60 s."""
+        """Return the time limit of an episode, steps of 1/60 s."""
         return self.task_class.episode_steps
 
     def seed(self, seed: int) -> list[int]:
@@ -249,10 +254,13 @@ def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
 
 def _camera(name: str | None, number: int | None) -> str:
     names = list(CAMERAS)
-    chosen = (names[0] if name is None else name) if number is None else next(iter(names[number : number + 1]), None)
-    if chosen not in names:
-        raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
-    return chosen
+    if number is None and name is None:
+        return names[0]
+    if number is None and name in names:
+        return name
+    if number is not None and number < len(names):
+        return names[number]
+    raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
 
 
 def _array(batch: torch.Tensor) -> np.ndarray:

@@ -28,12 +28,12 @@ DRAWN = frozenset((_SPHERE, _ELLIPSOID, _CAPSULE, _CYLINDER, _BOX, _MESH))
 
 
 def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
-    """Evenly spread pairs in [0, 1), shape (count, 2), from an offset (2,)."""
+    """Return evenly spread pairs in [0, 1), shape (count, 2), from an offset (2,)."""
     return (offset + np.arange(1, count + 1)[:, None] * _STEP) % 1.0
 
 
 def area(model: mujoco.MjModel, geom: int) -> float:
-    """Area of a geom's surface, m²; that of an ellipsoid to 1.1 % (Thomsen's formula)."""
+    """Return the area of a geom's surface, m²; for an ellipsoid to 1.1 % (Thomsen's formula)."""
     a, b, c = (float(x) for x in model.geom_size[geom])
     p = 1.6075
     kind = int(model.geom_type[geom])
@@ -49,7 +49,7 @@ def area(model: mujoco.MjModel, geom: int) -> float:
 
 
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
-    """Points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
+    """Return points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
 
     ``offset``, (2,) in [0, 1), is where the even numbers begin.
     """
@@ -66,7 +66,10 @@ def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) ->
 
 
 def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) -> np.ndarray:
-    """Which points (n, 3) of a geom's frame lie deeper than ``margin`` (m) in it; of meshes none. Shape (n,), bool."""
+    """Return whether points (n, 3) of a geom's frame lie deeper than ``margin`` (m) in it, bool (n,).
+
+    A mesh contains no point.
+    """
     size = np.asarray(model.geom_size[geom], dtype=np.float64)
     kind = int(model.geom_type[geom])
     if kind == _SPHERE:
@@ -157,7 +160,7 @@ def _box(size: np.ndarray, u: np.ndarray) -> Surface:
 
 
 def _faces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners (f, 3, 3), areas (f,) and unit normals (f, 3) of a mesh geom's triangles that have an area."""
+    """Return corners (f, 3, 3), areas (f,) and unit normals (f, 3) of a mesh geom's triangles that have an area."""
     mesh = int(model.geom_dataid[geom])
     first = model.mesh_vertadr[mesh]
     count = model.mesh_vertnum[mesh]
@@ -212,26 +215,28 @@ class Surfaces:
 
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms with a surface, in a shown group, not transparent."""
-    materials = model.geom_matid
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if int(model.geom_type[geom]) in DRAWN
-        and model.geom_group[geom] < _SHOWN_GROUPS
-        and (model.mat_rgba[materials[geom], 3] if materials[geom] >= 0 else model.geom_rgba[geom, 3]) > 0.0
-    ]
+    """Return the geoms with a surface that are in a shown group and not transparent."""
+    geoms = []
+    for geom in range(model.ngeom):
+        material = model.geom_matid[geom]
+        opacity = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
+        if int(model.geom_type[geom]) in DRAWN and model.geom_group[geom] < _SHOWN_GROUPS and opacity > 0.0:
+            geoms.append(geom)
+    return geoms
 
 
 def body_kinds(model: mujoco.MjModel) -> list[float]:
-    """FIXTURE, HAND or OBJECT of each body; a body without a joint up to the world is in no kinematic tree."""
+    """Return FIXTURE, HAND or OBJECT for each body.
+
+    A body without a joint up to the world is in no kinematic tree.
+    """
     hands = tuple(f"{side}/" for side in SIDES)
     moving = [OBJECT if tree >= 0 else FIXTURE for tree in model.body_treeid]
     return [HAND if model.body(i).name.startswith(hands) else kind for i, kind in enumerate(moving)]
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spreads ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
+    """Spread ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
 
     Raises BidexError for fewer points than visible geoms, or none visible.
     """
@@ -245,7 +250,9 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
     open_area = np.array([area(model, g) * len(seen[g][0]) / _PROBES for g in geoms])
     # Only geoms of the world itself have the fixtures' share: a door's frame has its points from the objects'.
     owners = model.geom_bodyid[geoms]
-    kinds = np.array([FIXTURE if body == 0 else HAND if of_body[body] == HAND else OBJECT for body in owners])
+    kinds = np.full(len(owners), OBJECT)
+    kinds[np.array(of_body)[owners] == HAND] = HAND
+    kinds[owners == 0] = FIXTURE
     found = []
     for geom, number in zip(geoms, _portions(open_area, kinds, count), strict=True):
         tries = int(np.ceil(1.3 * number * _PROBES / max(len(seen[geom][0]), 1))) + 8
@@ -265,7 +272,7 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
 
 
 def _portions(areas: np.ndarray, kinds: np.ndarray, count: int) -> np.ndarray:
-    """How many points each geom gets, at least one where it has open area: (geoms,), their sum is ``count``."""
+    """Return the number of points of each geom, (geoms,), at least one if it has open area; the sum is ``count``."""
     shares = np.zeros(len(areas))
     for kind, share in _SHARES.items():
         if (whole := areas[kinds == kind].sum()) > 0.0:
@@ -280,7 +287,7 @@ def _portions(areas: np.ndarray, kinds: np.ndarray, count: int) -> np.ndarray:
 def _in_body(
     model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray, others: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals in the frame of a geom's body, without those buried in other geoms of that body."""
+    """Return points and normals in the frame of a geom's body, without those buried in the body's other geoms."""
     points, normals = surface(model, geom, count, offset)
     turn = _matrix(model.geom_quat[geom])
     points = points @ turn.T + model.geom_pos[geom]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Randomisation
+from bidex_meta.rules import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument
@@ -48,7 +48,7 @@ _STATE = ("_action", "_past", "_obs", "task_index")
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """How a world is stepped and what it shows, whatever its slots.
+    """Options of a world, independent of its slots.
 
     Attributes:
         num_envs: Environments, split evenly over the slots; None: 1024 on the CPU and 8192 on an accelerator.
@@ -137,10 +137,8 @@ class World(BatchedWorld):
         groups = build_groups(self.slots, self.slot_env_ids, make_engine)
         self._masked = groups[0].engine.masked
         self._describe_observations(groups)
-        self.parts = [
-            Part(group, self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
-            for group in groups
-        ]
+        own = (self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
+        self.parts = [Part(group, *own) for group in groups]
         if config.randomisation is None:
             self._randomiser = None
         else:
@@ -157,12 +155,12 @@ class World(BatchedWorld):
         self._renew_draws()
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """As in ``BatchedWorld``; with ``pixels`` info holds the pictures."""
+        """Start episodes; see ``BatchedWorld``. With ``pixels`` info holds the pictures."""
         obs, info = super().reset(seed=seed, options=options)
         return obs, self._with_pixels(info)
 
     def step(self, action: Tensor | np.ndarray) -> Step:
-        """As in ``BatchedWorld``; with ``pixels`` info holds pictures of the state that the observation shows."""
+        """Advance one step; see ``BatchedWorld``. With ``pixels`` info holds pictures of the observed state."""
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, reward, terminated, truncated, self._with_pixels(info)
 
@@ -357,7 +355,7 @@ class World(BatchedWorld):
             part.check_formulas(part.group.take(self.task_index))
 
     def state_dict(self) -> State:
-        """As in ``BatchedWorld``."""
+        """Return the state; see ``BatchedWorld``."""
         state = super().state_dict()
         if self._past.numel():
             state["past"] = self._past.clone()
@@ -381,7 +379,7 @@ class World(BatchedWorld):
         return made
 
     def load_state_dict(self, state: State) -> None:
-        """As in ``BatchedWorld``; raises BidexError for the state of a world that was made differently."""
+        """Restore a ``state_dict``; raises BidexError for the state of a world that was made differently."""
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)
@@ -408,7 +406,7 @@ class World(BatchedWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Tasks of each slot, each (n, size of its variation)."""
+        """Return the tasks of each slot, each (n, size of its variation)."""
         return [slot.tasks.copy() for slot in self.slots]
 
     @property

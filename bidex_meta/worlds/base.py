@@ -1,33 +1,24 @@
-"""What a config names, resolved once: `Worlds.open(config)`, which does not load torch and physics."""
+"""`Worlds.open(config)` resolves the worlds that a config names, without loading torch and physics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import (
-    METAWORLD_SUITES,
-    OTHER_SEED,
-    SPLITS,
-    Rules,
-    Suite,
-    load_randomisation,
-    load_suite,
-    plain_name,
-    suite_names,
-)
+from bidex_meta.rules import Rules, plain_name
+from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.utils.files import Json
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 
-Json = Mapping[str, Any]
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
@@ -36,7 +27,7 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 @dataclass(frozen=True)
 class WorldsConfig:
-    """Which worlds (one of ``suite`` and ``task``; ``base`` and ``object`` are of a single class) and how they run."""
+    """The worlds of a run (``suite`` or ``task``; ``base`` and ``object`` concern a single class) and how they run."""
 
     suite: str | None = None
     task: str | None = None
@@ -51,8 +42,8 @@ class WorldsConfig:
     randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
-    def of(config: "Json | WorldsConfig") -> "WorldsConfig":
-        """The entries of a run's config that are of worlds; others are left out."""
+    def of(config: "Mapping[str, Json] | WorldsConfig") -> "WorldsConfig":
+        """Return the entries of a run's config that concern worlds; the others are left out."""
         if isinstance(config, WorldsConfig):
             return config
         return WorldsConfig(
@@ -93,8 +84,11 @@ class Worlds(ABC):
             self.randomisation = load_randomisation(config.randomisation)
 
     @staticmethod
-    def open(config: Json | WorldsConfig) -> "Worlds":
-        """Those of a config's ``suite``, or its class ``task``, in any case; BidexError for unknown or faulty ones."""
+    def open(config: Mapping[str, Json] | WorldsConfig) -> "Worlds":
+        """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
+
+        Raises BidexError for unknown or faulty ones.
+        """
         from bidex_meta.worlds import external, own
 
         config = WorldsConfig.of(config)
@@ -114,37 +108,41 @@ class Worlds(ABC):
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
-        """A fresh world of a split, ``train`` or ``test``: to train in an autoreset mode; None: to evaluate, DISABLED.
+        """Return a fresh world of a split, ``train`` or ``test``.
 
-        ``rows`` are its environments over all tasks, by default one per task (of Meta-World's a few per class). Raises
-        BidexError for a missing split, too few environments, or a device or engine that it does not run on.
+        ``mode`` is the autoreset mode of a training world; None makes an evaluation world (DISABLED). ``rows`` are the
+        environments over all tasks, by default one per task (for Meta-World five per class). Raises BidexError for a
+        missing split, too few environments, or a device or engine that the world does not run on.
         """
 
     @abstractmethod
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """Names of the tasks in the pool of each slot of a split's worlds, by the slot's name; empty without any."""
+        """Return the names of the tasks in the pool of each slot of a split's worlds, by slot; empty without any."""
 
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
-        """The classes of its train split by name; BidexError where they are of another library."""
+        """Return the classes of the train split by name; raises BidexError for classes of another library."""
 
     @property
     def rules(self) -> Rules | None:
-        """The rules of all its classes; None where they are of another library."""
+        """Return the rules of all classes, or None for classes of another library."""
         return None
 
     @property
     def splits(self) -> list[str]:
-        """The splits there are: ``train``, and ``test`` for a meta suite."""
+        """Return the splits: ``train``, and ``test`` for a meta suite."""
         return [split for split in ("train", "test") if self.tasks(split)]
 
     @property
     def others(self) -> "Worlds":
-        """Worlds of as many tasks, whose train tasks no run trained on: they are drawn by another seed."""
+        """Return worlds with the same number of unseen tasks: another seed draws them, and no run trained on them."""
         return Worlds.open(replace(self.config, task_seed=self.seed + OTHER_SEED))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
-        """Environments of a training world, and steps of a run over all of them, of a learner that adapts or not."""
+        """Return the default sizes of a training: environments, and steps over all of them.
+
+        ``adapts`` says whether the learner adapts to tasks.
+        """
         if not device.startswith("cpu"):
             return _SIZES_AND_STEPS["gpu"]
         if adapts:
@@ -153,30 +151,33 @@ class Worlds(ABC):
 
     @property
     def moving_bases(self) -> bool:
-        """Whether the hands move as in the shipped suites, and as where references were measured."""
+        """Return whether the hands' bases move, as in the shipped suites and in the measurement of the references."""
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
     def identity(self) -> Identity:
-        """What distinguishes its worlds from others of the same name, ready for JSON.
+        """Return what distinguishes these worlds from others of the same name, ready for JSON.
 
-        ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are not
-        ours; ``suite_version`` and ``suite_digest``: of the suite's file, None without one.
+        ``physics`` are twelve letters of the classes' physics (``bidex_meta.engine.models``), None for classes of
+        another library. ``suite_version`` and ``suite_digest`` come from the suite's file; they are None without one.
         """
         return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """References of the normalised score and of broken episodes; none where bases, tasks or reward are others."""
+        """Return the references of the normalised score and of broken episodes.
+
+        The result is empty if bases, tasks or reward differ from those that the references were measured with.
+        """
         as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
         if self.moving_bases and as_printed:
             return references()
         return {}
 
     def protocol(self, split: str, episodes: int | None = None, seed: int = EVALUATION_SEED) -> Protocol:
-        """What an evaluation of a policy plays: ``default_episodes``, or so many, of each task of a split."""
+        """Return the protocol of an evaluation: ``episodes`` (None: ``default_episodes``) of each task of a split."""
         return Protocol(split, seed, episodes_per_task=self.default_episodes if episodes is None else episodes)
 
     def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
-        """Evaluates a policy on all tasks of a world (mode DISABLED)."""
+        """Evaluate a policy on all tasks of a world (mode DISABLED)."""
         from bidex_meta.evaluation.play import evaluate
 
         return evaluate(agent, world, protocol=protocol, references=self.references())
@@ -186,7 +187,7 @@ V2_PRESET = "v2", "success counts at the end of the episodes, as in version 2"
 
 
 def physics_of(classes: "Mapping[str, TaskClass]") -> str:
-    """Twelve letters of the physics of some classes."""
+    """Return twelve letters that identify the physics of some classes."""
     from bidex_meta.engine.models import common_identity
     from bidex_meta.tasks.scene import compile_scene
 
@@ -194,12 +195,12 @@ def physics_of(classes: "Mapping[str, TaskClass]") -> str:
 
 
 def suites_to_run() -> list[str]:
-    """Every suite that a config may name: the shipped ones and Meta-World's."""
+    """Return every suite that a config may name: the shipped ones and Meta-World's."""
     return [*suite_names(), *METAWORLD_SUITES]
 
 
 def listed() -> list[dict[str, object]]:
-    """An entry of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
+    """Return an entry of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
     rows: list[tuple[object, ...]] = []
     for suite in map(load_suite, suite_names()):
         classes = ([entry.name for entry in suite.split_classes(split)] for split in SPLITS)

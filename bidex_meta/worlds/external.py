@@ -36,7 +36,7 @@ class Foreign(Worlds):
             raise BidexError(f"Worlds of our own are randomised, got {name}. Leave --randomisation out.")
 
     def _check(self, split: str, rows: int) -> None:
-        """Refuses another split than train, engines but C MuJoCo on the CPU, and more than fits into memory."""
+        """Refuse another split than train, engines but C MuJoCo on the CPU, and more than fits into memory."""
         if split != "train":
             raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
         if not self.device.startswith("cpu") or self.engine == "warp":
@@ -48,15 +48,15 @@ class Foreign(Worlds):
         check_memory(rows * self.bytes_per_environment, f"{rows:,} environments", "Lower --num-envs.")
 
     def task_classes(self) -> "dict[str, TaskClass]":
-        """As in ``Worlds``: refused."""
+        """Raise BidexError: the classes belong to another library."""
         raise BidexError(f"Pictures and references are made of classes of our own, got {self.name}. Name another.")
 
     def identity(self) -> Identity:
-        """As in ``Worlds``: the physics is the library's, known by its package's version."""
+        """Return an identity without entries: the physics is the library's, known by its package's version."""
         return {"physics": None, "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """As in ``Worlds``: none."""
+        """Return no references."""
         return {}
 
 
@@ -74,7 +74,7 @@ class MetaWorldSuite(Foreign):
             raise BidexError(f"Point clouds are made of scenes of our own, got the suite {name}. Leave --points out.")
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         rows = rows or _EVALUATION_SIZE * len(self.class_names)
         self._check(split, rows)
         from bidex_meta.metaworld.batched import MetaWorldWorld
@@ -82,24 +82,27 @@ class MetaWorldSuite(Foreign):
         return MetaWorldWorld(self.name, rows, seed=self.seed, autoreset_mode=mode or "DISABLED")
 
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         if split == "train":
             return {name: list(map(str, range(_TASKS))) for name in self.class_names}
         return {}
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         return _TRAINING_SIZE * len(self.class_names), _TRAINING_STEPS * len(self.class_names)
 
     def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
-        """As in ``Worlds``: the fifty tasks of each class a few at a time, as many as the world has environments."""
+        """Evaluate a policy on the fifty tasks of each class, as ``Worlds.judge``.
+
+        The world's environments play as many tasks at a time as there are environments per class.
+        """
         from bidex_meta.metaworld.batched import evaluate_all_tasks
 
         return evaluate_all_tasks(agent, world, protocol.episodes_per_task, seed=protocol.seed)
 
 
 class HumanoidTask(Foreign):
-    """``worlds/humanoid.py``, a single class with one task."""
+    """The world of ``worlds/humanoid.py``: a single class with one task."""
 
     default_episodes = _HUMANOIDS
     class_name = HUMANOID
@@ -113,7 +116,7 @@ class HumanoidTask(Foreign):
                 raise BidexError(f"--{flag} is of the classes with hands, got {value} with {HUMANOID}. Leave it out.")
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         rows = rows or _HUMANOIDS
         self._check(split, rows)
         from bidex_meta.worlds.humanoid import HumanoidWorld
@@ -121,7 +124,7 @@ class HumanoidTask(Foreign):
         return HumanoidWorld(rows, seed=self.seed, autoreset_mode=mode or "DISABLED", threads=self.threads)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         if split == "train":
             return {"Humanoid-v5": ["0"]}
         return {}

@@ -70,7 +70,7 @@ class HumanoidWorld(ForeignWorld):
         self.set_tasks({NAME: np.zeros((1, 0))})
 
     def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
-        """Replaces the pool by an array (n, 0), of which only n counts; BidexError for another class or shape."""
+        """Replace the pool by an array (n, 0), of which only n counts; raises BidexError for another class or shape."""
         for name, pool in pools.items():
             if name != NAME:
                 raise unknown_name("class", name, [NAME])
@@ -81,7 +81,7 @@ class HumanoidWorld(ForeignWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Tasks, (n, 0)."""
+        """Return the tasks, (n, 0)."""
         return [np.zeros((self.num_slot_tasks[0], 0))]
 
     def _place(self, mask: Tensor) -> None:
@@ -100,7 +100,7 @@ class HumanoidWorld(ForeignWorld):
         return (self._mass * self._centres[:, :, 0]).sum(1) / self._mass.sum()
 
     def _state(self) -> Tensor:
-        """Observations, (n, 348), float32."""
+        """Return observations, (n, 348), float32."""
         inertia, velocity, force = self._bound
         parts = self._engine.qpos[:, 2:], self._engine.qvel, inertia[:, 1:], velocity[:, 1:], force[:, 6:]
         return torch.cat([part.flatten(1) for part in (*parts, self._contact[:, 1:])], dim=1).float()
@@ -126,19 +126,22 @@ class HumanoidWorld(ForeignWorld):
         return (height > _LOWEST) & (height < _HIGHEST)
 
     def _feel(self, moved: Tensor) -> None:
-        """Forces on the bodies from outside; MuJoCo's step leaves them out, and Gymnasium asks for them after it."""
+        """Compute the external forces on the bodies of the rows of a mask.
+
+        MuJoCo's step leaves them out, and Gymnasium reads them after it.
+        """
         for row in moved.nonzero()[:, 0].tolist():
             self._engine.batch.get_data(row, self._data)
             mujoco.mj_rnePostConstraint(self._model, self._data)
             self._contact[row] = torch.from_numpy(self._data.cfrc_ext)
 
     def state_dict(self) -> State:
-        """All that decides the world's future: tensors and plain values, copied."""
+        """Return everything that decides the world's future: tensors and plain values, copied."""
         own = {"tasks": self.num_slot_tasks[0], "engine": self._engine.state_dict()}
         return {**super().state_dict(), **own, "x": self._x.clone(), "contact": self._contact.clone()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restores a ``state_dict``; raises BidexError for one of another size."""
+        """Restore a ``state_dict``; raises BidexError for one of another size."""
         fits(state, self.state_dict())
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         self._restore(state)

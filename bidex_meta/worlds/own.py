@@ -5,7 +5,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, V2, Rules, Split, Suite, load_suite, plain_name
+from bidex_meta.rules import V1, V2, Rules, plain_name
+from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig, physics_of
@@ -34,13 +35,13 @@ class OwnSuite(Worlds):
 
     @cached_property
     def benchmark(self):
-        """The suite with its classes and the tasks that the config's seed draws."""
+        """Return the suite with its classes and the tasks that the config's seed draws."""
         from bidex_meta.benchmark import Benchmark
 
         return Benchmark(self.suite, seed=self.seed)
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         if rows is None:
             # They are split evenly over slots, so that all need as many as the slot with the most tasks.
             pools = self.tasks(split).values()
@@ -49,25 +50,28 @@ class OwnSuite(Worlds):
         return self.benchmark.make_world(*given, randomisation=self.randomisation or mode is not None)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """As in ``Worlds``: the names that the file lists, else numbers."""
+        """Return the names that the file lists, else numbers; see ``Worlds``."""
         drawn = list(map(str, range(self.suite.tasks_per_class or 0)))
         classes = self.suite.split_classes(cast(Split, split))
         pools = {c.name: [task.name for task in c.tasks if task.split == split] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
-        return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
+        listed: dict[str, list[str]] = {}
+        for name, pool in pools.items():
+            listed |= {f"{name}/{task}": [task] for task in pool}
+        return listed
 
     def task_classes(self) -> "dict[str, TaskClass]":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         return self.benchmark.task_classes()
 
     @property
     def rules(self) -> Rules:
-        """As in ``Worlds``: the suite's."""
+        """Return the suite's rules."""
         return self.suite.rules
 
     def identity(self) -> Identity:
-        """As in ``Worlds``; of the classes of both splits."""
+        """Return the identity of the classes of both splits; see ``Worlds``."""
         classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
         physics = physics_of(classes)
         return {"physics": physics, "suite_version": self.suite.version, "suite_digest": self.suite.digest}
@@ -90,7 +94,7 @@ class SingleClass(Worlds):
             self.task_classes()  # refuses an unknown one now
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         from bidex_meta.benchmark import make_task_world
 
         if split != "train":
@@ -101,18 +105,18 @@ class SingleClass(Worlds):
         return make_task_world(*given, **named)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         if split == "train":
             return {self.name: list(map(str, range(_TASKS_ALONE)))}
         return {}
 
     def task_classes(self) -> "dict[str, TaskClass]":
-        """As in ``Worlds``."""
+        """See ``Worlds``."""
         return {self.name: registry.get(self.class_name, self.moving_base, **registry.with_object(self.object))}
 
     @property
     def rules(self) -> Rules:
-        """As in ``Worlds``: those that the class's name asks for."""
+        """Return the rules that the class's name asks for."""
         if self.class_name == plain_name(self.class_name):
             return V1
         return V2

@@ -11,7 +11,7 @@ from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import ALGOS, learner_kind
-from bidex_meta.training.learner import Sources
+from bidex_meta.training.learner import Capability, Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import Passing, PointClass, PointGoals
@@ -49,7 +49,7 @@ class Case:
 
     def world(self, rows: int = 8, **broken: Any) -> Any:
         kind = learner_kind(self.algo)
-        if not kind.make.adapts:
+        if Capability.ADAPTS not in kind.make.capabilities:
             return ToyWorld([nearness(0.6), nearness(0.0)], rows=rows, **broken)
         classes = (PointClass("Short", steps=9, count=3), PointClass("Long", steps=20, scale=100.0, count=5))
         mode = kind.make.autoreset_mode(self.config)
@@ -59,11 +59,11 @@ class Case:
         make = learner_kind(self.algo).make
         world = self.world() if world is None else world
         sources: dict[str, Any] = {}
-        if make.offline:
+        if Capability.OFFLINE in make.capabilities:
             world.reset(seed=0)
             still = noisy(lambda obs: torch.zeros(len(obs), 2), 0.4)
             sources["data"] = as_data(played(opposite_bandits(rows=4), still, 20))
-        if make.taught:
+        if Capability.TAUGHT in make.capabilities:
             sources["teachers"] = still_teachers(world)
         config = self.config if config is None else config
         return make(world, config, seed, Sources(**sources)) if sources else make(world, config, seed)
@@ -103,7 +103,13 @@ SHARING = {
         *((way, {"gradient_surgery": way}) for way in ("pcgrad", "cagrad", "famo") if algo == "mtppo"),
     )
 }
-PLAYING = {name: case for name, case in CASES.items() if not learner_kind(case.algo).make.offline}
+
+
+def capable(capability: Capability) -> list[str]:
+    return [algo for algo in ALGOS if capability in learner_kind(algo).make.capabilities]
+
+
+PLAYING = {name: case for name, case in CASES.items() if case.algo not in capable(Capability.OFFLINE)}
 
 
 def each(cases: dict[str, Case]) -> Callable[..., Any]:
@@ -218,7 +224,7 @@ def test_a_loss_that_is_no_number_ends_the_training_by_its_name(case: Case) -> N
         learner.iterate()
 
 
-@pytest.mark.parametrize("algo", [name for name in ALGOS if learner_kind(name).make.discounts_by_class])
+@pytest.mark.parametrize("algo", capable(Capability.DISCOUNTS_BY_CLASS))
 def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str) -> None:
     kind = learner_kind(algo)
     small: dict[str, Any] = {
@@ -228,7 +234,8 @@ def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str
     for preset in kind.presets.values():
         config = replace(preset, **{name: value for name, value in small.items() if name in vars(preset)})
         learner = Case(algo, {}).make(world=opposite_bandits(), config=config)
-        assert learner.offline or learner.taught or any(name.startswith("Loss/") for name in learner.iterate())
+        if not learner.capabilities & {Capability.OFFLINE, Capability.TAUGHT}:
+            assert any(name.startswith("Loss/") for name in learner.iterate())
 
 
 def test_means_over_tasks_wait_for_every_task():

@@ -9,7 +9,7 @@ import torch
 
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.training.learner import Sources
+from bidex_meta.training.learner import Capability, Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness
@@ -30,7 +30,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     **{name: [{}] for name in ("bc", "bcq", "td3bc", "iql")},
     "pearl": [{"steps_per_iteration": 25}], "dagger": [{"teacher_steps": 0}], "icl": [{"trials": 32, "memory": 8}],
 }  # fmt: skip
-PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
+PLAYING = [algo for algo in VARIANTS if Capability.OFFLINE not in learner_kind(algo).make.capabilities]
 TEAM = {"agents": "a=action/0;b=action/1"}
 OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}
 """Learners of several agents, and those whose tags they have."""
@@ -43,12 +43,15 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         known = {**SMALL, **options}
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
         mode, bandits = kind.make.autoreset_mode(config), [nearness(0.5), nearness(-0.5)]
-        world = PointGoals(16, autoreset_mode=mode) if kind.make.adapts else ToyWorld(bandits, rows=8)
+        if Capability.ADAPTS in kind.make.capabilities:
+            world = PointGoals(16, autoreset_mode=mode)
+        else:
+            world = ToyWorld(bandits, rows=8)
         sources: dict[str, Any] = {}
-        if known.get("demonstration_weight") or kind.make.offline:
+        if known.get("demonstration_weight") or Capability.OFFLINE in kind.make.capabilities:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
-            sources["data" if kind.make.offline else "demonstrations"] = data
-        if kind.make.taught or known.get("teacher_updates"):
+            sources["data" if Capability.OFFLINE in kind.make.capabilities else "demonstrations"] = data
+        if Capability.TAUGHT in kind.make.capabilities or known.get("teacher_updates"):
             rows, width = torch.arange(world.num_envs), world.single_observation_space.shape[0]
             sources["teachers"] = Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)])
         more = {"sources": Sources(**sources)} if sources else {}

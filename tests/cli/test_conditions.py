@@ -8,7 +8,9 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.experiments.policies import load_policy
+from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.provenance import differences
+from bidex_meta.runs.versions import Versions
 from tests.cli.conftest import SMALL
 from tests.fakes import evaluated_run
 from tests.pages import ROOT
@@ -34,9 +36,9 @@ def edited(run: Path, name: str) -> Path:
 
 
 def test_what_is_not_recorded_is_no_difference() -> None:
-    now = {"packages": {"mujoco": "4.0.0", "torch": None}, "physics": "a", "suite_version": 2, "suite_digest": None}
-    assert differences({}, now) == []
-    then = {"packages": {"mujoco": "3.9", "scipy": "1"}, "physics": "a", "suite_version": 1, "suite_digest": "b"}
+    now = Conditions(packages={"mujoco": "4.0.0", "torch": None}, physics="a", suite_version=2)
+    assert differences(Versions(), now) == []
+    then = Versions(packages={"mujoco": "3.9", "scipy": "1"}, physics="a", suite_version=1, suite_digest="b")
     found = differences(then, now)
     assert [(str(each), each.is_of_worlds) for each in found] == [
         ("mujoco 3.9 then, 4.0.0 now", True),

@@ -1,7 +1,6 @@
 """Own data against others': the arms, their differences, and the command."""
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.control_arms import arms, control
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import FINDER
@@ -17,7 +17,7 @@ from tests.points import Finder, PointWorld, Still, ring
 
 NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])
 TASKS = OwnSuite.tasks
-PLAYED: Any = {"rollouts": 6, "episodes_per_task": 5, "trials": 3}
+PLAYED = Protocol(seed=4, rollouts=6, episodes_per_task=5, trials=3)
 
 
 def world(*goals, rows=18):
@@ -27,7 +27,7 @@ def world(*goals, rows=18):
 @pytest.mark.parametrize("rows", [18, 6])  # all adaptations at once, and in portions
 def test_only_what_adapts_to_the_task_gains_above_others_data(rows):
     said = []
-    found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), seed=4, say=said.append, **PLAYED)
+    found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), say=said.append, protocol=PLAYED)
     assert len(said) == 3 and said[0].startswith("before: Near -")
     assert said[2].startswith("adapted to data of train task 2")
     assert len(found.foreign) == 2 and len(found.own.classes["Near"].returns) == 3 * 5
@@ -41,15 +41,15 @@ def test_only_what_adapts_to_the_task_gains_above_others_data(rows):
 
 
 def test_the_arms_are_those_of_the_meta_test():
-    found = control(Finder, world(NORTH), world(EAST, WEST), seed=4, **PLAYED)
-    own = meta_evaluate(Finder(), world(NORTH), seed=4, **PLAYED)
-    west = meta_evaluate(Finder(), world(NORTH), seed=4, adapt_world=world(WEST), **PLAYED)
+    found = control(Finder, world(NORTH), world(EAST, WEST), protocol=PLAYED)
+    own = meta_evaluate(Finder(), world(NORTH), protocol=PLAYED)
+    west = meta_evaluate(Finder(), world(NORTH), protocol=PLAYED, adapt_world=world(WEST))
     for ours, theirs in ((found.before, own.before), (found.own, own.after), (found.foreign[1], west.after)):
         np.testing.assert_array_equal(ours.classes["Near"].returns, theirs.classes["Near"].returns)
 
 
 def test_what_does_not_adapt_gains_exactly_nothing():
-    by_arm = arms([control(Still, world(NORTH), world(EAST, WEST), seed=4, **PLAYED)], "Near", ["east", "west"])
+    by_arm = arms([control(Still, world(NORTH), world(EAST, WEST), protocol=PLAYED)], "Near", ["east", "west"])
     for arm in ("before", "foreign", "east", "west"):
         gain = by_arm[arm]["own_minus"]["return"]
         assert (gain.value, gain.interval) == (0.0, (0.0, 0.0))

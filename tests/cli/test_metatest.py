@@ -8,6 +8,7 @@ from bidex_meta.cli import main
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.experiments.metatest import rollouts_of
 from bidex_meta.runs import RunFolder
+from bidex_meta.training.learner import Capability
 from bidex_meta.worlds import Worlds
 from tests.adapting_learner import Learner
 from tests.cli.conftest import COUNTS, FINDER
@@ -74,7 +75,7 @@ def test_the_curve_of_adaptation(adapted, shown, refused, tmp_path):
     other.write_text(shown("evaluate", adapted, "--json", "--shots", 3))
     shown("plot", adapted, "--evaluation", other, "--out", picture)
     assert picture.stat().st_size > 0
-    other.write_text('{"policy": {}}')
+    other.write_text('{"policy": {"classes": {"A": {"success": 0.5, "return": 1.0}}}}')
     assert "holds no meta-test" in refused("plot", adapted, "--evaluation", other)
 
 
@@ -111,7 +112,7 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     config = run_config(suite="ML4", algo="finder", num_envs=1024)
     source = Worlds.open(config.to_json())
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
-    monkeypatch.setattr(Learner, "independent_adaptation", True, raising=False)
+    monkeypatch.setattr(Learner, "capabilities", frozenset(Capability))
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 

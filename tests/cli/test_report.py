@@ -101,7 +101,8 @@ def test_runs_without_an_evaluation_and_of_one_seed(runs, report):
 def test_a_meta_test_is_drawn(runs, report):
     measures = {"success": 0.5, "return": 2.0, "score": None, "success_interval": [0.4, 0.6], "return_interval": None}
     shots = {"classes": {"A": measures}}
-    splits = {"train": {"before": shots, "after": shots, "by_shot": [shots, shots]}}
+    played = {"shots": 1, "rollouts": 2, "trials": 1}
+    splits = {"train": {**played, "before": shots, "after": shots, "by_shot": [shots, shots]}}
     (runs[0] / "evaluation.json").write_text(json.dumps({"splits": splits}))
     assert "over shots" in report(runs[:1])
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
@@ -142,7 +143,7 @@ def _rows(generator, classes, episodes, shift=0.0):
         returns = generator.normal(5.0 + shift, 2.0, episodes)
         successes = (generator.random(episodes) < 0.3).astype(float)
         result = ClassResult(returns, successes, np.ones(episodes, np.int64), np.zeros(episodes, np.int64), 0)
-        rows[f"C{i}"] = result.to_json()
+        rows[f"C{i}"] = result.summary()
     return rows
 
 
@@ -161,22 +162,23 @@ def test_honest_repetitions_are_within_and_a_worse_policy_is_not():
 @pytest.mark.parametrize("name", ["success", "return"])
 @pytest.mark.parametrize("tasks", [1, 20])
 def test_a_recorded_interval_counts_no_wider_than_episodes_can_make_it(name, tasks):
-    again = _rows(np.random.default_rng(2), 1, 60)["C0"] | {"tasks": tasks}
-    low, high = again[f"{name}_interval"]
+    again = replace(_rows(np.random.default_rng(2), 1, 60)["C0"], tasks=tasks)
+    low, high = getattr(again, f"{name}_interval")
+    measure = "mean_return" if name == "return" else name
     for gap, outcome in ((0.3, "within"), (9.0, "differs")):
-        value = again[name] + gap * (high - low) / 2
+        value = getattr(again, measure) + gap * (high - low) / 2
         for wide in (1.0, 1e9):
-            ends = [value - wide * (high - low) / 2, value + wide * (high - low) / 2]
-            row = again | {name: value, f"{name}_interval": ends}
+            ends = (value - wide * (high - low) / 2, value + wide * (high - low) / 2)
+            row = replace(again, **{measure: value, f"{name}_interval": ends})
             (found,) = agreements({"C0": row}, {"C0": again})
             assert found.outcome == outcome, (gap, wide)
 
 
 def test_rows_that_cannot_agree():
     rows = _rows(np.random.default_rng(1), 2, 20)
-    more = {name: row | {"episodes": 40} for name, row in rows.items()}
-    single = {name: row | {"return_interval": None} for name, row in rows.items()}
-    other = {name: row | {"return": row["return"] + 1e-6} for name, row in single.items()}
+    more = {name: replace(row, episodes=40) for name, row in rows.items()}
+    single = {name: replace(row, return_interval=None) for name, row in rows.items()}
+    other = {name: replace(row, mean_return=row.mean_return + 1e-6) for name, row in single.items()}
     for pair, outcome in (((rows, rows), "equal"), ((rows, more), "differs"), ((single, other), "differs")):
         assert [each.outcome for each in agreements(*pair)] == [outcome] * 2
     with pytest.raises(BidexError, match="of C0, got C0, C1"):

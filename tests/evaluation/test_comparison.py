@@ -161,7 +161,7 @@ def test_a_run_that_time_or_a_mark_ended_is_of_the_steps_it_made(tmp_path: Path,
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
     path = evaluated_run(tmp_path, 0, {"A": 0.5})
     (path / "evaluation.json").write_text(
-        json.dumps({"classes": {"A": {"success": 0.5, "return": 1.0, "score": None}}})
+        json.dumps({"policy": {"classes": {"A": {"success": 0.5, "return": 1.0, "score": None}}}})
     )
     assert groups(path)[0].scores is None
 

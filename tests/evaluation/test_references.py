@@ -7,6 +7,7 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.references import Reference
+from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.tasks import registry
 from bidex_meta.utils import paths
 from bidex_meta.worlds import Worlds
@@ -24,15 +25,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base: str) -> None:
     for kind, value in (("random", 1.0), ("expert", 5.0)):
         references.store(folder / f"{kind}.json", {name: {"return": value} for name in ("A", "B")}, {})
-    rows = {name: {"return": 2.0, "success": 0.5, "score": score} for name, score in (("A", 90.0), ("B", None))}
-    foreign = {"Lamp": {"return": 2.0, "score": 7.0}}
-    assert references.rescored(rows | foreign, run_config(base=base)) == {
-        "A": {"return": 2.0, "success": 0.5, "score": 25.0},
-        "B": {"return": 2.0, "success": 0.5, "score": 25.0},
-        **foreign,
-    }
+    scores = {"A": 90.0, "B": None, "Lamp": 7.0}
+    rows = {name: ClassSummary(mean_return=2.0, success=0.5, score=score) for name, score in scores.items()}
+    rescored = references.rescored(rows, run_config(base=base))
+    today = ClassSummary(mean_return=2.0, success=0.5, score=25.0)
+    assert rescored == {"A": today, "B": today, "Lamp": rows["Lamp"]}
     unscored = {"B": rows["B"]}  # nobody could say of what base, but where the run says so itself
-    assert references.rescored(unscored, run_config(base=base))["B"]["score"] == (25.0 if base == "moving" else None)
+    assert references.rescored(unscored, run_config(base=base))["B"].score == (25.0 if base == "moving" else None)
 
 
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:

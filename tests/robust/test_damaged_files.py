@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -14,11 +15,12 @@ from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.agreement import agreements, classes_of
+from bidex_meta.evaluation.agreement import agreements
 from bidex_meta.evaluation.references import load_from
 from bidex_meta.experiments.verifying import others, recorded_conditions, recorded_evaluation
 from bidex_meta.runs import Checkpoints, RunFolder, mend
-from bidex_meta.runs.schemas import read_evaluation, read_versions
+from bidex_meta.runs.evaluations import Conditions, parse_evaluation, read_evaluation
+from bidex_meta.runs.versions import Versions, read_versions
 from bidex_meta.utils.paths import assets_dir, suites_dir
 from bidex_meta.witness.store import load_witness
 from tests.fakes import run_config, trained_run
@@ -62,17 +64,16 @@ def test_evaluations(content: dict[str, Any], tmp_path: Path) -> None:
         put(path, drawn, whole)
         found = one_line_or(lambda: read_evaluation(path, "again"))
         if found is not None:  # then all that is read of it has its type
-            parts = found["splits"].values() if "splits" in found else [{"after": found.get("policy", found)}]
-            for part in parts:
-                for row in part["after"]["classes"].values():
-                    assert all(type(row[name]) in (int, float) for name in ("success", "return"))
-                    assert row["score"] is None or type(row["score"]) in (int, float)
+            for row in found.results.values():
+                assert all(type(value) is float for value in (row.success, row.mean_return))
+                assert row.score is None or type(row.score) is float
         found = one_line_or(lambda: recorded_evaluation(tmp_path, path))
         if found is not None:  # and what verify makes of it
-            now = {"packages": {"mujoco": "4.1.0"}, "device": "cpu", "engine": "c", "threads": 1}
-            others(recorded_conditions(found, {}, run_config()), now | {"physics": "x", "suite_version": 1})
-            again = {name: row | {"tasks": 2, "episodes": 4} for name, row in classes_of(content).items()}
-            one_line_or(lambda: agreements(classes_of(found), again))
+            now = Conditions(packages={"mujoco": "4.1.0"}, device="cpu", engine="c", threads=1, physics="x")
+            others(recorded_conditions(found, Versions(), run_config()), now)
+            again = parse_evaluation(content, "again").all_results
+            again = {name: msgspec.structs.replace(row, tasks=2, episodes=4) for name, row in again.items()}
+            one_line_or(lambda: agreements(found.all_results, again))
 
     draws(150, of_files(of_values()), check)
 

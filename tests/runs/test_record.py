@@ -19,8 +19,9 @@ from bidex_meta.data.part_files import SealedFile
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import MetricsWriter, Progress, Recorder, RunFolder, mend, read_metrics
 from bidex_meta.runs import progress as progress_module
+from bidex_meta.runs.evaluations import read_evaluation
 from bidex_meta.runs.metrics import last_rows
-from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
+from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, save, svg
 from bidex_meta.runs.video import check_suffix, write_animation, write_image, write_video
 from bidex_meta.runs.writers import make_writer
 
@@ -172,11 +173,14 @@ def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
 @pytest.mark.parametrize("text", ["[1]", "{}"])
 def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
     path = tmp_path / "evaluation.json"
-    with pytest.raises(BidexError, match="There is no"):
-        read_evaluation(path)
+    with pytest.raises(BidexError, match="No such file"):
+        read_evaluation(path, "again")
     path.write_text(text)
+    with pytest.raises(BidexError, match=r"content: expected a table|policy: expected it to be there"):
+        read_evaluation(path, "again")
+    path.write_text(json.dumps({"policy": {"classes": {"A": {"success": 0.5, "return": 1.0}}}}))
     with pytest.raises(BidexError, match="holds no meta-test"):
-        draw_adaptation(read_evaluation(path), path)
+        draw_adaptation(read_evaluation(path, "again"), path)
 
 
 def test_picture_and_film_read_back(tmp_path):

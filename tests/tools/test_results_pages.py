@@ -59,12 +59,12 @@ def test_several_studies_share_a_table_with_means_over_classes() -> None:
 def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:
     (study,) = read_studies(ROOT / "results" / "data", "mt20-dagger")
     found = [run.evaluation() for run in study.runs]
-    of_others = [each["other_tasks"]["policy"]["classes"] for each in found]
+    of_others = [each.other_tasks.policy.classes for each in found]
     head, _, *rows = map(cells, classes_table(study))
     assert head == ["class", "success", "other tasks", "return", "score"] and rows[-1][0] == "mean"
     (row,) = [row for row in rows if row[0] == "HandOver"]
-    assert percent(row[2]) == pytest.approx(np.mean([each["HandOver"]["success"] for each in of_others]), abs=6e-4)
-    mean = pytest.approx(np.mean([row["success"] for each in of_others for row in each.values()]), abs=6e-4)
+    assert percent(row[2]) == pytest.approx(np.mean([each["HandOver"].success for each in of_others]), abs=6e-4)
+    mean = pytest.approx(np.mean([row.success for each in of_others for row in each.values()]), abs=6e-4)
     head, _, arm, *_ = map(cells, arms_table(study))
     assert percent(arm[head.index("other tasks, mean")]) == percent(rows[-1][2]) == mean
 

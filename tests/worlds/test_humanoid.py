@@ -44,8 +44,8 @@ def test_a_run_on_it(algo: str, tmp_path: Path) -> None:
     assert main(["run", *flags, "--run-dir", str(tmp_path / "run")]) == 0
     folder = RunFolder.open(tmp_path / "run")
     assert folder.config().task == HUMANOID and folder.config().learner["gamma"] == 0.99
-    result = folder.evaluation()["policy"]["classes"]["Humanoid-v5"]
-    assert result["score"] is None and result["success"] == 0.0
+    result = folder.evaluation().results["Humanoid-v5"]
+    assert result.score is None and result.success == 0.0
 
 
 def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,14 +5,15 @@ evaluations. The expert is the study's online run on the same class. Without one
 evaluations.
 """
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
-from bidex_meta.evaluation.comparison import classes_of, scored_classes
+from bidex_meta.evaluation.comparison import scored_classes
+from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.stored import StoredRun
-from tools.pages.studies import Study, refuse_differing
+from tools.pages.studies import Study, classes_of_random, refuse_differing
 from tools.pages.tables import mean_and_range, table
 
 KINDS = ("random", "replay", "medium", "medium-expert", "expert")
@@ -24,11 +25,7 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 def offline_table(study: Study) -> Iterator[str]:
     """Yield a table of data sets by learners: score as mean over seeds (least to most), and mean success.
 
-    Args:
-        study: Runs on data sets; its online runs are the experts.
-
-    Raises:
-        BidexError: Seeds of one cell differ in more than the seed.
+    The study's online runs are the experts. Raises BidexError if seeds of one cell differ in more than the seed.
     """
     cells: dict[str, dict[str, list[StoredRun]]] = {}
     experts = []
@@ -38,17 +35,17 @@ def offline_table(study: Study) -> Iterator[str]:
             cells.setdefault(_kind(config.dataset), {}).setdefault(config.algo, []).append(run)
         else:
             experts.append(run)
-    learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
+    learners = _ordered(set().union(*cells.values()), LEARNERS)
     ends = _ends(study.runs, experts)
-    seeds = sorted({len(runs) for row in cells.values() for runs in row.values()})
-    kinds = _ordered(cells, KINDS)
-    yield from table(
-        ["data", *learners], [[kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)] for kind in kinds]
-    )
+    rows = []
+    for kind in _ordered(cells, KINDS):
+        rows.append([kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)])
+    yield from table(["data", *learners], rows)
+    seeds = sorted(set(map(len, chain.from_iterable(row.values() for row in cells.values()))))
     updates = []
     for algo in learners:
-        found = {run.content["steps"] for row in cells.values() for run in row.get(algo, [])}
-        updates.append(f"{algo} {_listed(sorted(found))}")
+        runs = chain.from_iterable(row.get(algo, []) for row in cells.values())
+        updates.append(f"{algo} {_listed(sorted({run.content['steps'] for run in runs}))}")
     yield ""
     yield f"Seeds: {_listed(seeds)}. Updates: {'; '.join(updates)}."
     if ends is not None:
@@ -63,10 +60,10 @@ def _kind(names: Sequence[str]) -> str:
 
 def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[float, float] | None:
     """Return the mean returns of uniform actions and of the experts; None without experts."""
-    random = [run.evaluation()["random"] for run in runs if "random" in run.evaluation()]
+    random = [rows for rows in map(classes_of_random, runs) if rows]
     if not experts or not random:
         return None
-    return float(np.mean([_of(found, "return") for found in random])), _mean(experts, "return")
+    return float(np.mean([_mean_of(rows, "mean_return") for rows in random])), _mean(experts, "mean_return")
 
 
 def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
@@ -74,22 +71,23 @@ def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
         return "–"
     refuse_differing(f"{_kind(runs[0].config().dataset)} {runs[0].config().algo}", runs)
     if ends is None:
-        scores = np.array([_of({"classes": scored_classes(run)}, "score") for run in runs])
+        scores = np.array([_mean_of(scored_classes(run), "score") for run in runs])
     else:
-        scores = 100 * (np.array([_of(run.evaluation(), "return") for run in runs]) - ends[0]) / (ends[1] - ends[0])
+        returns = np.array([_mean_of(run.evaluation().results, "mean_return") for run in runs])
+        scores = 100 * (returns - ends[0]) / (ends[1] - ends[0])
     return f"{mean_and_range(scores, '.1f')}; {100 * _mean(runs, 'success'):.3g} %"
 
 
 def _mean(runs: Sequence[StoredRun], name: str) -> float:
-    return float(np.mean([_of(run.evaluation(), name) for run in runs]))
+    return float(np.mean([_mean_of(run.evaluation().results, name) for run in runs]))
 
 
-def _of(found: dict[str, Any], name: str) -> float:
-    """Return the mean over the classes of an evaluation; NaN if a class has no value."""
-    return float(np.mean(np.array([row.get(name) for row in classes_of(found).values()], dtype=float)))
+def _mean_of(classes: Mapping[str, ClassSummary], name: str) -> float:
+    """Return the mean of a measure over classes; NaN if a class has no value."""
+    return float(np.mean(np.array([getattr(row, name) for row in classes.values()], dtype=float)))
 
 
-def _ordered(names: Any, known: Sequence[str]) -> list[str]:
+def _ordered(names: Iterable[str], known: Sequence[str]) -> list[str]:
     return sorted(names, key=lambda name: (known.index(name) if name in known else len(known), name))
 
 

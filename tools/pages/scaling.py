@@ -1,48 +1,42 @@
 """Numbers of parallel environments by learners, at equal environment steps (the paper's Figure 6)."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from itertools import chain
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import classes_of, curves_of
+from bidex_meta.evaluation.comparison import curves_of
 from bidex_meta.runs import plots
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, random_rows, table
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def rows_table(study: Study) -> Iterator[str]:
     """Yield a table of environments by learners: the evaluation's return, as mean over seeds (least to most).
 
-    Args:
-        study: Runs on one class.
-
-    Raises:
-        BidexError: Seeds of one cell differ in more than the seed, or there are several classes.
+    Raises BidexError if seeds of one cell differ in more than the seed, or if the runs are on several classes.
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))
     counts = sorted({envs for _, envs in cells})
-    yield from table(
-        ["environments", *algos],
-        [[f"{envs:,}", *(_cell(cells.get((algo, envs), [])) for algo in algos)] for envs in counts],
-    )
-    steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
+    rows = [[f"{envs:,}", *(_cell(cells.get((algo, envs), [])) for algo in algos)] for envs in counts]
+    yield from table(["environments", *algos], rows)
+    steps = sorted({run.content["steps"] for run in study.runs})
     seeds = sorted({len(runs) for runs in cells.values()})
     yield ""
-    returns = [row["return"] for rows in random_rows(study).values() for row in rows]
+    returns = [row.mean_return for row in chain.from_iterable(random_rows(study).values())]
     random = f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
     yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {random}"
 
 
-def rows_figure(study: Study) -> Any:
-    """Draw the return over training: one panel per learner, one line per number of environments.
-
-    Raises:
-        BidexError: As for ``rows_table``, or matplotlib is missing.
-    """
+def rows_figure(study: Study) -> "Figure":
+    """Draw the return over training: one panel per learner, one line per number of environments."""
     panels: dict[str, list[plots.Group]] = {}
     for (algo, envs), runs in sorted(_cells(study).items()):
         panels.setdefault(algo, []).append((f"{envs} envs", curves_of(runs)))
@@ -62,7 +56,7 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
 
 
 def _class(study: Study) -> str:
-    names = {name for run in study.runs for name in classes_of(run.evaluation())}
+    names = set[str]().union(*(run.evaluation().results for run in study.runs))
     if len(names) != 1:
         raise BidexError(
             f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}."
@@ -73,7 +67,10 @@ def _class(study: Study) -> str:
 def _cell(runs: Sequence[StoredRun]) -> str:
     if not runs:
         return "–"
-    return mean_and_range(np.array([row["return"] for run in runs for row in classes_of(run.evaluation()).values()]))
+    returns = []
+    for run in runs:
+        returns += [row.mean_return for row in run.evaluation().results.values()]
+    return mean_and_range(np.array(returns))
 
 
 def _range(numbers: Sequence[int]) -> str:

@@ -22,7 +22,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import world_size
-from bidex_meta.training.learner import AutoresetMode, Parts, State
+from bidex_meta.training.learner import AutoresetMode, Capability, Parts, State
 from bidex_meta.utils import maths
 from bidex_meta.world.contract import PooledWorld
 
@@ -152,7 +152,7 @@ class MetaLearner(Learner):
     policy: MetaPolicy
     remedy = "lower inner_learning_rate or the outer step"
     objective: ClassVar[Objective]  # what its inner step follows
-    adapts = True
+    capabilities = frozenset({Capability.ADAPTS})
     going_on = ("obs", "elapsed", "steps_with_tasks", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: OuterConfig, seed: int):

@@ -27,7 +27,7 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
 from bidex_meta.training.distributed import all_sum, pool_moments, sum_gradients, world_size
-from bidex_meta.training.learner import NO_SOURCES, LearnerConfig, Parts, Sources, State
+from bidex_meta.training.learner import NO_SOURCES, Capability, LearnerConfig, Parts, Sources, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
@@ -79,7 +79,7 @@ class ICL(TrialLearner):
     remedy = "lower learning_rate"
     config_type = ICLConfig
     presets = PRESETS
-    taught = True
+    capabilities = TrialLearner.capabilities | {Capability.TAUGHT}
     per_process = ("generator", "episodes", "data")
     config: ICLConfig
     policy: BeliefPolicy

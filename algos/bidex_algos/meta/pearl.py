@@ -28,7 +28,7 @@ from bidex_algos.replay import Stretches, Transitions
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, own_seed, world_size
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import Capability, Parts, State
 from bidex_meta.utils.validation import Count, NonNegative, Positive, Widths
 from bidex_meta.world.contract import Info, TaskWorld
 
@@ -64,7 +64,7 @@ class PEARL(MTSAC):
     name = "pearl"
     config_type = PEARLConfig
     presets = PRESETS
-    adapts = independent_adaptation = True
+    capabilities = MTSAC.capabilities | {Capability.ADAPTS, Capability.ADAPTS_INDEPENDENTLY}
     per_process = (*MTSAC.per_process, "trial")
     config: PEARLConfig
     policy: LatentPolicy

@@ -12,7 +12,7 @@ from bidex_algos.meta.trials import Player, Trials, play
 from bidex_algos.nets.recurrent import RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.training.distributed import all_sum, own_seed, rank, world_size
-from bidex_meta.training.learner import AutoresetMode, State
+from bidex_meta.training.learner import AutoresetMode, Capability, State
 from bidex_meta.world.contract import PooledWorld
 
 
@@ -33,7 +33,7 @@ class TrialLearner(Learner):
     world: PooledWorld
     policy: RecurrentPolicy
     per_process = ("generator", "episodes")
-    adapts = independent_adaptation = True
+    capabilities = frozenset({Capability.ADAPTS, Capability.ADAPTS_INDEPENDENTLY})
     going_on = ("trials_played", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: Any, seed: int):

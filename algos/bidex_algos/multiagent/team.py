@@ -7,11 +7,11 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import NetworkConfig
+from bidex_algos.nets.architecture import Networks
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
-from bidex_algos.onpolicy.base import OnPolicyConfig
+from bidex_algos.onpolicy.mtppo import OnPolicyConfig
 from bidex_meta.world.agent_views import AgentView
 
 
@@ -22,7 +22,7 @@ class Team(nn.Module):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig, outputs: Sequence[int], output_gain: float,
+        self, views: Sequence[AgentView], config: Networks, outputs: Sequence[int], output_gain: float,
         generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__()
@@ -40,7 +40,7 @@ class Team(nn.Module):
                 continue
             if share and len(family) > 1:
                 inputs = inputs.extended("agent", len(family))
-            inputs = with_task_embedding(with_point_net(inputs, config), config.task_embedding)
+            inputs = with_task_embedding(with_point_net(inputs, config), vars(config).get("task_embedding", 0))
             self.net_of[i] = len(made)
             made.append(MLP(inputs, config.hidden, outputs[i], output_gain, generator, config.activation))
         self.nets = nn.ModuleList(made)
@@ -159,7 +159,7 @@ class TeamCritic(Team):
     """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig, heads: int, generator: torch.Generator,
+        self, views: Sequence[AgentView], config: Networks, heads: int, generator: torch.Generator,
         share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)

@@ -21,7 +21,7 @@ from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.training.learner import NO_SOURCES, Parts, Sources, State
+from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
@@ -129,9 +129,8 @@ class Offline(Learner):
     everything else. A batch has ``batch_per_task`` transitions of each task, task after task (``task_of_draw``).
     """
 
-    offline = True
+    capabilities = frozenset({Capability.OFFLINE, Capability.DISCOUNTS_BY_CLASS})
     num_critics: ClassVar[int] = 2
-    discounts_by_class = True
     critic: Critics
     target_critic: Critics
 

@@ -24,7 +24,7 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
-from bidex_meta.training.learner import Parts, State
+from bidex_meta.training.learner import Capability, Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
 from bidex_meta.world.contract import Info, VectorWorld
 
@@ -109,7 +109,7 @@ class OffPolicy(Learner):
     """
 
     config: OffPolicyConfig
-    discounts_by_class = True
+    capabilities = frozenset({Capability.DISCOUNTS_BY_CLASS})
     per_process = ("generator", "episodes", "replay", "discounted")
     num_critics: ClassVar[int] = 2
     returns_type: ClassVar[type[ReturnScale]] = ReturnScale

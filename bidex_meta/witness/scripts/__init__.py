@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import Rules
+from bidex_meta.rules import Rules
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import push_blocks
@@ -44,12 +44,12 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
 
 
 def scripts_of(rules: Rules) -> dict[str, Script]:
-    """The scripts that play by a suite's rules, by class."""
+    """Return the scripts that play by a suite's rules, by class."""
     return WIDE_SCRIPTS if rules.wide else SCRIPTS
 
 
 def script_of(task: TaskClass) -> Script:
-    """The script of a class by its rules; raises BidexError where it has none, or its bases are fixed."""
+    """Return the script of a class by its rules; raises BidexError if it has none, or its bases are fixed."""
     known = scripts_of(task.rules)
     if not task.moving_base:
         raise BidexError(f"Expected moving bases for the script of {task.name}, got fixed ones: moving_base=True.")

@@ -1,7 +1,7 @@
-"""What policies share that carry a thing between both hands, one on either side of it along y.
+"""Steps that policies share which carry an object between both hands, one on either side of it along y.
 
-All is a function of the present state, and changes little where the state does: a policy without memory can learn it,
-and who comes late or drops the thing goes on from there.
+Everything is a function of the present state, and changes little when the state does: a policy without memory can learn
+it, and one that comes late or drops the object continues from there.
 """
 
 import math
@@ -15,13 +15,14 @@ from bidex_meta.witness.controller import HandController, Point, point
 
 @dataclass(frozen=True)
 class Take:
-    """How two hands take a thing; metres.
+    """The way two hands take an object; metres.
 
-    ``ahead``, ``above``: from the thing to the hands' points along x and z; ``high``: of the hands' points where they
-    pass over everything; ``apart``: from the thing to each hand's point along y before they close; ``aim``: how far off
-    their middle may be as they go down. ``joints``: one of the right and one of the left hand that gives way to what it
-    presses: its angle while ``free``, and while the thing is ``firm``ly held, rad. The hands close until it is. A base
-    that presses by itself holds too hard or too loosely: a newton is 0.1 to 0.3 % of its range.
+    ``ahead``, ``above``: from the object to the hands' points along x and z. ``high``: height of the hands' points when
+    they pass over everything. ``apart``: from the object to each hand's point along y before they close. ``aim``: how
+    far off their middle may be as they go down. ``joints``: one joint of the right and one of the left hand that gives
+    way to the object it presses: its angle while ``free``, and while the object is ``firm``ly held, rad. The hands
+    close until the object is firm. A base that presses by itself holds too hard or too loosely: a newton is 0.1 to
+    0.3 % of its range.
     """
 
     ahead: float
@@ -38,15 +39,18 @@ _CLOSING = 0.015  # how far ahead a hand is led that does not press yet, metres
 
 
 def ramp(value: float, first: float, last: float) -> float:
-    """0 at ``first`` and before, 1 at ``last`` and beyond, linear between."""
+    """Return 0 up to ``first``, 1 from ``last`` on, linear between."""
     return min(1.0, max(0.0, (value - first) / (last - first)))
 
 
 class Between:
-    """Both hands and a thing that they take, as they are now."""
+    """Both hands and an object that they take, in their present state."""
 
     def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
-        """``room``: of each hand's point at most so far from the thing before they close, metres."""
+        """Read the state.
+
+        ``room`` bounds the distance of each hand's point from the object before they close, metres.
+        """
         right, left = (min(take.apart, each) for each in room)
         self.take = take
         self.apart = 0.5 * (right + left)
@@ -58,10 +62,10 @@ class Between:
         self.way = x + take.ahead - self.middle[0], y + aside - self.middle[1]
         self.off = math.hypot(*self.way)
         self.over = self.middle[2] - z - take.above
-        self.firm = min(
-            (float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free)
-            for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True)
-        )
+        shares = []
+        for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True):
+            shares.append((float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free))
+        self.firm = min(shares)
         near = (
             ramp(self.off, 0.05, 0.03)
             * ramp(abs(self.over), 0.05, 0.035)
@@ -70,18 +74,21 @@ class Between:
         self.held = near * ramp(self.firm, 0.15, 0.35)
 
     def far(self, goal: Tensor) -> float:
-        """Horizontal distance of the thing from a place, metres."""
+        """Return the horizontal distance of the object from a place, metres."""
         return math.hypot(float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1])
 
     def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
-        """Where the hands go to take the thing to a place, at a height ``carried``, and to set it down at another."""
+        """Return the hands' points to take the object to ``goal`` and set it down there.
+
+        The object travels at height ``carried`` and is set down at height ``lowered``.
+        """
         aside = self._get()
         held = self._bring(goal, carried, lowered)
         x, y, z, half = (a + self.held * (b - a) for a, b in zip(aside, held, strict=True))
         return self._points(x, y, z, half)
 
     def leave(self) -> tuple[Point, Point]:
-        """Where the hands go to let go of what they hold, and up."""
+        """Return points at which the hands let go of the object, and then go up."""
         x, y, _ = self.middle
         return self._points(x, y, self._rise(self.take.high), self.apart)
 
@@ -90,17 +97,20 @@ class Between:
         return (x, y + half, z), (x, y - half, z)
 
     def _rise(self, height: float) -> float:
-        """A height to go to; upwards only once the hands are apart, since else they take along what they touch."""
+        """Return a height to go to; it rises only once the hands are apart, because they lift what they touch."""
         way = height - self.middle[2]
         apart = ramp(self.half, self.apart - 0.02, self.apart - 0.005)
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
 
     def _close(self) -> float:
-        """Half the distance to which the hands are led to hold the thing firmly."""
+        """Return half the distance to which the hands are led to hold the object firmly."""
         return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
-        """From above to both sides of the thing, and closer until it is held."""
+        """Return middle and half distance of the hands on their way to the object.
+
+        They go from above to both sides of the object, then closer until it is held.
+        """
         take = self.take
         x, y, height = self.middle
         near = max(ramp(self.off, 0.06, 0.04), ramp(height, take.high - 0.03, take.high - 0.01))
@@ -111,7 +121,7 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Up first, then over the place, then down."""
+        """Return middle and half distance of the hands: up first, then over the place, then down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)

@@ -15,7 +15,7 @@ _FORK = {"FFJ3": 0.3, "LFJ3": -0.3, "MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1
 
 
 def push_blocks(hands: HandController) -> Actions:
-    """Each hand takes its block between forefinger and little finger and pushes it to its goal."""
+    """Take each block between forefinger and little finger of one hand and push it to its goal."""
     blocks = {"right": "block2", "left": "block1"}
     goals = {"right": "goal2", "left": "goal1"}
     for side in SIDES:
@@ -36,8 +36,14 @@ def push_blocks(hands: HandController) -> Actions:
             place = hands.where(f"{blocks[side]}/position")
             way = hands.frozen(goals[side])[:2] - place[:2]
             far = float(way.norm())
-            lead = way * (0.05 / far if far > 0.05 else 0.0 if far < 0.01 else 1.0)
+            if far > 0.05:
+                lead = way * (0.05 / far)
+            elif far < 0.01:
+                lead = way * 0.0
+            else:
+                lead = way * 1.0
             # Where the fork is, if it follows its block; it never runs ahead.
             ahead = float(lead[0])
-            points.append(beside(place, _BEHIND + ahead if ahead < -0.004 else _CLEAR, float(lead[1]), _LOW))
+            behind_block = _BEHIND + ahead if ahead < -0.004 else _CLEAR
+            points.append(beside(place, behind_block, float(lead[1]), _LOW))
         yield from hands.lead_each(points, 0.5)

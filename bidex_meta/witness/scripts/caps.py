@@ -1,6 +1,7 @@
 """Scripted policies in which one finger moves a part: a bottle's cap, and a cup by its ear."""
 
 import math
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -10,11 +11,11 @@ from bidex_meta.witness.controller import Actions, HandController, Point, beside
 
 _TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
 _HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
-_FIST = {f"{finger}J{joint}": 1.4 for finger in ("FF", "MF", "RF") for joint in (1, 2)}
+_FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"), (1, 2))}
 
 
 def pull_cap(hands: HandController) -> Actions:
-    """The left little finger presses on the cap's side and drags it along the bottle; friction keeps it there."""
+    """Press the left little finger on the cap's side and drag it along the bottle; friction keeps it there."""
     slide = float(hands.frozen("slide"))
     stay = point(hands.at("right"))
     for side in ("right", "left"):
@@ -22,7 +23,7 @@ def pull_cap(hands: HandController) -> Actions:
     ahead = _ahead(hands)
 
     def poke(back: float) -> Point:
-        """The left hand's point with the little finger so far before the cap, metres."""
+        """Return the left hand's point with the little finger ``back`` before the cap, metres."""
         cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
         return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
 
@@ -50,12 +51,12 @@ def pull_cap(hands: HandController) -> Actions:
 
 
 def _axis(hands: HandController) -> Tensor:
-    """Where the cap slides to, world."""
+    """Return the direction in which the cap slides, world."""
     return rotate(hands.orientation("bottle/quaternion"), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
 
 
 def _ahead(hands: HandController) -> Tensor:
-    """Where the left hand's straight fingers point, world."""
+    """Return the direction in which the left hand's straight fingers point, world."""
     way = hands.where("left/palm_position") - hands.where("left/mount_position")
     return way / way.norm()
 
@@ -71,7 +72,7 @@ _FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
 
 
 def swing_cup(hands: HandController) -> Actions:
-    """The left little finger, bent to a peg, pulls the left ear around; the right fingers push it on from behind."""
+    """Pull the left ear around with the left little finger, bent to a peg; the right fingers push it on from behind."""
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
     away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
@@ -80,7 +81,7 @@ def swing_cup(hands: HandController) -> Actions:
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """The left hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
+        """Return the left hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
         return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
     x, y, z = hands.at("left").tolist()
@@ -101,13 +102,16 @@ def swing_cup(hands: HandController) -> Actions:
 
 
 def _push_on(hands: HandController) -> Actions:
-    """The left hand makes room, and the right one pushes the ear to its goal with straight fingers."""
+    """Move the left hand aside, and push the ear to its goal with the right hand's straight fingers."""
     x, y, z = hands.at("left").tolist()
     back = (x + 0.05, y - 0.08, z)
     aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
-        """The right hand's point for a fingertip at an angle behind the ear, so far towards the hand."""
+        """Return the right hand's point for a fingertip at an angle behind the ear.
+
+        ``before`` is the distance from there towards the hand, metres.
+        """
         way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
         return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
 
@@ -122,20 +126,20 @@ def _push_on(hands: HandController) -> Actions:
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """The place at an angle behind the left ear on a circle about the cup, at a height above its origin."""
+    """Return the place at an angle behind the left ear on a circle about the cup, at a height above its origin."""
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle
     return cup + torch.tensor([radius * math.cos(at), radius * math.sin(at), height], dtype=cup.dtype)
 
 
 def _missing(hands: HandController) -> float:
-    """Angle by which the cup must yet turn, within half a turn, rad."""
+    """Return the angle by which the cup must yet turn, within half a turn, rad."""
     goal = hands.frozen("goal")
     wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
     return (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _yaw(hands: HandController) -> float:
-    """Angle of the right ear about the vertical, rad."""
+    """Return the angle of the right ear about the vertical, rad."""
     turn = hands.orientation("cup/quaternion")
     return 2.0 * math.atan2(float(turn[2]), float(turn[3]))

@@ -12,7 +12,7 @@ _ASIDE = 0.01  # of the hand's point from the egg in x while it closes, metres: 
 
 
 def carry_egg(hands: HandController) -> Actions:
-    """The right hand closes on the egg and carries it to its goal; the left one makes way."""
+    """Close the right hand on the egg and carry it to its goal; the left hand makes way."""
     # A throw that is caught and then brought to the goal is quicker, but a script cannot foresee where an egg flies.
     hands.bend("left", 0.0, 0.0)
     for side in ("right", "left"):

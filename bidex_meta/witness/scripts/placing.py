@@ -16,7 +16,7 @@ _OVER = 0.765
 
 
 def place_in_bucket(hands: HandController) -> Actions:
-    """Both hands clamp the bucket and carry it to its goal, then the block, and drop it in; what fails is repeated."""
+    """Clamp the bucket with both hands and carry it to its goal, then drop the block in; repeat what fails."""
     # A bucket that is dragged tips: friction acts 5 cm below its middle, and its foot is 3 cm wide.
     thumb_away = {"THJ3": 0.5, "THJ1": -0.5, "THJ0": -1.5}
     hands.bend("right", 0.0, 0.0, WRJ0=0.2, WRJ1=_WRIST, FFJ3=_SPREAD, **thumb_away)

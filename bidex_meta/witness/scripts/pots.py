@@ -16,7 +16,7 @@ _POUR = math.radians(50.0)
 
 
 def lift_underarm(hands: HandController) -> Actions:
-    """The hands go under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
+    """Bring the hands under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
     # A pot that is thrown to its goal pays before one that is lifted there.
     pot = hands.where("object/position")
     out = (hands.where("object/right_handle_position") - pot) / 0.15  # from the pot to the right grip, of length 1
@@ -43,7 +43,7 @@ def lift_underarm(hands: HandController) -> Actions:
 
 
 def pour_water(hands: HandController) -> Actions:
-    """The right hand grips the handle, the left goes under the spout; they lift the kettle and tilt it."""
+    """Grip the handle with the right hand, support the spout with the left, lift the kettle and tilt it."""
     # Water itself is not paid.
     kettle = hands.where("kettle/position")
     bucket = hands.where("bucket/position")
@@ -51,7 +51,7 @@ def pour_water(hands: HandController) -> Actions:
     back = back / back.norm()
 
     def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
-        """Leads the hands to where they hold a kettle at this place, or ``loose`` metres off it, ``aside`` in x."""
+        """Lead the hands to where they hold a kettle at ``origin``, or ``loose`` metres off it, ``aside`` in x."""
 
         def at(x: float, along: float, up: float) -> Point:
             flat = along * math.cos(tilt) - up * math.sin(tilt)

@@ -15,7 +15,7 @@ _EDGE = 0.05
 
 
 def stack_in_order(hands: HandController) -> Actions:
-    """The backs of both hands' fingers clamp the lower block, carry it to its target, and put the other on it."""
+    """Clamp the lower block with the backs of both hands' fingers, carry it, and stack the other on it."""
     second_above = hands.wide and float(hands.frozen("upper")) < 0.0
     upper, lower = ("block2", "block1") if second_above else ("block1", "block2")
     goals = {block: hands.frozen(f"goal{block[-1]}") for block in (upper, lower)}
@@ -39,7 +39,7 @@ def stack_in_order(hands: HandController) -> Actions:
 
 
 def _between(hands: HandController, block: str, other: str) -> Between:
-    """The hands and a block; there is little room where the other one is near."""
+    """Return the state of the hands and a block; there is little room if the other block is near."""
     x, y, _ = (hands.where(f"{other}/position") - hands.where(f"{block}/position")).tolist()
     if abs(x) < 0.075:
         room = max(0.08, min(_TAKE.apart, abs(y) - 0.025))

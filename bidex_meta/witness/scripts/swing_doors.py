@@ -26,7 +26,7 @@ class _Leaf:
     over: float
 
     def place(self, along: float, over: float, angle: float) -> tuple[float, float]:
-        """A point of the leaf that stands open by this angle towards the hands (away from them: negative)."""
+        """Return a point of the leaf that is open by this angle towards the hands (negative: away from them)."""
         sine = math.sin(angle)
         cosine = math.cos(angle)
         return self.hinge[0] + over * cosine + along * sine, self.hinge[1] + over * sine - along * cosine
@@ -37,17 +37,15 @@ _OUTWARD = _Leaf((-0.0085, 0.4265), 0.3752, 0.0830), _Leaf((-0.0056, 0.4204), 0.
 
 
 def open_inward(hands: HandController) -> Actions:
-    """Fingers bent to hooks go behind the bars from the side, and pull the leaves open; the hands turn with them."""
+    """Put bent fingers behind the bars from the side, and pull the leaves open; the hands turn with them."""
     # One leaf open and the other shut pays as much as both half open.
 
     def go(
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
     ) -> Actions:
-        """Hooks behind the bars of leaves that stand open by these angles, or ``aside`` and ``back`` of that."""
-        at = [
-            leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle)
-            for leaf, angle in zip(_INWARD, angles, strict=True)
-        ]
+        """Lead bent fingers behind the bars of leaves open by these angles, or ``aside`` and ``back`` of that."""
+        pairs = zip(_INWARD, angles, strict=True)
+        at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle) for leaf, angle in pairs]
         yield from _lead(hands, at, angles, steps, speed)
 
     for side in SIDES:
@@ -57,21 +55,19 @@ def open_inward(hands: HandController) -> Actions:
     yield from go(led, aside=0.11, steps=6, speed=0.5)
     yield from go(led, steps=15, speed=0.5)
     while hands.steps_left:
-        led = [
-            min(angle + 0.0075, now + 0.1, last)
-            for angle, now, last in zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
-        ]
+        triples = zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
+        led = [min(angle + 0.0075, now + 0.1, last) for angle, now, last in triples]
         yield from go(led)
 
 
 def close_outward(hands: HandController) -> Actions:
-    """Straight fingers go between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
+    """Put straight fingers between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
     # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded, since
     # more force straightens bent fingers.
     start = _angles(hands)
 
     def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Fingers behind the bars of leaves that stand open by these angles, or ``back`` of that."""
+        """Lead fingers behind the bars of leaves that are open by these angles, or ``back`` of that."""
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
         for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
@@ -89,21 +85,20 @@ def close_outward(hands: HandController) -> Actions:
     led = start
     lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
     while hands.steps_left:
-        led = [
-            max(angle - 0.012, now - 0.22, last) for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
-        ]
+        triples = zip(led, _angles(hands), lasts, strict=True)
+        led = [max(angle - 0.012, now - 0.22, last) for angle, now, last in triples]
         yield from go(led)
 
 
 def push(hands: HandController) -> Actions:
-    """Fists above the bars push the leaves away from the hands, each to its angle, and then let go of it."""
+    """Push the leaves away with fists above the bars, each to its angle, and then let go of it."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
     goals = [sign * goal for goal in _goals(hands, -0.1 if inward else 1.35)]  # inward they are shut
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Fists before leaves that stand open towards the hands by these angles, ``back`` from them."""
+        """Lead fists to leaves that are open towards the hands by these angles, at distance ``back``."""
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
         yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 
@@ -114,22 +109,20 @@ def push(hands: HandController) -> Actions:
     while hands.steps_left:
         now = [sign * angle for angle in _angles(hands)]
         left = [angle - goal for angle, goal in zip(now, goals, strict=True)]
-        led = [
-            max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1
-            for was, angle, more in zip(led, now, left, strict=True)
-        ]
+        triples = zip(led, now, left, strict=True)
+        led = [max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1 for was, angle, more in triples]
         yield from go(led, back=0.0)
 
 
 def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
-    """Angles of a task for the right and the left leaf, rad, ``less`` so much; ``usual`` where it has none."""
+    """Return the angles of a task for the right and the left leaf minus ``less``, rad; ``usual`` if it has none."""
     if hands.wide:
         return (hands.frozen("leaves") - less).tolist()
     return [usual, usual]
 
 
 def _angles(hands: HandController) -> list[float]:
-    """How far the right and the left leaf stand open, rad."""
+    """Return the angles by which the right and the left leaf are open, rad."""
     return [float(hands.where(f"object/hinge{leaf}_angle")) for leaf in (1, 2)]
 
 
@@ -141,7 +134,7 @@ def _lead(
     speed: float,
     height: float = _DOOR_HEIGHT,
 ) -> Actions:
-    """Moves the right hand to its point and the left one to its point mirrored, turned outwards."""
+    """Move the right hand to its point and the left one to its mirrored point, turned outwards."""
     middle = float(hands.where("object/position")[1])
     points: list[Point] = []
     for side, sign, (x, y), yaw in zip(SIDES, (1.0, -1.0), at, yaws, strict=True):

@@ -13,7 +13,7 @@ _LEVER = 0.035  # from a rocker's hinge to its button, metres
 
 
 def press_switches(hands: HandController) -> Actions:
-    """Fingertips press each button until its rocker has the angle asked for, and rise again."""
+    """Press each button with a fingertip until its rocker has the requested angle, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
     buttons = ("switch2", "switch1")  # of the right and the left hand
     for side in SIDES:
@@ -38,7 +38,8 @@ def press_switches(hands: HandController) -> Actions:
             above = _tip(hands, side, _button(hands, name), 0.06)
             height = float(hands.at(side)[2])
             down = min(0.008, max(0.002, 0.8 * _LEVER * left))
-            points.append((above[0], above[1], height + 0.01 if done[i] else height - down))
+            target = height + 0.01 if done[i] else height - down
+            points.append((above[0], above[1], target))
         yield from hands.lead_each(points, 0.6)
 
 
@@ -47,7 +48,7 @@ def _button(hands: HandController, name: str) -> Tensor:
 
 
 def _tip(hands: HandController, side: str, target: Tensor, height: float, finger: str = "mf") -> Point:
-    """Where the hand's point must go for a finger's last joint to be ``height`` metres above a target."""
+    """Return the hand's point that puts a finger's last joint ``height`` metres above a target."""
     goal = target + torch.tensor([0.0, 0.0, height], dtype=target.dtype)
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
@@ -56,7 +57,7 @@ _ENDS = {"right": "pen/cap_position", "left": "pen/body_position"}
 
 
 def open_pen(hands: HandController) -> Actions:
-    """Both hands close around the pen, at body and cap, and move apart to the gap asked for."""
+    """Close both hands around the pen, at body and cap, and move them apart to the requested gap."""
     gap = float(hands.frozen("gap"))
     while hands.steps_left:
         out = hands.where(_ENDS["right"]) - hands.where(_ENDS["left"])
@@ -72,7 +73,7 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Goes down to an end of the pen, closes around it, and then goes so far along it."""
+    """Return the hand's point on its way down to an end of the pen, around it, and then ``way`` along it."""
     end = hands.where(_ENDS[side]).clone()
     at = hands.at(side)
     end[0] -= 0.008
@@ -90,7 +91,7 @@ _HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of
 
 
 def open_scissors(hands: HandController) -> Actions:
-    """A bent finger of each hand goes into its loop; they pull the loops apart to the angle asked for, and rise."""
+    """Put a bent finger of each hand into its loop, pull the loops apart to the requested angle, and rise."""
     target = float(hands.frozen("target"))
     loops = {"right": "scissors/right_handle_position", "left": "scissors/left_handle_position"}
     for side in SIDES:

@@ -17,7 +17,7 @@ _FOLLOW = 0.5
 
 
 def turn_cubes(hands: HandController) -> Actions:
-    """Each hand stays below its cube until that lies in the cup, closes to a fist, and turns it at its goal."""
+    """Keep each hand below its cube until the cube lies in it, close to a fist, and turn the cube at its goal."""
     # Noise on the bases throws cubes off open hands, and a turn moves its cube, which costs as much as it earns. All is
     # a function of the state alone, so that it can be cloned.
     while hands.steps_left:
@@ -26,7 +26,7 @@ def turn_cubes(hands: HandController) -> Actions:
 
 
 def _next(hands: HandController, side: str) -> Point:
-    """Bends the fingers and turns a hand; returns where it should go."""
+    """Bend the fingers and turn a hand; return where it should go."""
     cube, goal = _CUBES[side]
     place = hands.where(f"{cube}/position")
     knuckles = _knuckles(hands, side, "position")
@@ -49,10 +49,10 @@ def _next(hands: HandController, side: str) -> Point:
 
 
 def _knuckles(hands: HandController, side: str, what: str) -> float:
-    """Mean angle, rad, or its speed, of three knuckles."""
+    """Return the mean angle, rad, or its speed, of three knuckles."""
     return sum(float(hands.where(f"{side}/{joint}_{what}")) for joint in _CUBE_KNUCKLES) / len(_CUBE_KNUCKLES)
 
 
 def _falls(value: float, low: float, high: float) -> float:
-    """1 up to ``low``, 0 from ``high`` on, linear between."""
+    """Return 1 up to ``low``, 0 from ``high`` on, linear between."""
     return min(1.0, max(0.0, (high - value) / (high - low)))
