@@ -45,6 +45,12 @@ ALGOS: dict[str, str] = {
     "iql": "bidex_algos.offline.iql:IQL",
 }
 
+USUAL_SETTINGS = (
+    "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "batch_per_task",
+    "updates_per_step",
+)  # fmt: skip
+"""Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those of its learner."""
+
 
 @dataclass(frozen=True)
 class LearnerKind:
