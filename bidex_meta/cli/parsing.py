@@ -133,7 +133,9 @@ def _short_help(options: type, command: str, default: object, usual: Mapping[str
     actions = {flag: action for action in parser._actions for flag in action.option_strings}
     doc = getattr(options, "__origin__", options).__doc__ or ""
     width = min(output_width(80), 100)
-    lines = [f"usage: bidex-meta {command} [OPTIONS]", "", *inspect.cleandoc(doc).splitlines()]
+    lines = [f"usage: bidex-meta {command} [OPTIONS]", ""]
+    for line in inspect.cleandoc(doc).splitlines():
+        lines += textwrap.wrap(line, width) or [""]
     for heading, flags in usual.items():
         lines += ["", f"{heading}:"]
         for flag in flags:

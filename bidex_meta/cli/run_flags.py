@@ -20,7 +20,7 @@ _USUAL: dict[str, tuple[str, ...]] = {
     "budget": ("--steps", "--minutes", "--stop-at-success", "--num-envs", "--device"),
     "data": ("--start-from", "--dataset", "--teacher"),
     "output": (
-        "--run-dir", "--resume", "--logger", "--evaluate-every", "--video-every", "--no-evaluate", "--print-config",
+        "--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config",
     ),
 }  # fmt: skip
 """Flags that ``run --help`` shows; the learner's stand in ``USUAL_SETTINGS``."""

@@ -46,8 +46,7 @@ ALGOS: dict[str, str] = {
 }
 
 USUAL_SETTINGS = (
-    "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "batch_per_task",
-    "updates_per_step",
+    "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "updates_per_step",
 )  # fmt: skip
 """Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those of its learner."""
 
