@@ -137,7 +137,7 @@ def verify(
 
 
 def recorded_evaluation(run: Path, named: Path | None = None) -> Json:
-    """The evaluation of a run folder, or another file of it, to compare with; all that is read of it checked.
+    """Return a run's recorded evaluation, or another file of the run, to compare with; check what is read of it.
 
     Raises BidexError where there is none, or it is damaged, or does not say how it was made.
     """
@@ -169,7 +169,7 @@ def _where(device: str, engine: str | None, then: Json, config: AnyConfig) -> An
 
 
 def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
-    """The checkpoint that was evaluated."""
+    """Return the checkpoint that was evaluated."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         if there:
@@ -187,7 +187,7 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
 def _again(
     folder: RunFolder, config: AnyConfig, worlds: Worlds, recorded: Json, num_envs: int | None, state: Json
 ) -> Json:
-    """The recorded evaluation, made again."""
+    """Repeat the recorded evaluation."""
     load = partial(policy_of, folder, state, config.device)
     if learner_kind(config.algo).make.adapts != ("splits" in recorded):
         if "splits" in recorded:
@@ -219,7 +219,7 @@ def _again(
 
 
 def recorded_conditions(evaluation: Json, versions: Json, config: AnyConfig) -> Json:
-    """The same of an evaluation as it was recorded; of an older one what its run was trained with.
+    """Return the conditions as they were recorded; for older evaluations those that the run was trained with.
 
     Of the contents of ``evaluation.json`` and ``versions.json`` (empty where there is none), and the run's config.
     """
@@ -231,7 +231,7 @@ def recorded_conditions(evaluation: Json, versions: Json, config: AnyConfig) -> 
 
 
 def others(then: Json, now: Json) -> list[str]:
-    """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
+    """Return a text per condition that differs from its record; the last names conditions that were not recorded."""
     texts = list(map(str, differences(then, now)))
     where = ("device", "engine", "threads")
     texts += [f"{name} {then[name]} then, {now[name]} now" for name in where if then.get(name) not in (None, now[name])]
