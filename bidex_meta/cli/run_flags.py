@@ -10,10 +10,20 @@ import tyro
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.config import LearnerSettings, RunConfig
 from bidex_meta.experiments.evaluating import USUAL_EVALUATION, FinalEvaluation
+from bidex_meta.experiments.learners import USUAL_SETTINGS
 from bidex_meta.experiments.run_config import resolve
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
+_USUAL: dict[str, tuple[str, ...]] = {
+    "task": ("--suite", "--task", "--algo", "--preset", "--seed"),
+    "budget": ("--steps", "--minutes", "--stop-at-success", "--num-envs", "--device"),
+    "data": ("--start-from", "--dataset", "--teacher"),
+    "output": (
+        "--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config",
+    ),
+}  # fmt: skip
+"""Flags that ``run --help`` shows; the learner's stand in ``USUAL_SETTINGS``."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,9 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     default = _defaults(arguments, folder)
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
-    flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=(), teacher=())))
+    start = RunFlags(replace(default, dataset=(), demonstrations=(), teacher=()))
+    settings = [f"--learner.{name.replace('_', '-')}" for name in USUAL_SETTINGS]
+    flags = parse(options, arguments, "run", start, _USUAL | {f"learner ({default.algo})": settings})
     is_named = folder is not None or any(peek(arguments, f"--{name}") for name in ("suite", "task", "dataset"))
     config = replace(
         flags.config,

@@ -61,12 +61,12 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
-    """Data sets as a config holds them: of folders the whole path, since a run may be resumed from another folder."""
+    """Return data sets as a config holds them; folders get whole paths, because a run may resume in another folder."""
     return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 
 
 def open_datasets(names: Sequence[str]) -> list[Dataset]:
-    """Data sets by names or folders; errors as of ``open_dataset``."""
+    """Open data sets by names or folders; errors are those of ``open_dataset``."""
     return [open_dataset(name) for name in names]
 
 
@@ -90,7 +90,7 @@ def implied(datasets: Sequence[Dataset]) -> Json:
 
 
 def task_seed(datasets: Sequence[Dataset]) -> int | None:
-    """The seed of the tasks that the first data set was collected on: a learner is evaluated on those."""
+    """Return the seed of the tasks of the first data set: a learner is evaluated on those tasks."""
     if datasets:
         return datasets[0].metadata.get("seed")
     return None

@@ -23,6 +23,25 @@ def test_help_and_lists_need_no_torch():
     assert all(name in done.stdout for name in named) and done.stdout.rstrip().endswith("set()")
 
 
+def test_the_help_of_run_fits_three_screens_and_that_of_all_flags_names_them_all(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    for algo in ("mtppo", "mtsac", "maml"):
+        brief = help_of("--algo", algo, "--help", capsys=capsys)
+        assert len(brief.splitlines()) <= 3 * 24 and "--suite" in brief and "--learner.gamma" in brief
+        assert max(map(len, brief.splitlines())) <= 80
+    every = help_of("--help-all", capsys=capsys)
+    flags = set(re.findall(r"^  (--[a-z-]+(?:\.[a-z-]+)?)", every, re.MULTILINE))
+    assert flags >= {"--engine", "--learner.desired-kl", "--split"} and "--learner.desired-kl" not in brief
+
+
+def help_of(*words, capsys):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["run", *words])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
 def test_lists_read_from_source_are_as_the_classes_say(shown):
     suites = {row["name"]: row for row in json.loads(shown("list", "suites", "--json"))}
     assert suites["ML4"]["test_classes"] == ["TwoCatchUnderarm"]
