@@ -198,7 +198,7 @@ def _draw(out: Path, steps: Sequence[Json], shots: Sequence[Json]) -> None:
         _save(plots.draw_panels(panels, TAG, "success", unit), out / "demonstrations.png")
 
 
-def _save(figure: plots.Figure, out: Path) -> None:
+def _save(figure: "plots.Figure", out: Path) -> None:
     for axis in figure.axes:
         axis.set_ylim(-0.02, 1.02)
     plots.save(figure, out)
