@@ -181,7 +181,7 @@ def _draw(out: Path, steps: Sequence[JsonObject], shots: Sequence[JsonObject]) -
         _save(plots.draw_panels(panels, TAG, "success", unit), out / "demonstrations.png")
 
 
-def _save(figure: plots.Figure, out: Path) -> None:
+def _save(figure: "plots.Figure", out: Path) -> None:
     for axis in figure.axes:
         axis.set_ylim(-0.02, 1.02)
     plots.save(figure, out)

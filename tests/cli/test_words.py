@@ -1,6 +1,7 @@
 """Names, hints and completion: the words of the command line."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
