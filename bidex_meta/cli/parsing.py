@@ -130,7 +130,9 @@ def _short_help(options: type, command: str, default: object, usual: Mapping[str
     """Return the usual flags under their headings, each with the first sentence of its help and its default."""
     with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
         parser = tyro.extras.get_parser(options, default=default)
-    actions = {flag: action for action in parser._actions for flag in action.option_strings}
+    actions = {}
+    for action in parser._actions:
+        actions |= dict.fromkeys(action.option_strings, action)
     doc = getattr(options, "__origin__", options).__doc__ or ""
     width = min(output_width(80), 100)
     lines = [f"usage: bidex-meta {command} [OPTIONS]", ""]

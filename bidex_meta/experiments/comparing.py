@@ -1,6 +1,7 @@
 """Tables of groups of runs that differ in the seed alone."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -19,10 +20,9 @@ def group_row(group: Group, first: Group) -> Json:
     for name, own, over in measures:
         row[f"{name}_iqm"] = None if own is None else vars(iqm_over_seeds(own))
         row[f"{name}_over_first"] = None if over is None else vars(over)
-    row["classes"] = {
-        name: {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
-        for i, name in enumerate(group.classes)
-    }
+    row["classes"] = {}
+    for i, name in enumerate(group.classes):
+        row["classes"][name] = {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
     return row
 
 
@@ -46,7 +46,7 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows of a table with one row per class and group: mean over seeds, and range of seeds."""
     rows = []
-    for name in dict.fromkeys(name for group in groups for name in group.classes):
+    for name in dict.fromkeys(chain.from_iterable(group.classes for group in groups)):
         for group in groups:
             if name not in group.classes:
                 continue

@@ -333,15 +333,17 @@ def _demonstrations(settings: RecordConfig) -> _Collection:
             return Scripted(world, settings.noise, seed)
         return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], settings.noise, seed)
 
+    if settings.script:
+        replays = f"episodes of {name}'s scripted policy"
+        mend = ""
+    else:
+        replays = f"replays of {name}'s witness"
+        mend = " or play --starts witness" if on_tasks else " or --shift"
+
     def play(world: PooledWorld, out: DatasetWriter) -> None:
         while (now := progress(out)).steps[0] < size:
             if not now.steps[0] and out.parts >= _PATIENCE:
-                what, mend = (
-                    (f"episodes of {name}'s scripted policy", "")
-                    if settings.script
-                    else (f"replays of {name}'s witness", f" or {'play --starts witness' if on_tasks else '--shift'}")
-                )
-                raise BidexError(f"None of {_PATIENCE * rows} {what} succeeds. Lower --noise{mend}.")
+                raise BidexError(f"None of {_PATIENCE * rows} {replays} succeeds. Lower --noise{mend}.")
             collect_successes(world, lambda seed: agent(world, seed), out, settings.seed)
             after = progress(out)
             stored = after.episodes[0] - now.episodes[0]

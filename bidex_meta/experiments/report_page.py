@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -37,6 +38,9 @@ def render(runs: Sequence[Run]) -> str:
     configs = [run.config() for run in runs]
     algos = ", ".join(dict.fromkeys(config.algo for config in configs))
     subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
+    short_names = {}
+    for name, history in named:
+        short_names |= {run.path: name for run in history.runs}
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
@@ -44,7 +48,7 @@ def render(runs: Sequence[Run]) -> str:
         title=f"{algos} on {subjects}",
         groups=[(name, history.label, len(history.runs)) for name, history in named],
         runs=[_run(run, names[run.path]) for run in runs],
-        final=_final(runs, {run.path: name for name, history in named for run in history.runs}),
+        final=_final(runs, short_names),
         learning=_picture(lambda: plots.draw_learning(curves)),
         speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
         adaptation=list(_adaptation(runs, names)),
@@ -82,14 +86,16 @@ def _run(run: Run, name: str) -> Json:
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
+    speed = f"{median(speeds):,.0f}" if speeds else NONE
+    dirty = "+" if git.get("dirty") else ""
     return {
         "name": name, "path": portable(str(run.path)), "on": portable(config.suite or config.task),
         "steps": f"{max((row['step'] for row in rows), default=0):,}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
-        "speed": f"{median(speeds):,.0f}" if speeds else NONE,
+        "speed": speed,
         "environments": f"{config.num_envs:,}",
         "device": f"{config.device} ({hardware})",
-        "commit": (git.get("commit") or NONE)[:10] + ("+" if git.get("dirty") else ""),
+        "commit": (git.get("commit") or NONE)[:10] + dirty,
     }  # fmt: skip
 
 
@@ -127,7 +133,7 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
 def _differences(runs: Sequence[Run], names: dict[Path, str]) -> Json:
     """Return the entries of config and versions that are not the same in all runs."""
     columns = [flat(portable(run.config().to_json())) | flat({"versions": run.versions()}) for run in runs]
-    keys = dict.fromkeys(key for column in columns for key in column)
+    keys = dict.fromkeys(chain.from_iterable(columns))
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
     cells = [[key, *map(_cell, (column.get(key) for column in columns))] for key in differing]
     return {"names": [names[run.path] for run in runs], "rows": cells}

@@ -59,11 +59,12 @@ def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
     Raises BidexError for a run that cannot teach here.
     """
     knows = {name: _scripted(source) if name == SCRIPTS else _known_to(name, source) for name in names}
-    return {
-        task: next(name for name in names if task in knows[name])
-        for task in source.task_classes()
-        if any(task in known for known in knows.values())
-    }
+    teachers = {}
+    for task in source.task_classes():
+        knowing = [name for name in names if task in knows[name]]
+        if knowing:
+            teachers[task] = knowing[0]
+    return teachers
 
 
 def _scripted(source: Worlds) -> set[str]:

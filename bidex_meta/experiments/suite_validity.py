@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -45,14 +46,16 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
     rows: dict[str, Json] = {}
     for slot in world.slots:
         found = results[slot.name]
-        hidden = [name for part in slot.task_class.hides() for name in part.names]
+        hidden = list(chain.from_iterable(part.names for part in slot.task_class.hides()))
         known = {name: result.success for name, result in found.items() if name not in (*_NOTHING, "witness", "misled")}
         aligned = alignment(found)
+        identified = _identified(slot, worlds) if hidden else {"identified": None}
+        untrained = {name: found[name].success if name in found else None for name in (*_NOTHING, "witness")}
         rows[slot.name] = {
             "hidden": hidden,
             "blind": blind_ceiling(slot.task_class, seed=worlds.seed),
-            **(_identified(slot, worlds) if hidden else {"identified": None}),
-            **{name: found[name].success if name in found else None for name in (*_NOTHING, "witness")},
+            **identified,
+            **untrained,
             "solved": max(known.values(), default=None),
             "alignment": aligned and asdict(aligned),
             "policies": {name: [each.success, each.mean_return] for name, each in found.items()},

@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from statistics import mean
 from types import FrameType
@@ -369,7 +370,8 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
         except ValueError:
             message = f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
             raise BidexError(message) from None
-        chosen = list(dict.fromkeys(core for ends in parts for core in usable[min(ends) : max(ends) + 1]))
+        ranges = [usable[min(ends) : max(ends) + 1] for ends in parts]
+        chosen = list(dict.fromkeys(chain.from_iterable(ranges)))
     count = workers or (1 if asked is None else len(chosen))
     if count > len(chosen):
         raise BidexError(f"--workers: expected at most {len(chosen)}, one for each core, got {count}.")

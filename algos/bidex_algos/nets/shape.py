@@ -70,9 +70,8 @@ def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: S
     """Raise BidexError if an option needs the tasks' one-hot and the world does not show it."""
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
-        wanted = [
-            option for option in wanted if option not in _OF_SEVERAL
-        ]  # one task needs no one-hot, but cannot have heads
+        # One task needs no one-hot, but cannot have heads.
+        wanted = [option for option in wanted if option not in _OF_SEVERAL]
     architecture = vars(config).get("architecture", "shared")
     if not shares_a_trunk(architecture):
         wanted.append(f"architecture {architecture}")
