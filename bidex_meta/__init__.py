@@ -27,21 +27,27 @@ if TYPE_CHECKING:
     from bidex_meta.experiments.learners import learner_class
     from bidex_meta.experiments.plotting import plot
     from bidex_meta.experiments.policies import load_policy
+    from bidex_meta.experiments.recording import RecordConfig, record
+    from bidex_meta.experiments.sweep_plan import SweepPlan
+    from bidex_meta.experiments.sweeping import sweep
     from bidex_meta.experiments.training import train
+    from bidex_meta.experiments.transferring import transfer
     from bidex_meta.experiments.verifying import verify
     from bidex_meta.runs import RunFolder
     from bidex_meta.world import World
 
 __all__ = [
-    "Benchmark", "BidexError", "RunConfig", "RunFolder", "Suite", "Task", "World", "__version__", "evaluate",
-    "learner_class", "load_policy", "load_suite", "make_task_world", "meta_test", "plot", "suite_names", "train",
-    "verify",
+    "Benchmark", "BidexError", "RecordConfig", "RunConfig", "RunFolder", "Suite", "SweepPlan", "Task", "World",
+    "__version__", "evaluate", "learner_class", "load_policy", "load_suite", "make_task_world", "meta_test", "plot",
+    "record", "suite_names", "sweep", "train", "transfer", "verify",
 ]  # fmt: skip
 
 _LAZY = {
     "Benchmark": "bidex_meta.benchmark",
+    "RecordConfig": "bidex_meta.experiments.recording",
     "RunConfig": "bidex_meta.config",
     "RunFolder": "bidex_meta.runs",
+    "SweepPlan": "bidex_meta.experiments.sweep_plan",
     "Task": "bidex_meta.benchmark",
     "World": "bidex_meta.world",
     "evaluate": "bidex_meta.experiments.evaluating",
@@ -50,7 +56,10 @@ _LAZY = {
     "make_task_world": "bidex_meta.benchmark",
     "meta_test": "bidex_meta.experiments.evaluating",
     "plot": "bidex_meta.experiments.plotting",
+    "record": "bidex_meta.experiments.recording",
+    "sweep": "bidex_meta.experiments.sweeping",
     "train": "bidex_meta.experiments.training",
+    "transfer": "bidex_meta.experiments.transferring",
     "verify": "bidex_meta.experiments.verifying",
 }
 

@@ -14,22 +14,8 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import (
-    MOST_POINTS,
-    OTHER_SEED,
-    OTHERS,
-    SPLITS,
-    V2,
-    ListedTask,
-    Randomisation,
-    Rules,
-    Split,
-    Suite,
-    SuiteClass,
-    load_suite,
-    plain_name,
-    versioned_name,
-)
+from bidex_meta.rules import V2, Randomisation, Rules, plain_name, versioned_name
+from bidex_meta.suite import MOST_POINTS, OTHER_SEED, OTHERS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace

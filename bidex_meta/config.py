@@ -38,7 +38,7 @@ _WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
 """Fields that no ``config.json`` may lack."""
 
 MAY_CHANGE = {"may_change": True}
-"""Metadata of a field that a resumed run may be given anew: it changes nothing of what is learned."""
+"""Metadata of a field that a resumed run may change, because it does not affect what is learned."""
 
 
 def _whole_number(words: list[str]) -> int:
@@ -66,6 +66,10 @@ Steps = Annotated[
 
 Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 """A flag that may be given several times."""
+
+
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""A flag without a value and without a ``--no-`` twin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,11 +112,11 @@ class RunConfig(Generic[LearnerSettings]):
     the training. Building the world before and evaluations, also the last one, are not counted: of short runs they can
     take longer. None: as long as --steps take."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every so many iterations, one episode for up to ten tasks of each class (at least ten overall; learners
+    """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
     that adapt: one shot on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect training.
     None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Film one environment of each class every so many iterations, into videos/ and the logger. None: never."""
+    """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Where metrics, config and films go beside metrics.jsonl."""
     dataset: Several = ()
@@ -122,13 +126,13 @@ class RunConfig(Generic[LearnerSettings]):
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
-    --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
+    --algo mtppo and ppo, see --learner.demonstration-batch. Given several times: all of them."""
     teacher: Several = ()
     """With --algo dagger, icl, mtppo and ppo: who labels what the policy comes to. scripts: the scripts of all classes
     that have one; or the folder of a run on the same suite, or on one of its classes alone. Given several times: each
     class takes the first that knows it."""
     record: Steps = 0
-    """Keep about so many transitions of the training as the data set replay/ in the run's folder, whole episodes of
+    """Keep about this many transitions of the training as the data set replay/ in the run's folder, whole episodes of
     some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
     """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""

@@ -21,7 +21,7 @@ def main(
     seed: int = 0,
     out: Path = Path("runs/optuna"),
 ) -> optuna.Study:
-    """Searches and prints the best trial.
+    """Search, and print the best trial.
 
     Args:
         suite: A multi-task suite, e.g. MT4.

@@ -59,7 +59,7 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, batch: Tensor) -> None:
-        """Takes in observations (n, d)."""
+        """Update the statistics with observations (n, d)."""
         total = self.count + len(batch)
         delta = batch.mean(0) - self.mean
         spread = self.variance * self.count + batch.var(0, correction=0) * len(batch)
@@ -92,7 +92,7 @@ class Agent(nn.Module):
         return self.critic(self.normalise(obs)).squeeze(-1)
 
     def policy(self, obs: Tensor) -> torch.distributions.Independent:
-        """The distribution of actions."""
+        """Return the distribution of actions."""
         normal = torch.distributions.Normal(self.actor(self.normalise(obs)), self.log_std.exp())
         return torch.distributions.Independent(normal, 1)
 

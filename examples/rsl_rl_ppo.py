@@ -14,7 +14,7 @@ NETWORK = {"class_name": "MLPModel", "hidden_dims": [256, 256, 128], "activation
 
 
 def config(rollout: int, seed: int) -> dict:
-    """What rsl-rl's runner is told; `obs_groups` maps its networks to the groups of the environment."""
+    """Return the configuration of rsl-rl's runner; `obs_groups` maps its networks to the groups of the environment."""
     return {
         "seed": seed,
         "num_steps_per_env": rollout,

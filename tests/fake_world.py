@@ -7,10 +7,11 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.world.base import make_spaces, split_envs
+from bidex_meta.world.base import split_envs
 from bidex_meta.world.checked import clean
 from bidex_meta.world.contract import Info, Options, State, Step, plain_groups
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
@@ -46,9 +47,10 @@ class FakeWorld(ABC):
         self.autoreset_mode = checked_mode(mode)
         self.metadata: Info = {"autoreset_mode": self.autoreset_mode}
         self.num_id_columns = self.num_tasks if one_hot else 0
-        spaces = make_spaces(Box(-np.inf, np.inf, (sizes[0],), np.float32), sizes[1], num_envs)
-        self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
-        self.observation_space, self.action_space = spaces.observation, spaces.action
+        self.single_observation_space = Box(-np.inf, np.inf, (sizes[0],), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (sizes[1],), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_groups = plain_groups(sizes[0], self.num_id_columns)
         self.slot_env_ids = split_envs(num_envs, self.num_tasks)
         counts = torch.tensor([rows.stop - rows.start for rows in self.slot_env_ids])

@@ -57,7 +57,10 @@ def names() -> Iterator[tuple[str, Any]]:
     yield "gymnasium", sorted(each for each in gymnasium.registry if each.startswith("bidex-meta/"))
     commands = re.findall(r"^  ([a-z]+)  ", command("--help"), re.MULTILINE)
     for name in commands:
-        yield f"command {name}", sorted(set(re.findall(r"(?<![\w-])--[a-z][\w.-]*", command(name, "--help"))))
+        text = command(name, "--help")
+        if "--help-all" in text:
+            text = command(name, "--help-all")
+        yield f"command {name}", sorted(set(re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)))
     for kind in ("suites", "tasks", "algos"):
         yield f"list {kind}", json.loads(command("list", kind, "--json"))
 

@@ -20,6 +20,7 @@ SHARED = ("advantages", "balancing", "labelled", "nets", "replay", "rollout", "t
 ORDER = (
     ("errors", "agents", "bidex_algos"),
     ("utils",),
+    ("ladder", "rules"),
     ("engine", "hands", "suite"),
     ("config", "tasks"),
     ("runs", "world"),

@@ -2,12 +2,14 @@
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import re
 import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -135,7 +137,10 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_extras_that_pages_and_messages_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for path in (*PAGES, *(ROOT / "bidex_meta").rglob("*.py"), *(ROOT / "examples").glob("*.py")):
+    for path in (
+        *PAGES,
+        *(path for folder in ("bidex_meta", "algos", "examples") for path in (ROOT / folder).rglob("*.py")),
+    ):
         text = path.read_text(encoding="utf-8")
         named = [name.strip() for each in re.findall(r"bidex-meta\[([\w, -]+)\]", text) for name in each.split(",")]
         for rest in re.findall(r"needs the extra (`[^.]*)", text):
@@ -158,3 +163,41 @@ def _prose(page: Path) -> int:
 def test_the_documentation_is_short() -> None:
     words = {page: _prose(page) for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "notes"}
     assert sum(words.values()) <= 19_000, sorted(words.items(), key=lambda item: -item[1])[:8]
+
+
+@pytest.fixture
+def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("site_build", ROOT / "docs" / "site" / "build.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "STAGE", tmp_path / "pages")
+    return module
+
+
+def test_navigation_has_every_page_once(build: ModuleType) -> None:
+    pages = sorted(page.relative_to(ROOT).as_posix() for page in build.stage())
+    config = (ROOT / "docs" / "site" / "mkdocs.yml").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"[\w/-]+\.md\b", config.partition("\nnav:")[2])) == pages
+
+
+def test_what_pages_link_to_is_staged(build: ModuleType) -> None:
+    build.stage()
+    for page in build.STAGE.rglob("*.md"):
+        for found in build.LINK.finditer(page.read_text(encoding="utf-8")):
+            assert (page.parent / found[2]).is_file(), f"{page.name}: {found[0]}"
+
+
+def test_mkdocs_builds_it_and_it_loads_nothing_from_elsewhere(build: ModuleType, tmp_path: Path) -> None:
+    mkdocs_config = pytest.importorskip("mkdocs.config", reason="needs the extra docs: `make docs`")
+    pytest.importorskip("material", reason="needs the extra docs")
+    from mkdocs.commands.build import build as make  # pyright: ignore[reportMissingImports]
+
+    build.stage()
+    config = ROOT / "docs" / "site" / "mkdocs.yml"
+    made = tmp_path / "site"
+    make(mkdocs_config.load_config(str(config), docs_dir=str(build.STAGE), site_dir=str(made)))
+    for page in made.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=\"?https?:", text), page
+        assert 'class="mermaid"' not in text, "mermaid's script would be loaded from a network"

@@ -9,7 +9,6 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
-from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import filming
 from bidex_meta.experiments.policies import checkpoint
 from bidex_meta.runs import RunFolder, read_metrics
@@ -76,28 +75,6 @@ def test_environments_of_a_suites_classes_show_its_points(tmp_path: Path) -> Non
     kinds = obs[-48:].reshape(12, 4)[:, 3]
     assert set(kinds.tolist()) <= {1.0, 0.0, -1.0}
     assert Benchmark("MT4").train_classes["HandOver"]().observation_space.shape == (len(obs) - 48,)
-
-
-@pytest.mark.parametrize(
-    "table", ["points = 3", *(f"[points]\n{line}" for line in ("count = 0", "count = 99999", "kind = 1"))]
-)
-def test_bad_tables_are_one_line(table: str, tmp_path: Path) -> None:
-    with pytest.raises(BidexError, match=r"points|count|kind"):
-        load_suite(suite_file(tmp_path, table))
-
-
-@pytest.mark.parametrize(
-    ("flags", "told"),
-    [
-        (["--task", "HandOver", "--points", "-1"], "--points: "),
-        (["--suite", "MT4", "--points", "99999"], "16384"),
-        (["--suite", "metaworld/MT10", "--points", "16"], "scenes of our own"),
-        (["--suite", "ML1", "--algo", "maml", "--points", "16", "--threads", "1"], "does not read point clouds"),
-    ],
-)
-def test_what_cannot_be_is_one_line(flags, told, tmp_path, capsys):
-    assert main(["run", *flags, "--run-dir", str(tmp_path / "a")]) == 2
-    assert told in capsys.readouterr().err
 
 
 def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:

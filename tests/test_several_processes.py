@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.cli.run_flags import config_of_words
+from bidex_meta.cli.run_flags import run_flags
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_config, training
@@ -185,7 +185,7 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
     for name, value in places.items():
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(run_config, "usable_cores", lambda: 10)
-    config = config_of_words(["--suite", "MT4", "--device", "cpu"])
+    config = run_flags(["--suite", "MT4", "--device", "cpu"]).config
     assert (config.threads, config.processes, config.device) == (2, 8, "cpu")
     assert launch().own_device("cuda") == "cuda:1"
     assert resume_command(Path("r"), 8).startswith("torchrun --nnodes 2 --nproc-per-node 4 -m bidex_meta.cli")
@@ -194,15 +194,15 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
 
 
 def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = RunFolder.create(config_of_words(SMALL), tmp_path / "r")
+    folder = RunFolder.create(run_flags(SMALL).config, tmp_path / "r")
     config = folder.config().to_json()
     del config["processes"]
     folder.config_path.write_text(json.dumps(config))
-    assert config_of_words(["--resume", str(tmp_path / "r")]).processes == 1
+    assert run_flags(["--resume", str(tmp_path / "r")]).config.processes == 1
 
 
 def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = config_of_words(SMALL)
+    config = run_flags(SMALL).config
 
     def agree(step: int | None = None, **other: object) -> AnyConfig:
         everyone = SimpleNamespace(share=lambda mine: [mine, (replace(config, **other), step)])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.cli.bench import paired_steps
+from bidex_meta.experiments.world_speed import paired_steps
 from tests.world.play import suite_world
 
 FEW = ["--num-envs", "8", "--steps", "2", "--repeats", "3", "--threads", "1"]
@@ -20,32 +20,9 @@ def test_bench_world_prints_both_speeds_and_their_ratio(capsys: pytest.CaptureFi
     for name in ("env_steps_per_s", "engine_steps_per_s"):
         assert 10 < found[name] < 1e6
     assert 0.05 < found["ratio"] < 20.0
-
-
-def test_bench_world_as_a_table_of_mt4(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "world", *FEW]) == 0
     shown = capsys.readouterr().out
     assert "ratio" in shown and "MT4" in shown
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("world --steps 0", "--steps of 1 or more"),
-        ("world --repeats 0", "--repeats: expected a whole number >= 1"),
-        ("world --suite MT5", "MT4"),
-        ("world --device tpu", "device: expected auto"),
-        ("world --engine d", "Unknown engine"),
-        ("world --against HEAD", "Unknown flag --against"),
-        ("soak", "Unknown bench 'soak'"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused_in_one_line(
-    words: str, expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", *words.split()]) == 2
-    error = capsys.readouterr().err
-    assert expected in error and error.count("\n") == 1
 
 
 def test_the_bare_engines_do_the_physics_of_the_world() -> None:

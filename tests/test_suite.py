@@ -91,6 +91,12 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
         Benchmark(write(tmp_path, text.replace("water =", "watr =")))
 
 
+@pytest.mark.parametrize(("name", "told"), [("crate", "Unknown object 'crate'"), ("missing.xml", "missing.xml")])
+def test_an_object_that_is_not_there_is_named(name: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match=rf"own\.toml.*{told}"):
+        Benchmark(write(tmp_path, META.replace('split = "test"', f'split = "test"\nobjects = ["{name}"]')))
+
+
 def test_names_and_paths(tmp_path: Path) -> None:
     file = write(tmp_path, META)
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
@@ -131,6 +137,13 @@ FAULTS = {
     "a text option": (META, 'split = "test"', 'options = {water = "3"}', "classes[1].options.water: expected"),
     "a number as object": (META, 'split = "test"', "options = {object = 3}", "classes[1].options.object: expected"),
     "object and objects": (META, *BOTH, "classes[1].objects: expected either"),
+    "no objects": (META, 'split = "test"', "objects = []", "classes[1].objects: expected"),
+    "a number of objects": (META, 'split = "test"', "objects = 3", "classes[1].objects: expected"),
+    "a number among objects": (META, 'split = "test"', 'objects = ["egg", 3]', "objects[1]: expected"),
+    "an object twice": (META, 'split = "test"', 'objects = ["egg", "egg"]', "each name once"),
+    "points as a number": (META, "version = 1", "version = 1\npoints = 3", "points: expected"),
+    "no points": (META, "version = 1", "version = 1\npoints = {count = 0}", "points.count: expected"),
+    "points by another name": (META, "version = 1", "version = 1\npoints = {kind = 1}", "points.kind: unknown"),
     "too many points": (META, "version = 1", "version = 1\npoints = {count = 20000}", "points.count: expected"),
     "overlap": (LISTED, "goal_x = 0.1", "goal_x = 0.0", "train and test tasks that differ, got 'near' and 'far'"),
     "task twice": (LISTED, '"far"', '"near"', "classes[0].tasks.name: expected each name once"),

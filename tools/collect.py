@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from torch import nn
 
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.policies import load_policy
-from bidex_meta.experiments.sweep_plan import read_sweep
+from bidex_meta.experiments.sweep_plan import SweepPlan
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation, evaluation_json
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
@@ -34,6 +35,8 @@ _TAG = re.compile(
     r"|Perf/steps_per_second"
 )
 _TRAINED = "Train/return/"
+_OF_A_RUN = ("task", "algo", "seed", "learner")
+"""Entries of a config in which a run of the same name must not differ."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """What is kept of a class after each shot; the evaluation after the last one has counts and lengths too."""
 
@@ -54,12 +57,13 @@ def collect(
     """
     contents = {run.content["name"]: run.content for run in read_study(into)} if into.exists() else {}
     added: list[str] = []
-    for path, label in [named for given in runs for named in _named(given, out)]:
+    for path, label in chain.from_iterable(_named(given, out) for given in runs):
         folder = RunFolder.open(path)
         content = condensed(folder, arm or label, _parameters(folder))
         name = content["name"]
         known = contents.get(name)
-        if name in added or (known is not None and _is_another(known["config"], content["config"])):
+        another = known is not None and any(known["config"].get(key) != content["config"][key] for key in _OF_A_RUN)
+        if name in added or another:
             raise BidexError(f"{into}:{name} is another run than {path}. Rename the run's folder, or remove the entry.")
         contents[name] = content
         added.append(name)
@@ -71,17 +75,12 @@ def collect(
             print(f"{name} was made by changed code: its commit alone does not make it again.", file=sys.stderr)
 
 
-def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dict[str, Any]:
+def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> Json:
     """Return the entry of an evaluated run in the file of a study.
 
-    Args:
-        folder: The run.
-        arm: The run's name in its study, without the seed; None: see :func:`arm_of`.
-        parameters: Number of the policy's parameters; None if unknown.
-
-    Raises:
-        BidexError: The run is not evaluated, its evaluation is of another run or of fewer steps, or its commit is not
-            known.
+    ``arm`` is the run's name in its study, without the seed (None: see :func:`arm_of`); ``parameters`` is the number of
+    the policy's parameters, if known. Raises BidexError if the run is not evaluated, its evaluation is of another run
+    or of fewer steps, or its commit is not known.
     """
     config = folder.config().to_json()
     evaluation = folder.evaluation()
@@ -103,7 +102,7 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dic
     }
 
 
-def arm_of(path: Path, config: dict[str, Any]) -> str:
+def arm_of(path: Path, config: Json) -> str:
     """Return the name of a run's folder without suite and seed; if only a date is left, return the learner's name."""
     subject = Path(str(config["suite"] or short_name(config["task"]))).stem
     name = re.sub(r"[-_ ]*(s|seed)[-_]?\d+$", "", path.resolve().name, flags=re.IGNORECASE)
@@ -116,17 +115,13 @@ def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
     """Return run folders; for a sweep, the folders of the ended runs, with the names of their arms."""
     if path.suffix != ".toml":
         return [(path, None)]
-    runs = read_sweep(path, out).runs
+    runs = SweepPlan.read(path, out).runs
     ended = [(run.path, run.arm) for run in runs if run.folder.evaluated]
     if not ended:
         raise BidexError(f"{path}: no run of it has ended under {out}. Run it: bidex-meta sweep {path}")
     if len(ended) < len(runs):
         print(f"{path}: {len(runs) - len(ended)} of {len(runs)} runs have not ended: left out.", file=sys.stderr)
     return list(ended)
-
-
-def _is_another(known: dict[str, Any], config: dict[str, Any]) -> bool:
-    return any(known.get(name) != config[name] for name in ("task", "algo", "seed", "learner"))
 
 
 def _parameters(folder: RunFolder) -> int | None:
@@ -136,7 +131,7 @@ def _parameters(folder: RunFolder) -> int | None:
     return sum(each.numel() for each in module.parameters()) if isinstance(module, nn.Module) else None
 
 
-def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[dict[str, Any]]) -> None:
+def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> None:
     """Raise BidexError for a run whose table nobody could trust or repeat."""
     if not rows:
         raise BidexError(f"{folder.metrics_path} holds nothing: not a run that has trained. Name another.")
@@ -159,7 +154,8 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[dict[str, An
             f"{folder.path} was trained with other worlds than its evaluation's: {', '.join(other)}. Evaluate it "
             "with the versions in versions.json."
         )
-    trained = {tag.removeprefix(_TRAINED) for row in rows for tag in row if tag.startswith(_TRAINED)}
+    tags = set().union(*rows)
+    trained = {tag.removeprefix(_TRAINED) for tag in tags if tag.startswith(_TRAINED)}
     if isinstance(evaluation, MetaTestEvaluation):
         if "train" not in evaluation.splits:
             return  # a meta-test of test tasks alone (--split test) may have no class in common
@@ -175,7 +171,7 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[dict[str, An
         )
 
 
-def _suite(name: str | None) -> dict[str, Any] | None:
+def _suite(name: str | None) -> Json | None:
     """Return name and version of a suite; also the whole file if the suite is not a shipped one."""
     if name is None:
         return None
@@ -185,13 +181,15 @@ def _suite(name: str | None) -> dict[str, Any] | None:
     return {"name": suite.name, "version": suite.version, "file": read_text(Path(name), "a suite file")}
 
 
-def _engine(config: dict[str, Any]) -> str:
+def _engine(config: Json) -> str:
     """Return the engine that stepped the run; the device decides ``auto``, as in ``bidex_meta.engine.choice``."""
     engine = config.get("engine", "auto")
-    return engine if engine != "auto" else "warp" if str(config.get("device", "cpu")).startswith("cuda") else "c"
+    if engine != "auto":
+        return engine
+    return "warp" if str(config.get("device", "cpu")).startswith("cuda") else "c"
 
 
-def _evaluation(evaluation: Evaluated) -> dict[str, Any]:
+def _evaluation(evaluation: Evaluated) -> Json:
     """Return the content of an evaluation with less about random actions, and about each shot."""
     content = evaluation_json(replace(evaluation, run=None))
     if "random" in content:
@@ -201,7 +199,7 @@ def _evaluation(evaluation: Evaluated) -> dict[str, Any]:
     return _rounded(content, 5)
 
 
-def _only(summary: dict[str, Any], measures: Sequence[str]) -> dict[str, Any]:
+def _only(summary: Json, measures: Sequence[str]) -> Json:
     """Return some measures of the classes of a summary."""
     classes = {}
     for name, row in summary["classes"].items():
@@ -209,20 +207,19 @@ def _only(summary: dict[str, Any], measures: Sequence[str]) -> dict[str, Any]:
     return {"classes": classes}
 
 
-def _curves(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
+def _curves(rows: Sequence[Json]) -> dict[str, list[float | None]]:
     """Return columns by tag: means over intervals of about equal length, with step and training time at their ends."""
     count = min(POINTS, len(rows))
     edges = [len(rows) * i // count for i in range(count + 1)]
     parts = [rows[low:high] for low, high in pairwise(edges)]
-    tags = sorted({tag for row in rows for tag in row if _TAG.fullmatch(tag)})
-    return {
-        "step": [part[-1]["step"] for part in parts],
-        **{tag: [_mean(part, tag) for part in parts] for tag in tags},
-        "Perf/training_time": [_rounded(training_seconds(rows[:edge]), 6) for edge in edges[1:]],
-    }
+    curves = {"step": [part[-1]["step"] for part in parts]}
+    for tag in sorted(filter(_TAG.fullmatch, set().union(*rows))):
+        curves[tag] = [_mean(part, tag) for part in parts]
+    curves["Perf/training_time"] = [_rounded(training_seconds(rows[:edge]), 6) for edge in edges[1:]]
+    return curves
 
 
-def _mean(part: Sequence[dict[str, Any]], tag: str) -> float | None:
+def _mean(part: Sequence[Json], tag: str) -> float | None:
     values = [row[tag] for row in part if row.get(tag) is not None]
     return _rounded(math.fsum(values) / len(values), 4) if values else None
 

@@ -1,13 +1,14 @@
 """``python -m tools.experts RUN...``: find the best policy that solves each class; its normalised score is 100."""
 
 from collections.abc import Collection, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Kind, load, store
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import PolicyEvaluation
 from bidex_meta.runs.stored import Run, open_runs
 from bidex_meta.runs.versions import collect_versions
@@ -35,22 +36,19 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
         store(out, known, {"versions": collect_versions()})
 
 
-def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[str, Any]]:
+def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, Json]:
     """Find return and source of the best policy of each class among those that solve at least half of the tasks.
 
-    A class without such a policy is left out.
-
-    Args:
-        names: The classes.
-        runs: Evaluated runs: their folders, or their entries that ``collect`` has stored.
-
-    Raises:
-        BidexError: A run has no evaluation, or plays a class with fixed bases.
+    A class without such a policy is left out. ``runs`` are folders of evaluated runs, or entries that ``collect`` has
+    stored. Raises BidexError if a run has no evaluation, or plays a class with fixed bases.
     """
-    candidates = [row for path in runs for run in open_runs(path) for row in _of_run(run)]
+    candidates: list[tuple[str, Json]] = []
+    for run in chain.from_iterable(map(open_runs, runs)):
+        candidates += _of_run(run)
     played: tuple[Kind, ...] = ("script", "witness")
-    candidates += [(name, row | {"source": kind}) for kind in played for name, row in load(kind).items()]
-    best: dict[str, dict[str, Any]] = {}
+    for kind in played:
+        candidates += [(name, row | {"source": kind}) for name, row in load(kind).items()]
+    best: dict[str, Json] = {}
     for name, row in candidates:
         solves = name in names and row["success"] >= _SOLVES
         if solves and row["return"] > best.get(name, {"return": -float("inf")})["return"]:
@@ -58,7 +56,7 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, dict[s
     return best
 
 
-def _of_run(run: Run) -> list[tuple[str, dict[str, Any]]]:
+def _of_run(run: Run) -> list[tuple[str, Json]]:
     """Return the results of a run's classes from its evaluation, as means over all tasks."""
     config = run.config()
     source = Worlds.open(config.to_json())

@@ -1,8 +1,7 @@
 """``python -m tools.gallery`` (``make gallery``): generate the page of all task classes from their code."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +19,6 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.scripts import scripts_of
@@ -119,21 +117,24 @@ def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
 
 def _section(task: TaskClass, random: dict | None) -> str:
     pictures = " ".join(f"![{task.name}, {view}]({_image(task.name, view)})" for view in VIEWS)
+    space = task.variation_space
+    ranges = zip(space.names, space.low, space.high, strict=True)
     rows = [
         ("observation, action", f"{task.observation_size}, {task.action_size}"),
         ("episode", f"{task.episode_steps} steps"),
         ("reward", f"`{task.formula}`"),
         ("success", task.solved),
-        ("variation", _variation(task.variation_space)),
+        ("variation", ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in ranges)),
         ("ML mask", _mask(task)),
         *_of_version_2(registry.get(f"{task.name}-v2", True)),
         ("deviations", " ".join(task.deviations) or "none"),
     ]
     if random is not None:
         rows.append(("uniform actions", f"return {random['return']:.4g}, success {100 * random['success']:.1f} %"))
-    rows.append(("witness", _witness(task.name)))
+    has_witness = witness_path(task.name).is_file()
+    rows.append(("witness", "[solves task 0](results/mt20.md#witnesses)" if has_witness else "none yet"))
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
-    strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
+    strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if has_witness else ""
     tasks = f"![{task.name}, three tasks of version 2]({_image(task.name, 'v2')})\n"
     return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}\n{tasks}"
 
@@ -197,21 +198,12 @@ class _Comparisons(TorchFunctionMode):
         super().__init__()
         self.operands: list[Tensor] = []
 
-    def __torch_function__(self, func: Any, types: object, args: tuple = (), kwargs: dict | None = None) -> object:
+    def __torch_function__(
+        self, func: Callable[..., object], types: object, args: tuple = (), kwargs: dict | None = None
+    ) -> object:
         if getattr(func, "__name__", "").strip("_") in ("lt", "le", "gt", "ge"):
             self.operands += [value for value in args if isinstance(value, Tensor)]
         return func(*args, **(kwargs or {}))
-
-
-def _witness(name: str) -> str:
-    if not witness_path(name).is_file():
-        return "none yet"
-    return "[solves task 0](results/mt20.md#witnesses)"
-
-
-def _variation(space: VariationSpace) -> str:
-    parts = zip(space.names, space.low, space.high, strict=True)
-    return ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in parts)
 
 
 if __name__ == "__main__":

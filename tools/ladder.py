@@ -12,7 +12,8 @@ from bidex_algos.meta.icl import ICL
 from bidex_algos.nets.evidence import Belief, spread
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
+from bidex_meta.evaluation.eval_protocol import Protocol
+from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.experiments.metatest import adapt_steps_of
 from bidex_meta.experiments.policies import checkpoint, fitting
 from bidex_meta.experiments.run_teachers import teachers_of
@@ -22,7 +23,8 @@ from bidex_meta.world.contract import PrivilegedWorld
 from bidex_meta.worlds import Worlds
 
 # Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
-_CANDIDATES, _EXACT = 128, 0.02
+_CANDIDATES = 128
+_EXACT = 0.02
 
 
 def ladder(
@@ -43,7 +45,9 @@ def ladder(
     if folder.config().algo != ICL.name:
         raise BidexError(f"Expected a run of icl, got one of {folder.config().algo}.")
     worlds = Worlds.open(folder.config().to_json())
-    worlds, split = (worlds.others, "train") if split == OTHERS else (worlds, split)
+    if split == OTHERS:
+        worlds = worlds.others
+        split = "train"
     world: Any = worlds.world(split, tasks * len(worlds.tasks(split)))
     found = dict[str, dict[str, list[float]]]()
     longest = adapt_steps_of(folder.config())
@@ -54,12 +58,14 @@ def ladder(
         with fitting(folder.path):
             return ICL.load_policy(state, belief=belief)
 
-    def play(name: str, agent: Any, shots: int) -> None:
-        found[name] = success(
-            meta_evaluate(agent, world, shots, rollouts=1, episodes_per_task=1, tasks=tasks, max_adapt_steps=longest)
-        )
-        for each, shares in found[name].items():
-            print(f"{name}, {each}: {', '.join(f'{100 * share:.0f} %' for share in shares)}", flush=True)
+    def play(name: str, agent: Agent, shots: int) -> None:
+        protocol = Protocol(shots=shots, rollouts=1, episodes_per_task=1, tasks=tasks, max_adapt_steps=longest)
+        played = meta_evaluate(agent, world, protocol=protocol)
+        found[name] = {}
+        for task_name in world.task_names:
+            shares = [shot.classes[task_name].success for shot in played.by_shot]
+            found[name][task_name] = shares
+            print(f"{name}, {task_name}: {', '.join(f'{100 * share:.0f} %' for share in shares)}", flush=True)
 
     play("icl, known rewards", believing(_KnownRewards(world)), shots)
     play("icl, shown the goal", believing(_ShownGoal(world)), 0)
@@ -67,11 +73,6 @@ def ladder(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(found, indent=2) + "\n")
-
-
-def success(evaluation: MetaEvaluation) -> dict[str, list[float]]:
-    """Return the success of each class before and after each shot."""
-    return {name: [each.classes[name].success for each in evaluation.by_shot] for name in evaluation.before.classes}
 
 
 class _KnownRewards:

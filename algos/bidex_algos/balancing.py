@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -12,6 +13,9 @@ from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
+_CAGRAD_RADIUS = 0.4  # how far cagrad's direction may leave the mean gradient, in its lengths
+_FAMO_RATE = 0.025  # Adam's step size of famo's weights
+_FAMO_DECAY = 0.01  # how strongly these weights are drawn back to even ones
 
 
 class Balance(ABC):
@@ -179,3 +183,14 @@ class Famo(Balance):
     def parts(self) -> Parts:
         """Return the parts of the balance that a checkpoint holds."""
         return {"famo_logits": self.logits, "famo_adam": self.adam}
+
+
+def balance_of(name: Balancing, num_tasks: int, device: torch.device) -> Balance | None:
+    """Make a balance by its name; None for ``none``, which sums the losses."""
+    if name == "pcgrad":
+        return GradientBalance(project_conflicting)
+    if name == "cagrad":
+        return GradientBalance(partial(conflict_averse, radius=_CAGRAD_RADIUS))
+    if name == "famo":
+        return Famo(num_tasks, _FAMO_RATE, _FAMO_DECAY, device)
+    return None

@@ -6,7 +6,8 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
+from itertools import chain
 from typing import Any, ClassVar
 
 import torch
@@ -136,7 +137,7 @@ class Learner(Contract):
         """Begin the training: return raw observations (N, d) of the world's first reset."""
         # The same seed gives the same weights in every process, unless a machine computes differently.
         modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
-        broadcast([weight for module in modules for weight in module.parameters()])
+        broadcast(list(chain.from_iterable(module.parameters() for module in modules)))
         obs, _ = self.world.reset(seed=own_seed(self.seed))
         self.policy.observations.update(obs)
         return obs
@@ -165,7 +166,9 @@ class Learner(Contract):
         total = sum(weight.numel() for weight in weights.values())
         if max(size for size in sizes.values() if isinstance(size, int)) > total:
             raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
-        config = cls.config_type(**state["config"])
+        # Options that a later version dropped do not shape the network.
+        names = {option.name for option in fields(cls.config_type)}
+        config = cls.config_type(**{name: value for name, value in state["config"].items() if name in names})
         shape = Shape.load(sizes)
         with torch.device("meta"):
             planned = cls._make_policy(config, shape, init, torch.device("meta")).state_dict()
@@ -247,7 +250,10 @@ def _network(weights: State) -> State:
 
 
 def _seen(shape: Shape) -> State:
-    ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
+    ids = []
+    for group in shape.groups:
+        if group.name == "task_id":
+            ids += [[part.start, part.stop] for part in group.where]
     return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
 
 

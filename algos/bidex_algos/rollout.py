@@ -129,3 +129,13 @@ def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
             f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
             f'autoreset_mode="{expected}".'
         )
+
+
+def check_samples(name: str, rollout_steps: int, num_envs: int, num_minibatches: int) -> None:
+    """Raise BidexError if a rollout has fewer samples than mini-batches."""
+    samples = rollout_steps * num_envs
+    if samples < num_minibatches:
+        raise BidexError(
+            f"{name}: {num_minibatches} mini-batches need as many samples, but {num_envs} environments x "
+            f"{rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
+        )

@@ -2,24 +2,16 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass
 
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
 from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.control_arms import Control, arms, control
-from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
-from bidex_meta.experiments import metatest
-from bidex_meta.experiments.learners import learner_kind, resolve_device
-from bidex_meta.experiments.policies import policy_loader
+from bidex_meta.evaluation.control_arms import arms
+from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
+from bidex_meta.experiments.control_runs import control_runs
 from bidex_meta.runs import RunFolder
-from bidex_meta.runs.provenance import check_alike
-from bidex_meta.training.launch import say
-from bidex_meta.training.learner import Capability
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
-from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
 
@@ -52,8 +44,17 @@ def main(arguments: Sequence[str]) -> None:
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config()
     worlds = Worlds.open(config.to_json())
-    _check(folders)
-    played = [_play(folder, flags) for folder in folders]
+    played = control_runs(
+        folders,
+        shots=flags.shots,
+        rollouts=flags.rollouts,
+        episodes=flags.episodes,
+        trials=flags.trials,
+        num_envs=flags.num_envs,
+        seed=flags.seed,
+        device=flags.device,
+        engine=flags.engine,
+    )
     tasks = worlds.tasks("train")
     found = {name: arms(played, name, tasks[name]) for name in played[0].own.classes}
     episodes = {name: result.episodes * len(played) for name, result in played[0].own.classes.items()}
@@ -88,46 +89,3 @@ def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
 def _plain(arm: Json) -> Json:
     gains = arm.get("own_minus", {})
     return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
-
-
-def _check(folders: Sequence[RunFolder]) -> None:
-    """Raise BidexError unless all runs adapt, have the same classes in both splits, and differ only in the seed."""
-    check_alike(folders)
-    first = run_kind(folders[0].config())
-    seeds: dict[int, Path] = {}
-    for folder in folders:
-        config = folder.config()
-        if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
-            raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
-        metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
-        if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
-            raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
-        if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
-            raise BidexError(
-                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
-                f"{', '.join(differing)}. Name them in separate calls."
-            )
-
-
-def _play(folder: RunFolder, flags: ControlFlags) -> Control:
-    stored = folder.config()
-    device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
-    config = replace(stored, device=device, engine=flags.engine)
-    worlds = Worlds.open(config.to_json())
-    set_up_torch(config.threads)
-    counts = [len(pool) for pool in worlds.tasks("test").values()]
-    rollouts = metatest.rollouts_of(worlds, config, flags.rollouts, max(1, flags.num_envs // len(counts)))
-    size = metatest.environments_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
-    say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
-    test, train = (worlds.world(split, size) for split in ("test", "train"))
-    protocol = Protocol(
-        "test", flags.seed, shots=flags.shots, rollouts=rollouts, episodes_per_task=flags.episodes, trials=flags.trials,
-        max_adapt_steps=metatest.adapt_steps_of(config)
-    )  # fmt: skip
-    found = control(
-        policy_loader(folder, device)[0], test, train, say=say, protocol=protocol,
-        references=worlds.references(),
-    )  # fmt: skip
-    test.close()
-    train.close()
-    return found

@@ -87,23 +87,23 @@ def _info(flags: DataFlags) -> None:
     print(f"{dataset.name}: {about['kind']} data of {about.get('suite') or about.get('task') or 'elsewhere'}")
     print(f"{episodes}; {sizes}; commit {about.get('commit')}")
     print(f"Acted: {acted or 'unknown'}. Left out: {left or 'nothing'}.")
-    print_rows(
-        [
+    rows = []
+    for slot in classes:
+        score = "–" if slot.score is None else f"{slot.score:.1f}"
+        rows.append(
             {
-                "class": each.name,
-                "episodes": each.episodes,
-                "transitions": each.steps,
-                "length": f"{each.length:.1f}",
-                "return: least, median, mean, largest": " ".join(f"{value:.4g}" for value in each.returns),
-                "success": f"{100 * each.success:.1f} %",
-                "score": "–" if each.score is None else f"{each.score:.1f}",
-                "tasks": each.tasks,
-                "broken": each.broken,
+                "class": slot.name,
+                "episodes": slot.episodes,
+                "transitions": slot.steps,
+                "length": f"{slot.length:.1f}",
+                "return: least, median, mean, largest": " ".join(f"{value:.4g}" for value in slot.returns),
+                "success": f"{100 * slot.success:.1f} %",
+                "score": score,
+                "tasks": slot.tasks,
+                "broken": slot.broken,
             }
-            for each in classes
-        ],
-        as_json=False,
-    )
+        )
+    print_rows(rows, as_json=False)
     groups = ", ".join(f"{name} {value:.3g}" for name, value in spread["observation_std"].items())
     print(f"Spread (standard deviation over states, mean over entries): {groups}")
     at_bounds = f"{100 * spread['action_at_bounds']:.1f} % at a bound"

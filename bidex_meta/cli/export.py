@@ -1,31 +1,11 @@
 """``bidex-meta export``: write a run's policy as one ONNX file, checked against torch."""
 
-import json
-import logging
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.cli.parsing import RunPath, parse
-from bidex_meta.cli.tables import Json
-from bidex_meta.config import RunConfig
-from bidex_meta.errors import BidexError, one_line
-from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.experiments.policies import checkpoint, policy_of
-from bidex_meta.runs import RunFolder
-from bidex_meta.runs.atomic import check_writable, write_atomic
-from bidex_meta.training.learner import Capability
-from bidex_meta.utils.files import portable
-from bidex_meta.utils.validation import parse as parse_content
-from bidex_meta.worlds import Worlds
-
-TOLERANCE = 1e-5
-"""Largest allowed difference of an action from torch's."""
-_ROWS = 256  # rows of the check; the export itself uses another number of rows
-_SHAPE = dict[str, Any]
+from bidex_meta.experiments.exporting import ROWS, TOLERANCE, export
 
 
 @dataclass(frozen=True)
@@ -46,109 +26,13 @@ class ExportFlags:
 def main(arguments: Sequence[str]) -> None:
     """Export, check and print the file's path."""
     flags = parse(ExportFlags, arguments, "export")
-    if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
-        raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
-    folder = RunFolder.open(flags.run)
-    config = replace(folder.config(), device="cpu")
-    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
-        raise BidexError(
-            f"{config.algo} adapts to tasks or remembers, and an ONNX file maps one observation to one action. "
-            "Export a policy that does not adapt, such as one of mtppo, mtsac, td3, mappo, dagger or bc."
+    found = export(flags.run, flags.out, checkpoint=flags.checkpoint)
+    print(
+        f"{found.path}: {found.size / 1e6:.1f} MB, within {found.gap:.1g} of torch in float32 on {ROWS} random "
+        "observations"
+    )
+    if found.gap_as_played > TOLERANCE:
+        print(
+            "On this machine the run's policy computes in bfloat16: its actions are up to "
+            f"{found.gap_as_played:.1g} away."
         )
-    out = flags.out or folder.path / "policy.onnx"
-    check_writable(out)
-    state, steps = checkpoint(folder, flags.checkpoint)
-    policy: Any = policy_of(folder, state, "cpu")
-    shape = parse_content(state["learner"]["policy"].get("shape"), _SHAPE, f"{folder.path}: the policy's shape")
-    content, gap, gap_as_played = exported(policy, shape, _metadata(folder, config, steps, shape))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(out, lambda file: file.write(content))
-    print(f"{out}: {len(content) / 1e6:.1f} MB, within {gap:.1g} of torch in float32 on {_ROWS} random observations")
-    if gap_as_played > TOLERANCE:
-        print(f"On this machine the run's policy computes in bfloat16: its actions are up to {gap_as_played:.1g} away.")
-
-
-def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float, float]:
-    """Return a policy as the bytes of an ONNX file, which computes in float32, and two largest differences of actions.
-
-    The first difference is to torch's actions in float32. The second difference is to the actions of the policy as it
-    was given, which may compute in bfloat16. ``shape`` is as in a checkpoint. BidexError is raised if torch cannot
-    export the policy or the first difference is larger than TOLERANCE.
-    """
-    import onnxruntime
-    import torch
-
-    network: Any = policy
-    if not isinstance(policy, torch.nn.Module):
-        raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
-    obs = _observations(_ROWS, shape)
-    as_played = network.eval_action(obs).numpy()
-    low_precision = getattr(network, "low_precision", False)
-    network.low_precision = False
-    # mkldnn would choose a matrix product by the size of a batch, which the export leaves open.
-    with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
-        try:
-            content = _onnx(network, _observations(2, shape), metadata)
-        except Exception as error:  # the exporter raises many kinds
-            raise BidexError(
-                f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
-                "look at numbers; --debug shows where."
-            ) from error
-        wanted = network.eval_action(obs).numpy()
-    network.low_precision = low_precision
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    actions = session.run(None, {"observations": obs.numpy()})[0]
-    gap = float(abs(actions - wanted).max())
-    if not gap <= TOLERANCE:
-        raise BidexError(f"The exported actions differ by {gap:.2g} from torch's, more than {TOLERANCE:g}: none kept.")
-    return content, gap, float(abs(actions - as_played).max())
-
-
-def _onnx(policy: Any, obs: Any, metadata: dict[str, str]) -> bytes:
-    import torch
-
-    class MeanAction(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.policy = policy
-
-        def forward(self, observations: torch.Tensor) -> torch.Tensor:
-            # Some products of zero rows crash onnxruntime's process by SIGFPE, so one row is always added.
-            padded = torch.cat([observations, observations.new_zeros(1, observations.shape[1])])
-            return self.policy.eval_action(padded)[:-1]
-
-    for name in ("torch.onnx", "onnxscript", "onnx_ir"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    program = torch.onnx.export(
-        MeanAction(), (obs,), input_names=["observations"], output_names=["actions"],
-        dynamic_shapes={"observations": {0: torch.export.Dim("rows")}}, dynamo=True, verbose=False,
-    )  # fmt: skip
-    if program is None:
-        raise TypeError("torch.onnx.export returned no program")
-    program.model.metadata_props.update(metadata)
-    for node in program.model.graph.all_nodes():
-        node.metadata_props.clear()  # the metadata quote lines of code, with paths of this machine
-    return program.model_proto.SerializeToString()
-
-
-def _observations(rows: int, shape: Json) -> Any:
-    """Draw random raw observations (rows, d), float32, with a task's one-hot if the policy reads one."""
-    import torch
-
-    obs = torch.randn(rows, shape["observations"], generator=torch.Generator().manual_seed(0))
-    for start, stop in shape.get("groups", {}).get("task_id", []):
-        obs[:, start:stop] = torch.eye(stop - start)[torch.arange(rows) % (stop - start)]
-    return obs
-
-
-def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
-    """Return the file's metadata: texts by name, lists and tables as JSON."""
-    worlds = Worlds.open(config.to_json())
-    versions = folder.versions()
-    facts = {
-        "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
-        "classes": list(worlds.tasks("train")), "seed": config.seed, "steps": steps,
-        "commit": (versions.get("git") or {}).get("commit"), "versions": versions.get("packages"),
-        "observation_groups": shape.get("groups"),
-    }  # fmt: skip
-    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}

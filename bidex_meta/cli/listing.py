@@ -1,21 +1,15 @@
 """``bidex-meta list``: list suites, tasks, hidden parts of tasks, algos or objects."""
 
-import ast
-import importlib.util
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from bidex_meta.cli.parsing import JsonSwitch, parse
-from bidex_meta.cli.tables import Json, print_rows
-from bidex_meta.errors import BidexError, known_name
-from bidex_meta.experiments.learners import ALGOS
-from bidex_meta.tasks import registry
+from bidex_meta.cli.tables import print_rows
+from bidex_meta.errors import known_name
+from bidex_meta.experiments.catalogue import algo_rows, hidden_rows, object_rows, task_rows
 from bidex_meta.worlds import listed
 
 
@@ -35,122 +29,6 @@ class ListFlags:
 def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row per entry."""
     flags = parse(ListFlags, arguments, "list")
-    kinds = {"suites": listed, "tasks": _tasks, "hidden": _hidden, "algos": _algos, "objects": _objects}
+    kinds = {"suites": listed, "tasks": task_rows, "hidden": hidden_rows, "algos": algo_rows, "objects": object_rows}
     rows = kinds[known_name("list", flags.what, kinds)]()
     print_rows(rows, flags.json, spare=("test classes", "train classes", "presets"))
-
-
-def _tasks() -> list[Json]:
-    rows = []
-    for name in registry.names():
-        place = registry.module_of(name), name
-        moves, steps, summary = (_constant(*place, key) for key in ("moves_by_default", "episode_steps", "summary"))
-        found = re.findall(r"\((\d{3})[;)]", _docstring(*place))
-        if len(found) != 1:
-            raise BidexError(
-                f"{name}: expected the observation's size once in the docstring, as in 'Observation: Table 10 (422).', "
-                f"got {found}."
-            )
-        sizes = {"observation": int(found[0]), "action": 52 if moves else 40}
-        rows.append({"name": name, **sizes, "episode_steps": steps, "summary": summary})
-    return rows
-
-
-def _hidden() -> list[Json]:
-    tasks = [registry.get(f"{name}-v2") for name in registry.names()]
-    return [{"name": t.name, "hides": [part.described(t.variation_space) for part in t.hides()]} for t in tasks]
-
-
-def _algos() -> list[Json]:
-    rows = []
-    for name, path in ALGOS.items():
-        module, _, class_name = path.partition(":")
-        presets = _keys(*_attribute(module, class_name, "presets")) or _keys(*_found(module, "PRESETS"))
-        rows.append({"name": name, "presets": presets, "summary": _docstring(module, class_name).splitlines()[0]})
-    return rows
-
-
-# Classes are read from their source: their modules load torch and mujoco.
-
-
-@cache
-def _statements(module: str) -> dict[str, ast.AST]:
-    spec = importlib.util.find_spec(module)
-    assert spec is not None and spec.origin is not None
-    return _bound(ast.parse(Path(spec.origin).read_bytes()).body)
-
-
-def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
-    """Map each bound name to its class, its value, or the import that it comes from."""
-    found: dict[str, ast.AST] = {}
-    for node in body:
-        match node:
-            case ast.ClassDef():
-                found[node.name] = node
-            case ast.ImportFrom():
-                found |= dict.fromkeys((each.name for each in node.names), node)
-            case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
-                found |= {ast.unparse(name): value for name, value in zip(names, values, strict=True)}
-            case ast.Assign(targets=[ast.Name(name)]) | ast.AnnAssign(target=ast.Name(name)) if node.value:
-                found[name] = node.value
-            case _:
-                pass
-    return found
-
-
-def _found(module: str, name: str) -> tuple[str, ast.AST | None]:
-    """Follow imports of a name; return the module that binds the name, and the bound class or value."""
-    node = _statements(module).get(name)
-    if isinstance(node, ast.ImportFrom):
-        return _found(node.module or "", name)
-    return (module, node)
-
-
-def _docstring(module: str, name: str) -> str:
-    node = _found(module, name)[1]
-    if isinstance(node, ast.ClassDef):
-        return ast.get_docstring(node) or ""
-    return ""
-
-
-def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | None]:
-    """Return the module and the value of an attribute of a class or of its nearest base class that has the value."""
-    module, node = _found(module, name)
-    if not isinstance(node, ast.ClassDef):
-        return module, None
-    if own := _bound(node.body).get(attribute):
-        return module, own
-    bases = (_attribute(module, base.id, attribute) for base in node.bases if isinstance(base, ast.Name))
-    return next((found for found in bases if found[1]), (module, None))
-
-
-def _constant(module: str, name: str, attribute: str) -> object:
-    value = _attribute(module, name, attribute)[1]
-    if isinstance(value, ast.Constant):
-        return value.value
-    return None
-
-
-def _keys(module: str, node: ast.AST | None) -> list[str]:
-    """Return the keys of a dictionary literal, a named dictionary, or a union of dictionaries."""
-    match node:
-        case ast.Dict(keys):
-            return [key.value for key in keys if isinstance(key, ast.Constant) and isinstance(key.value, str)]
-        case ast.BinOp(left, _, right):
-            return list(dict.fromkeys([*_keys(module, left), *_keys(module, right)]))
-        case ast.Name(name):
-            return _keys(*_found(module, name))
-        case _:
-            return []
-
-
-def _objects() -> list[Json]:
-    from bidex_meta.tasks.objects.held import held_object, shelf
-
-    # The egg's figures: docs/figures.md, objects.
-    rows: list[Json] = [{"name": "egg", "mass_g": 75.4, "box_mm": "60 x 60 x 80", "geoms": 1}]
-    for name in shelf():
-        if found := held_object(name):
-            box = " x ".join(f"{1000 * (high - low):.0f}" for low, high in zip(found.low, found.high, strict=True))
-            rows.append({"name": name, "mass_g": round(1000 * found.mass, 1), "box_mm": box, "geoms": found.geoms})
-    return rows

@@ -3,9 +3,12 @@
 import contextlib
 import dataclasses
 import difflib
+import inspect
 import io
 import re
-from collections.abc import Callable, Iterator, Sequence
+import textwrap
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from itertools import zip_longest
 from pathlib import Path
@@ -13,10 +16,17 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import tyro
 
+from bidex_meta.config import Switch
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.streams import output_width
 from bidex_meta.utils.validation import Seed, check_fields
 
 Options = TypeVar("Options")
+
+
+_HELP_COLUMN = 26  # where texts of the short help begin
+_END = re.compile(r"[.;](?: |$)(?![^(]*\))")
+"""End of the first sentence of a help text: a full stop or semicolon outside parentheses."""
 
 
 class FlagsFound(Exception):
@@ -45,8 +55,7 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
     raise TypeError(f"{command.__module__}.main parses no flags")
 
 
-Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # A flag without a value and without a ``--no-`` twin
-JsonSwitch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print JSON.")]
+JsonSwitch = Annotated[Switch, tyro.conf.arg(help="Print JSON.")]
 Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
 Engine = Annotated[
     Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
@@ -79,14 +88,26 @@ class LookFlags:
         return str(self.run)
 
 
-def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:
+def parse(
+    options: type[Options],
+    arguments: Sequence[str],
+    command: str,
+    default: Options | None = None,
+    usual: Mapping[str, Sequence[str]] | None = None,
+) -> Options:
     """Parse the flags of a subcommand into a dataclass, whose docstring opens with a sentence and an example.
 
-    ``default`` has the values of flags that are not given. BidexError is raised if a flag is unknown (the message names
-    the nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
+    ``default`` has the values of flags that are not given. With ``usual``, flags under headings, ``--help`` shows these
+    flags alone, and ``--help-all`` shows all flags. BidexError is raised if a flag is unknown (the message names the
+    nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
     """
     if _asked_for_flags.get():
         raise FlagsFound(options, default)
+    if usual is not None:
+        if not {"-h", "--help"}.isdisjoint(arguments):
+            print(_short_help(options, command, default, usual))
+            raise SystemExit(0)
+        arguments = ["--help" if word == "--help-all" else word for word in arguments]
     complaint = io.StringIO()
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -103,6 +124,40 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
         _refuse(unknown[0], options if default is None else default, command)
     check_fields(parsed, command, as_flags=True)
     return parsed
+
+
+def _short_help(options: type, command: str, default: object, usual: Mapping[str, Sequence[str]]) -> str:
+    """Return the usual flags under their headings, each with the first sentence of its help and its default."""
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        parser = tyro.extras.get_parser(options, default=default)
+    actions = {}
+    for action in parser._actions:
+        actions |= dict.fromkeys(action.option_strings, action)
+    doc = getattr(options, "__origin__", options).__doc__ or ""
+    width = min(output_width(80), 100)
+    lines = [f"usage: bidex-meta {command} [OPTIONS]", ""]
+    for line in inspect.cleandoc(doc).splitlines():
+        lines += textwrap.wrap(line, width) or [""]
+    for heading, flags in usual.items():
+        lines += ["", f"{heading}:"]
+        for flag in flags:
+            if flag not in actions:
+                continue
+            action = actions[flag]
+            text, _, value = " ".join((action.help or "").split()).partition(" (default: ")
+            text = re.sub(r" \([^)]{60,}\)", "", re.split(_END, text)[0])
+            if value not in ("", "None)", "True)", "False)"):
+                text += f" (default: {value}"
+            metavar = re.sub(r"^\{None\}\||[\[\]]", "", str(action.metavar or "")).replace("INT INT ...", "INT ...")
+            if len(metavar) > _HELP_COLUMN:
+                metavar = "NAME"  # --help-all shows the choices
+            head = f"  {', '.join(action.option_strings)} {metavar}".rstrip()
+            if len(head) >= _HELP_COLUMN:
+                lines.append(head)
+                head = ""
+            indent = " " * _HELP_COLUMN
+            lines += textwrap.wrap(text, width, initial_indent=head.ljust(_HELP_COLUMN), subsequent_indent=indent)
+    return "\n".join([*lines, "", f"bidex-meta {command} --help-all shows all {len(parser._actions)} flags."])
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
@@ -150,7 +205,7 @@ def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
         name = field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
         if dataclasses.is_dataclass(value):
-            yield from _flags(value, prefix if name == "config" else f"{prefix}{name}.")
+            yield from _flags(value, prefix if name in ("config", "final") else f"{prefix}{name}.")
         else:
             yield from [prefix + name, f"{prefix}no-{name}"][: 1 + isinstance(value, bool)]
 

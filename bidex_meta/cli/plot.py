@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from bidex_meta.cli.parsing import RunPaths, Switch, parse
@@ -55,7 +56,7 @@ def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRu
     """Open the runs that a command was given. Raises BidexError if there is no run, or a path is not a run."""
     if not paths:
         raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
-    return [run for path in paths for run in open_runs(path)]
+    return list(chain.from_iterable(map(open_runs, paths)))
 
 
 def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:

@@ -3,17 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal
+from typing import Annotated, Any, Generic
 
 import tyro
 
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.config import LearnerSettings, RunConfig
-from bidex_meta.experiments.run_config import check, resolve
+from bidex_meta.experiments.evaluating import USUAL_EVALUATION, FinalEvaluation
+from bidex_meta.experiments.learners import USUAL_SETTINGS
+from bidex_meta.experiments.run_config import resolve
 from bidex_meta.runs.folder import AnyConfig, RunFolder
-from bidex_meta.utils.validation import Count, Few, Shots
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
+_USUAL: dict[str, tuple[str, ...]] = {
+    "task": ("--suite", "--task", "--algo", "--preset", "--seed"),
+    "budget": ("--steps", "--minutes", "--stop-at-success", "--num-envs", "--device"),
+    "data": ("--start-from", "--dataset", "--teacher"),
+    "output": (
+        "--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config",
+    ),
+}  # fmt: skip
+"""Flags that ``run --help`` shows; the learner's stand in ``USUAL_SETTINGS``."""
 
 
 @dataclass(frozen=True)
@@ -29,20 +39,8 @@ class RunFlags(Generic[LearnerSettings]):
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
     count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
     evaluate: bool = True  # Evaluate at the end.
-    episodes: Few | None = None
-    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
-    that adapt play --rollouts episodes."""
-    other_tasks: Switch = False
-    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
-    others."""
-    split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
-    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
-    on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
-    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
-    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
     print_config: Switch = False  # Print the resolved config as JSON and stop.
+    final: Annotated[FinalEvaluation, tyro.conf.arg(name="")] = USUAL_EVALUATION
 
 
 def run_flags(arguments: Sequence[str]) -> RunFlags:
@@ -59,7 +57,9 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     default = _defaults(arguments, folder)
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
-    flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=(), teacher=())))
+    start = RunFlags(replace(default, dataset=(), demonstrations=(), teacher=()))
+    settings = [f"--learner.{name.replace('_', '-')}" for name in USUAL_SETTINGS]
+    flags = parse(options, arguments, "run", start, _USUAL | {f"learner ({default.algo})": settings})
     is_named = folder is not None or any(peek(arguments, f"--{name}") for name in ("suite", "task", "dataset"))
     config = replace(
         flags.config,
@@ -70,14 +70,9 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
         algo=default.algo,
         preset=default.preset,
     )
-    return replace(flags, config=resolve(config))
-
-
-def config_of_words(arguments: Sequence[str]) -> AnyConfig:
-    """Return the resolved and checked config of a run by the words that follow ``bidex-meta run``."""
-    config = run_flags(arguments).config
-    check(config)
-    return config
+    config = resolve(config)
+    flags.final.check(config)
+    return replace(flags, config=config)
 
 
 def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:

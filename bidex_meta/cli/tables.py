@@ -14,14 +14,13 @@ from rich.text import Text
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
-from bidex_meta.evaluation.statistics import Interval
+from bidex_meta.evaluation.statistics import NONE, Interval
 from bidex_meta.utils.streams import output_width
 
 if TYPE_CHECKING:  # torch, which lists and help do without
     from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 
 Json = dict[str, Any]  # an object of JSON
-NONE = "–"
 _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
     "unknown: of the worst finished episode)"
@@ -60,10 +59,9 @@ class Sheet:
         caption = self.caption
         if left_out:
             caption += f"\nIn a wider terminal, or with COLUMNS=200: {', '.join(reversed(left_out))}."
-        table = Table(
-            title=Text(self.title) if self.title else None, title_justify="left",
-            caption=Text(caption.strip()) if caption else None, caption_justify="left",
-        )  # fmt: skip
+        title = Text(self.title) if self.title else None
+        below = Text(caption.strip()) if caption else None
+        table = Table(title=title, title_justify="left", caption=below, caption_justify="left")
         for column, size in zip(shown, _widths(shown, width), strict=True):
             table.add_column(Text(column.header), justify="right" if column.is_numbers else "left", width=size)
         for number, style in enumerate(self.styles):
@@ -120,7 +118,7 @@ class _Column:
         """Least width in terminal columns: the widest cell, or for prose the longest word and some room."""
         words = self.header.split()
         if self.is_prose:
-            words += [word for cell in self.cells for word in cell.split()]
+            words += " ".join(self.cells).split()
             return max(_PROSE, *map(len, words))
         return max(map(len, [*self.cells, *words]), default=1)
 

@@ -17,8 +17,8 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        what = f"Expected the extra {name!r}, but {error.name} is not installed"
-        raise BidexError(f"{what}. Add it: pip install 'bidex-meta[{name}]'.") from error
+        fault = f"Expected the extra {name!r}, but {error.name} is not installed"
+        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[{name}]'.") from error
 
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:

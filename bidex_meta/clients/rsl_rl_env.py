@@ -67,8 +67,8 @@ class RslRlVecEnv(VecEnv):
             steps = given.to(torch.int64)
         if given is None or steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
             got = shortened(value if given is None else given.tolist())
-            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
-            raise BidexError(f"episode_length_buf: expected {what}. Give steps, one number for each environment.")
+            fault = f"whole numbers from 0 on, shape ({self.num_envs},), got {got}"
+            raise BidexError(f"episode_length_buf: expected {fault}. Give steps, one number for each environment.")
         self.get_observations()
         episodes = self.world.episodes
         episodes.counts = episodes.counts & (steps == episodes.elapsed)

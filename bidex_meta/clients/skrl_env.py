@@ -70,7 +70,7 @@ class SkrlEnv(Wrapper):
         if bool(episode_mask.any()):
             names = {"r": "Episode / Return", "l": "Episode / Length", "success": "Episode / Success"}
             infos["episode"] = {names[name]: info["running"][name][episode_mask].float().mean() for name in names}
-        reward, terminated, truncated = (each[:, None] for each in results)
+        reward, terminated, truncated = (result[:, None] for result in results)
         return self._obs, reward, terminated, truncated, infos
 
     def state(self) -> None:

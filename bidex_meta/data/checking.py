@@ -31,6 +31,7 @@ _TOLERANCE = 1e-5
 """Absolute and relative tolerance of a recomputed reward, because observations and, on a GPU, the formula are float32.
 The measured error on the CPU is 2e-8."""
 _EXAMPLES = 5
+_MOST_COVERED = 2000
 _Shown = dict[str, tuple[slice, float]]
 
 
@@ -259,8 +260,8 @@ def summary(dataset: Dataset) -> list[SlotSummary]:
     return summaries
 
 
-def coverage(dataset: Dataset, most: int = 2000) -> Json:
-    """Measure how widely states and actions are spread over at most ``most`` episodes.
+def coverage(dataset: Dataset) -> Json:
+    """Measure how widely states and actions are spread over at most 2,000 episodes.
 
     Two results are per group of the observation: ``observation_std`` is the standard deviation over all states,
     averaged over the group's entries; ``constant`` is the share of the group's entries that never change.
@@ -276,7 +277,7 @@ def coverage(dataset: Dataset, most: int = 2000) -> Json:
     high = np.full(d, -np.inf)
     bounds = 0
     first = np.zeros(0)
-    for _, episode in _spread_episodes(dataset, most):
+    for _, episode in _spread_episodes(dataset, _MOST_COVERED):
         values = np.concatenate([episode.observations[:-1], episode.actions], 1).astype(np.float64)
         if len(first) == 0:
             first = values[0].copy()

@@ -144,8 +144,8 @@ def collect(
         collector.active = rows
         _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
-            what = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
-            raise BidexError(f"{what}. Check the policy's actions.")
+            fault = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
+            raise BidexError(f"{fault}. Check the policy's actions.")
         writer.left_out.update({name: count for name, count in collector.left_out.items() if name == BROKEN})
         collector.left_out.clear()
         writer.commit()

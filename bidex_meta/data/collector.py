@@ -38,8 +38,8 @@ class EpisodeCollector(PooledWorldWrapper):
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
         super().__init__(world)  # type: ignore[arg-type]  # without pools there are no variations
         if world.metadata["autoreset_mode"].name == "NEXT_STEP":
-            what = "Expected a world in autoreset mode SAME_STEP or DISABLED to record, got NEXT_STEP"
-            raise BidexError(f"{what}; make it without autoreset_mode.")
+            fault = "Expected a world in autoreset mode SAME_STEP or DISABLED to record, got NEXT_STEP"
+            raise BidexError(f"{fault}; make it without autoreset_mode.")
         if rows is None:
             chosen = range(world.num_envs)
         else:
@@ -166,9 +166,9 @@ class EpisodeCollector(PooledWorldWrapper):
         room = self._actions.shape[1]
         if steps <= room:
             return
-        more = [(0, 0), (0, room), (0, 0)]
-        self._observations = np.pad(self._observations, more)
-        self._actions = np.pad(self._actions, more)
+        padding = [(0, 0), (0, room), (0, 0)]
+        self._observations = np.pad(self._observations, padding)
+        self._actions = np.pad(self._actions, padding)
         self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
 
     def load_state_dict(self, state: State) -> None:

@@ -159,8 +159,8 @@ class Dataset:
         episodes = len(columns["steps"])
         steps = int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
-            what = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
-            raise BidexError(f"{self.folder}: {what}. Parts are missing: record it again, or bring them back.")
+            fault = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
+            raise BidexError(f"{self.folder}: {fault}. Parts are missing: record it again, or bring them back.")
         slots = len(self.metadata["tasks"])
         if ((columns["task"] < 0) | (columns["task"] >= slots)).any():
             raise BidexError(f"{self.folder}: expected tasks from 0 to {slots - 1}, found others. Record it again.")
@@ -196,8 +196,8 @@ class Dataset:
         for _, ranges in groups:
             shown = max(shown, *(stop for _, stop in ranges))
         if shown > (size := first.observations.shape[1]):
-            what = f"expected {shown} entries of an observation, found {size}"
-            raise BidexError(f"{self.folder}: {what}. Record it again.")
+            fault = f"expected {shown} entries of an observation, found {size}"
+            raise BidexError(f"{self.folder}: {fault}. Record it again.")
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:

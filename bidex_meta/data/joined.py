@@ -61,8 +61,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
         slots |= {form.slots[task] for task in np.unique(form.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
-        what = f"Expected data of every class, found none of {', '.join(missing)}"
-        raise BidexError(f"{what}. Add a data set, or name a suite of the others alone.")
+        fault = f"Expected data of every class, found none of {', '.join(missing)}"
+        raise BidexError(f"{fault}. Add a data set, or name a suite of the others alone.")
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
     fitted = chain.from_iterable(form.fitted_episodes(ids) for form in forms)
@@ -126,8 +126,8 @@ class _Form:
         names: list[str] = about["tasks"]
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
-            what = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
-            raise BidexError(f"{what}. Record it with the same bases (--base), or learn for what it was recorded of.")
+            fault = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
+            raise BidexError(f"{fault}. Record it with the same bases (--base), or learn for what it was recorded of.")
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for start, stop in dict(shown).get("task_id", ()))
         self._width = plain
@@ -157,8 +157,8 @@ class _Form:
         here = len(own.state)
         there = len(theirs.state)
         if here > there or (here < there and not may_pad):
-            what = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
-            raise BidexError(f"{what}. Learn for what it was recorded of.")
+            fault = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
+            raise BidexError(f"{fault}. Learn for what it was recorded of.")
 
     def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
         """Yield all episodes, each with its slot and its observations in the world's form."""

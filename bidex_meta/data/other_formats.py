@@ -13,24 +13,24 @@ _SPACES = {"observations": "observation_space", "actions": "action_space"}
 
 def check_spaces(content: Json, name: str) -> None:
     """Raise BidexError if the spaces in ``metadata.json`` say that observations or actions are not flat."""
-    for what, entry in _SPACES.items():
+    for array, entry in _SPACES.items():
         space = _space(content, entry)
         kind = space.get("type", "Box")
         shape = space.get("shape", [0])
         if kind != "Box" or not isinstance(shape, list) or len(shape) != 1:
-            raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
+            raise _not_flat(name, array, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
 
 
-def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.ndarray:
-    """Read an episode's array ``what`` (Minari's name); raise BidexError for a wrong shape, type or ``length``."""
+def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.ndarray:
+    """Read an array of an episode by Minari's name of it; raise BidexError for a wrong shape, type or ``length``."""
     if not hasattr(stored, "shape"):
-        raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
+        raise _not_flat(name, array, f"a group of {shortened(', '.join(stored))}")
     shape = stored.shape or ()
     kind = stored.dtype
-    if len(shape) != 1 + (what in _SPACES) or kind.kind not in "biuf":
-        raise _not_flat(name, what, f"an array of shape {shape} and type {kind}")
+    if len(shape) != 1 + (array in _SPACES) or kind.kind not in "biuf":
+        raise _not_flat(name, array, f"an array of shape {shape} and type {kind}")
     if length not in (None, len(stored)):
-        raise BidexError(f"{name}: expected {length} {what} in {stored.name}, got {len(stored)}. Record it again.")
+        raise BidexError(f"{name}: expected {length} {array} in {stored.name}, got {len(stored)}. Record it again.")
     return np.asarray(stored[()])
 
 
@@ -47,8 +47,8 @@ def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.n
     fits = low.shape == high.shape == (size,)
     if not fits or not np.isfinite([low, high]).all() or (low >= high).any():
         got = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
-        what = f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}"
-        raise BidexError(f"{what}. Store it with an action_space that has them.")
+        fault = f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}"
+        raise BidexError(f"{fault}. Store it with an action_space that has them.")
     return low, high
 
 
@@ -63,9 +63,9 @@ def _space(content: Json, entry: str) -> Json:
     return space if isinstance(space, dict) else {}
 
 
-def _not_flat(name: str, what: str, found: str) -> BidexError:
-    if what in _SPACES:
+def _not_flat(name: str, array: str, got: str) -> BidexError:
+    if array in _SPACES:
         expected = "a row of numbers"
     else:
         expected = "a number"
-    return BidexError(f"{name}: expected {expected} a step as {what}, got {found}. Flatten them and store it again.")
+    return BidexError(f"{name}: expected {expected} a step as {array}, got {got}. Flatten them and store it again.")

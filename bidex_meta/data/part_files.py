@@ -74,8 +74,8 @@ def hdf5() -> ModuleType:
     try:
         import h5py
     except ModuleNotFoundError:
-        what = "Expected h5py for data sets, but it is not installed"
-        raise BidexError(f"{what}. Add it: pip install 'bidex-meta[data]'.") from None
+        fault = "Expected h5py for data sets, but it is not installed"
+        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[data]'.") from None
     return h5py
 
 
@@ -247,8 +247,8 @@ def reading(path: Path) -> Iterator[H5]:
         raise
     except Exception as error:  # h5py raises many kinds; a group instead of an array lacks an array's attributes
         reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
-        what = f"{path} is damaged or no part of a data set ({reason})"
-        raise BidexError(f"{what}. Delete it and record it again.") from None
+        fault = f"{path} is damaged or no part of a data set ({reason})"
+        raise BidexError(f"{fault}. Delete it and record it again.") from None
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:

@@ -70,12 +70,12 @@ def check_name(name: str) -> None:
         raise BidexError(f"Expected a name such as CatchUnderarm/random-v0, got {name!r}. Name another path by --out.")
 
 
-def check_room(folder: Path, needed: int, what: str) -> None:
-    """Raise BidexError if ``needed`` bytes, of ``what``, do not fit on the disk of a folder, which may be missing."""
+def check_room(folder: Path, needed: int, subject: str) -> None:
+    """Raise BidexError if the disk of a folder, perhaps a missing one, lacks ``needed`` bytes for ``subject``."""
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
-        needs = f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}"
+        needs = f"{subject} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}"
         raise BidexError(f"{needs}. Lower --size, or name another path by --out.")
 
 
@@ -100,7 +100,7 @@ class DatasetWriter:
 
     @property
     def open_steps(self) -> int:
-        """Number of transitions that are not committed yet."""
+        """Return the number of transitions that are not committed yet."""
         return 0 if self._part is None else self._part.steps
 
     def add(self, episode: Episode) -> None:
@@ -190,9 +190,9 @@ def has_begun(folder: Path, plan: Json) -> bool:
         before = stored_plan(folder)
         differ = sorted(name for name in before.keys() | plan.keys() if before.get(name) != plan.get(name))
         if differ:
-            old, new = (shortened(one.get(differ[0])) for one in (before, plan))
-            what = f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}"
-            raise BidexError(f"{what}. Give its own command to go on, or name another path by --out.")
+            old, new = (shortened(stored.get(differ[0])) for stored in (before, plan))
+            fault = f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}"
+            raise BidexError(f"{fault}. Give its own command to go on, or name another path by --out.")
         return True
     if inner.is_dir():
         remove_leftovers(inner)  # left by a collection that was killed as it began

@@ -164,7 +164,7 @@ class CpuEngine(Engine):
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
         # A batch has either models or fields per simulation: fields in which the models differ become per-row fields.
         self.batch.set_models(None)
-        differing = {name for model in self._models for name in differing_fields(self._models[0], model)}
+        differing = set[str]().union(*(differing_fields(self._models[0], model) for model in self._models))
         wanted = set(names)
         found = {}
         for name in sorted(wanted | differing & mujoco.batch.MODEL_FIELDS):

@@ -84,8 +84,9 @@ def lean(m: mjw.Model) -> Lean:
     ]
     parts: dict[str, mjw.Model] = dict.fromkeys(everywhere, m)
     for names, changes, allowed in table:
-        for name in names if allowed else ():
-            parts[name] = _without(parts[name], **changes)
+        if allowed:
+            for name in names:
+                parts[name] = _without(parts[name], **changes)
     if implicit and m.opt.integrator == mjw.IntegratorType.IMPLICIT:
         solver = ImplicitSolver(m)
     else:

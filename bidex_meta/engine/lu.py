@@ -7,6 +7,8 @@ Eliminating from the last degree of freedom on fills no entry in. The results eq
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportOptionalMemberAccess=false
 
+from itertools import product
+
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
@@ -71,12 +73,15 @@ class ImplicitSolver:
         """List the entries that each elimination updates; arrays are on the model's device."""
         starts, diagonal, columns = (a.numpy().astype(np.int32) for a in (m.D_rowadr, m.D_diag, m.D_colind))
         rows = np.append(starts, len(columns)).astype(np.int32)
-        place = {(i, int(columns[k])): k for i in range(m.nv) for k in range(rows[i], rows[i + 1])}
+        place: dict[tuple[int, int], int] = {}
+        for i in range(m.nv):
+            for k in range(rows[i], rows[i + 1]):
+                place[i, int(columns[k])] = k
         updates = []
         first = [0]
         for i in range(m.nv):
             ancestors = columns[rows[i] : rows[i] + diagonal[i]].tolist()
-            updates += [(place[j, i], place[i, k], place[j, k]) for j in ancestors for k in ancestors]
+            updates += [(place[j, i], place[i, k], place[j, k]) for j, k in product(ancestors, repeat=2)]
             first.append(len(updates))
         by_level = np.argsort(diagonal, kind="stable")  # an ancestor has fewer ancestors
         levels = np.searchsorted(diagonal[by_level], np.arange(diagonal.max() + 2))

@@ -69,17 +69,21 @@ _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
     """Return the names of the array fields in which two models differ."""
-    ours, theirs = (
-        {n: value for n, value in _members(model).items() if isinstance(value, np.ndarray)} for model in (a, b)
-    )
+    ours = _arrays(a)
+    theirs = _arrays(b)
     return [n for n, x in ours.items() if not np.array_equal(x, theirs[n], equal_nan=x.dtype.kind == "f")]
 
 
 def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     """Return whether two models differ only in numbers that may differ from row to row of one batch."""
-    return _sizes(a) == _sizes(b) and all(
-        name in _PER_WORLD or name in _FREE or name.startswith(_FREE_PREFIXES) for name in differing_fields(a, b)
-    )
+    if _sizes(a) != _sizes(b):
+        return False
+    differing = differing_fields(a, b)
+    return all(name in _PER_WORLD or name in _FREE or name.startswith(_FREE_PREFIXES) for name in differing)
+
+
+def _arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    return {name: value for name, value in _members(model).items() if isinstance(value, np.ndarray)}
 
 
 def _sizes(model: mujoco.MjModel) -> Mapping[str, object]:

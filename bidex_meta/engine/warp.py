@@ -10,7 +10,6 @@ import gc
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -263,7 +262,7 @@ class WarpEngine(Engine):
         assert graph is not None
         return lambda: wp.capture_launch(graph, stream=self._stream)
 
-    def _from_scratch(self) -> AbstractContextManager[Any]:
+    def _from_scratch(self) -> AbstractContextManager[object]:
         """Make Warp allocate from the engine's scratch memory on CUDA, the only device with a choice."""
         if self._device.is_cuda:
             return wp.ScopedAllocator(self._device, self._scratch)

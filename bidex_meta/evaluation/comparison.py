@@ -95,8 +95,8 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
     _check_copies(runs)
     members: dict[str, list[Run]] = {}
     unique: dict[str, Json] = {}
-    for kind, made, run in zip(kinds, split_by_worlds(runs), runs, strict=True):
-        kind = {**kind, _MADE: [f"{name} {value}" for name, value in made.items()]}
+    for kind, versions, run in zip(kinds, split_by_worlds(runs), runs, strict=True):
+        kind = {**kind, _MADE: [f"{name} {value}" for name, value in versions.items()]}
         key = json.dumps(kind, sort_keys=True)
         unique[key] = kind
         members.setdefault(key, []).append(run)

@@ -8,6 +8,7 @@ minus foreign is the part of the gain that is due to the task.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -61,16 +62,16 @@ def control(
         for name, pool, size in zip(train_world.task_names, pools, test_world.num_slot_tasks, strict=True):
             chosen[name] = np.repeat(pool[[number % len(pool)]], size, axis=0)
         train_world.set_tasks(chosen)
-        found = meta_evaluate(
+        adapted = meta_evaluate(
             load(), test_world, protocol=protocol, references=references, adapt_world=train_world, evaluated=(shots,)
         )
-        foreign.append(found.after)
-        say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(found.after)}")
+        foreign.append(adapted.after)
+        say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(adapted.after)}")
     return Control(own.before, own.after, foreign, own.adaptations, own.rollouts)
 
 
-def _returns(found: Evaluation) -> str:
-    return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in found.classes.items())
+def _returns(evaluation: Evaluation) -> str:
+    return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in evaluation.classes.items())
 
 
 def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, Json]:
@@ -84,16 +85,16 @@ def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict
     by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
     by_arm["foreign"] = [run.foreign for run in runs]
     by_arm |= {name: [[run.foreign[i]] for run in runs] for i, name in enumerate(names)}
-    found: dict[str, Json] = {}
+    summaries: dict[str, Json] = {}
     for arm, evaluations in by_arm.items():
-        results = [[each.classes[class_name] for each in of_run] for of_run in evaluations]
+        results = [[evaluation.classes[class_name] for evaluation in of_run] for of_run in evaluations]
         returns = [float(np.mean([result.mean_return for result in of_run])) for of_run in results]
-        success = [[result.success for result in of_run] for of_run in results]
-        found[arm] = {"return": float(np.mean(returns)), "success": float(np.mean(success)), "runs": returns}
+        success = float(np.mean([result.success for result in chain.from_iterable(results)]))
+        summaries[arm] = {"return": float(np.mean(returns)), "success": success, "runs": returns}
         if arm != "own":
             minus = {measure: _own_minus(runs, results, class_name, of) for measure, of in MEASURES.items()}
-            found[arm]["own_minus"] = minus
-    return found
+            summaries[arm]["own_minus"] = minus
+    return summaries
 
 
 def _own_minus(

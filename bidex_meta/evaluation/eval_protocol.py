@@ -24,18 +24,13 @@ class Protocol:
     split: str | None = None
     """Tasks of a world: ``train``, ``test``, or ``others``: the same number of unseen tasks of the train classes, drawn
     by another seed; see ``Benchmark.make_world``. None: the tasks of the given world."""
-    seed: int = EVALUATION_SEED
-    """Seed of all starts."""
-    tasks: int | None = None
-    """Number of tasks of each class, the first of its pool; None: all."""
-    episodes_per_task: int = 4
-    """Evaluation episodes of each task, after each trial."""
-    shots: int = 2
-    """Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation."""
+    seed: int = EVALUATION_SEED  # Seed of all starts.
+    tasks: int | None = None  # Number of tasks of each class, the first of its pool; None: all.
+    episodes_per_task: int = 4  # Evaluation episodes of each task, after each trial.
+    shots: int = 2  # Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation.
     rollouts: int | None = None
     """Exploring episodes of each task in a shot; None: one in each environment that plays it."""
-    trials: int = 1
-    """Number of adaptations to each task, each from the start and with other episodes."""
+    trials: int = 1  # Number of adaptations to each task, each from the start and with other episodes.
     hidden_rewards: bool = False
     """Also play the evaluation episodes with their rewards hidden. Otherwise rewards are shown in all episodes, as in
     the papers: an agent that learns while it acts needs them. Hidden rewards test what it remembers."""

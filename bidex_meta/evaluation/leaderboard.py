@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.evaluation.statistics import (
     Estimate,
     crossed_estimate,
@@ -26,8 +26,7 @@ from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
 
-PROFILE = (0.1, 0.5, 0.9)
-"""Success rates at which a performance profile is read."""
+PROFILE = (0.1, 0.5, 0.9)  # Success rates at which a performance profile is read.
 FORMAT = 2
 _TASKS_OF_METAWORLD = 50
 _ROUNDING = 1e-4  # of stored rates
@@ -210,14 +209,11 @@ def class_rows(evaluations: Sequence[Evaluation]) -> Json:
     """Return the classes of an entry from one evaluation per seed, ready for JSON."""
     rows = {}
     for name in evaluations[0].classes:
-        tasks = np.array([_success_of_tasks(evaluation.classes[name]) for evaluation in evaluations])
+        results = [evaluation.classes[name] for evaluation in evaluations]
+        tasks = np.array([result.task_means(result.successes) for result in results])
         mean = crossed_estimate(lambda tables: tables[0].mean(), [tasks])
         rows[name] = {"success": mean.value, "interval": mean.interval, "tasks": tasks.round(4).tolist()}
     return rows
-
-
-def _success_of_tasks(result: ClassResult) -> list[float]:
-    return [result.successes[result.tasks == task].mean() for task in np.unique(result.tasks)]
 
 
 def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:

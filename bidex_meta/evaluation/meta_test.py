@@ -12,6 +12,7 @@ from typing import cast
 
 import numpy as np
 import torch
+from msgspec import to_builtins
 from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
@@ -23,7 +24,7 @@ from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import Gains, SplitSummary, summary_json
+from bidex_meta.runs.evaluations import Gains, SplitSummary
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import Info, TaskWorld
@@ -73,35 +74,26 @@ class MetaEvaluation:
 
     def to_json(self) -> Json:
         """Return the results without the single episodes, ready for JSON."""
-        return summary_json(self.summary())
+        return to_builtins(self.summary())
 
 
 @checked_arguments
 def meta_evaluate(
-    agent: Agent, world: TaskWorld, shots: int | None = None, *, rollouts: int | None = None,
-    episodes_per_task: int | None = None, tasks: int | None = None, trials: int | None = None,
-    max_adapt_steps: int | None = None, seed: int | None = None, hidden_rewards: bool | None = None,
-    protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None,
-    adapt_world: TaskWorld | None = None, evaluated: Collection[int] | None = None
+    agent: Agent, world: TaskWorld, shots: int | None = None, *, protocol: Protocol = DEFAULT,
+    references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
+    evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
 
     Environments that play the same task share one adaptation. If the world has fewer environments than tasks times
-    ``rollouts``, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The
-    world must be reset afterwards.
+    rollouts, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The world
+    must be reset afterwards. Before adaptation, and with all tasks in the world at once, starts are those of
+    ``evaluate``.
 
     Args:
-        agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
+        agent: A MetaLearningAgent; with no shots any Agent.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
-        shots: Adaptation rounds. This and the next seven arguments replace entries of ``protocol``, if given.
-        rollouts: Exploring episodes of each task in a shot.
-        episodes_per_task: Evaluation episodes of each task, after each trial.
-        tasks: Number of tasks of each pool, the first ones.
-        trials: Adaptations to each task, each from the start and with other episodes.
-        max_adapt_steps: Steps after which exploring episodes are cut.
-        seed: Seed of all starts. Before adaptation, and with all tasks in the world at once, starts are those of
-            ``evaluate``.
-        hidden_rewards: Whether to play all evaluation episodes a second time with their rewards hidden.
+        shots: Adaptation rounds; None: those of ``protocol``.
         protocol: The tasks and episodes to play.
         references: As in ``evaluate``.
         adapt_world: Another world for the episodes of adaptation, with the same starts and the same number of
@@ -110,10 +102,7 @@ def meta_evaluate(
 
     Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
-    protocol = protocol.changed(
-        shots=shots, rollouts=rollouts, episodes_per_task=episodes_per_task, tasks=tasks, trials=trials,
-        max_adapt_steps=max_adapt_steps, seed=seed, hidden_rewards=hidden_rewards
-    )  # fmt: skip
+    protocol = protocol.changed(shots=shots)
     shots = protocol.shots
     seed = protocol.seed
     if adapt_world is None:
@@ -121,9 +110,9 @@ def meta_evaluate(
     else:
         worlds = [world, adapt_world]
     _check(agent, worlds, shots)
-    found = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
-    hidden = {shot: list[Episodes]() for shot in found if protocol.hidden_rewards}
-    if not found:
+    by_shot = {shot: list[Episodes]() for shot in range(shots + 1) if evaluated is None or shot in evaluated}
+    hidden = {shot: list[Episodes]() for shot in by_shot if protocol.hidden_rewards}
+    if not by_shot:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
     portions = Portions(world, protocol.rollouts, protocol.tasks, protocol.trials)
     field = worlds[-1]
@@ -136,24 +125,24 @@ def meta_evaluate(
                 if shot > 0:
                     starts = _seed(seed, "adaptation", number, shot)
                     adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, longest, starts)
-                if shot in found:
+                if shot in by_shot:
                     if number == 0:
                         starts = seed
                     else:
                         starts = _seed(seed, "evaluation", number)
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts)
-                    found[shot].append(portions.labelled(played, number))
+                    by_shot[shot].append(portions.labelled(played, number))
                 if shot in hidden:
                     played = play_tasks(agent, world, protocol.episodes_per_task, starts, hidden_rewards=True)
                     hidden[shot].append(portions.labelled(played, number))
-    joined = [joined_episodes(parts) for parts in (*found.values(), *hidden.values())]
+    joined = [joined_episodes(parts) for parts in (*by_shot.values(), *hidden.values())]
     if references is None:
         references = references_of(world)
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
     evaluations = [Evaluation(classes, protocol.episodes_per_task) for classes in by_class]
     first = joined[0]
     return MetaEvaluation(
-        by_shot=evaluations[: len(found)], hidden_by_shot=evaluations[len(found) :] or None,
+        by_shot=evaluations[: len(by_shot)], hidden_by_shot=evaluations[len(by_shot) :] or None,
         adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
         protocol=protocol.changed(rollouts=portions.rollouts, max_adapt_steps=longest), adapt_steps=adapt_steps
     )  # fmt: skip

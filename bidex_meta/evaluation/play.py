@@ -26,8 +26,7 @@ from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import TaskWorld
 
 DEFAULT = Protocol()
-Episodes = dict[str, np.ndarray]
-"""Results of episodes by name, one entry per episode; see :func:`play_tasks`."""
+Episodes = dict[str, np.ndarray]  # Results of episodes by name, one entry per episode; see :func:`play_tasks`.
 
 
 @checked_arguments

@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import to_builtins
 
 from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.statistics import aggregate, estimate, mean, mean_difference
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary, summary_json
+from bidex_meta.runs.evaluations import ClassSummary, Estimate, Summary
 from bidex_meta.utils.arguments import checked_arguments
 
 MANY_TASKS = 10  # number of tasks from which intervals resample tasks instead of episodes
@@ -62,9 +63,14 @@ class ClassResult:
 
         Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """
-        names, task = np.unique(self.tasks, return_inverse=True)
-        if len(names) < MANY_TASKS:
+        means = self.task_means(values)
+        if len(means) < MANY_TASKS:
             return values
+        return means
+
+    def task_means(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of ``values`` (episodes,) in each task, by rising number of the task."""
+        _, task = np.unique(self.tasks, return_inverse=True)
         return np.bincount(task, values) / np.bincount(task)
 
     def summary(self) -> ClassSummary:
@@ -99,7 +105,7 @@ class Evaluation:
 
     def to_json(self) -> Json:
         """Return the results without the single episodes, ready for JSON."""
-        return summary_json(self.summary())
+        return to_builtins(self.summary())
 
 
 Difference = Estimate  # of two policies' mean returns in a class; tasks of both (few: episodes) are resampled

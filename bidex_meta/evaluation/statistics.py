@@ -15,6 +15,10 @@ from bidex_meta.runs.evaluations import Aggregate, Estimate, Interval
 Statistic = Callable[..., np.ndarray]
 """Maps one array of shape ``(resamples, n, ...)`` per sample to values of shape ``(resamples,)``."""
 
+NONE = "–"
+"""Stands in tables for a value that is not there."""
+
+
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 0
 _BATCH = 200  # Drawing every resample at once would need 2000 times the memory of the sample.

@@ -26,16 +26,11 @@ from bidex_meta.world import World
 _CANDIDATES = 512
 _STARTS = 24
 _ROUNDS = 25
-_MOST_CENTRES = 1000
-"""Final states among which a blind policy chooses."""
-_SCORING = 25
-"""Tasks that score the chosen state for each task that chooses it."""
-_STEPS = 40
-"""Number of an episode's steps whose rewards are fitted, evenly spread."""
-_HOLD = 10
-"""Number of steps for which an exploring action is held."""
-_NOISE = 0.3
-"""Weight of the rough action that is added to a policy's action."""
+_MOST_CENTRES = 1000  # Final states among which a blind policy chooses.
+_SCORING = 25  # Tasks that score the chosen state for each task that chooses it.
+_STEPS = 40  # Number of an episode's steps whose rewards are fitted, evenly spread.
+_HOLD = 10  # Number of steps for which an exploring action is held.
+_NOISE = 0.3  # Weight of the rough action that is added to a policy's action.
 
 
 @dataclass(frozen=True)
@@ -46,10 +41,8 @@ class Alignment:
     """Rank-biserial correlation of return and success over all episodes: for pairs of a successful and an unsuccessful
     episode, the share in which the successful one returns more minus the share in which it returns less. Unlike
     Spearman's correlation it can reach 1 for any share of successes."""
-    solved: float
-    """Mean return of the successful episodes."""
-    unsolved: float
-    """Largest mean return of a policy that never succeeds."""
+    solved: float  # Mean return of the successful episodes.
+    unsolved: float  # Largest mean return of a policy that never succeeds.
 
 
 def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
@@ -108,10 +101,8 @@ def distances(part: Hidden, values: Tensor, centre: Tensor) -> Tensor:
 class Identified:
     """Errors of hidden parts that were inferred from the rewards of one exploring episode."""
 
-    share: float
-    """Share of episodes in which every part is fitted within its tolerance."""
-    errors: np.ndarray
-    """Largest error of a part in units of its tolerance, (episodes,)."""
+    share: float  # Share of episodes in which every part is fitted within its tolerance.
+    errors: np.ndarray  # Largest error of a part in units of its tolerance, (episodes,).
 
 
 def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) -> Identified:
@@ -210,10 +201,10 @@ def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: in
         x = torch.where(better[:, None], new, x)
         off = torch.where(better[:, None], new_off, off)
         damping = torch.where(better[:, None, None], 0.3 * damping, 5.0 * damping).clamp(1e-6, 1e6)
-    found = truth.clone()
-    found[columns] = x[off.square().sum(dim=1).argmin()]
+    fitted = truth.clone()
+    fitted[columns] = x[off.square().sum(dim=1).argmin()]
     errors = []
     for part, where in parts:
-        error = float(distances(part, found[None, where], truth[where])[0])
+        error = float(distances(part, fitted[None, where], truth[where])[0])
         errors.append(error if part.kind == "sign" else error / part.tolerance)
     return max(errors)

@@ -30,13 +30,13 @@ def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int 
     An evaluation has ten episodes, and a single one sometimes reaches one half by chance.
     """
     reached = success >= level
-    found = np.flatnonzero(reached[:-1] & reached[1:])
-    return int(steps[found[0]]) if len(found) else None
+    rows = np.flatnonzero(reached[:-1] & reached[1:])
+    return int(steps[rows[0]]) if len(rows) else None
 
 
-def median_steps(found: Sequence[int | None]) -> int | None:
+def median_steps(counts: Sequence[int | None]) -> int | None:
     """Return the median, the larger middle value of an even count; None counts as more steps than any number."""
-    ranked = sorted(found, key=lambda steps: np.inf if steps is None else steps)
+    ranked = sorted(counts, key=lambda steps: np.inf if steps is None else steps)
     return ranked[len(ranked) // 2]
 
 

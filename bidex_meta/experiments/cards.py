@@ -13,7 +13,7 @@ from bidex_meta.utils.files import portable
 
 
 def run_card(folder: RunFolder, name: str) -> str:
-    """The card of a run's policy: the hub's header in YAML, then facts and results."""
+    """Return the card of a run's policy: the hub's header in YAML, then facts and results."""
     config = folder.config()
     versions = versions_of(folder)
     subject = portable(config.suite or str(config.task))
@@ -41,7 +41,7 @@ def run_card(folder: RunFolder, name: str) -> str:
 
 
 def data_card(dataset: Dataset, name: str) -> str:
-    """The card of a data set."""
+    """Return the card of a data set."""
     ours = portable(dataset.metadata)
     tasks = ours["tasks"]
     header = {
@@ -73,7 +73,7 @@ def _card(header: Json, title: str, use: str, facts: Json) -> str:
 
 
 def _cell(value: object) -> str:
-    """A value in a table of Markdown; names in metadata may be anybody's."""
+    """Format a value for a table of Markdown; names in metadata may be anybody's."""
     return one_line(value).replace("|", "\\|")
 
 

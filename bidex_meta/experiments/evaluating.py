@@ -3,9 +3,10 @@
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from bidex_meta.agents import Agent
+from bidex_meta.config import Switch
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation
 from bidex_meta.evaluation.play import RandomAgent
@@ -27,11 +28,11 @@ from bidex_meta.runs.evaluations import (
     write_evaluation,
 )
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.training.launch import say
+from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
-from bidex_meta.utils.validation import Environments, Few, Seed, Shots
+from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
@@ -124,6 +125,55 @@ class RunMetaTest:
     def to_json(self) -> Json:
         """Return the content of ``evaluation.json``."""
         return evaluation_json(self.record())
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinalEvaluation:
+    """The evaluation that follows a training."""
+
+    episodes: Few | None = None
+    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
+    that adapt play --rollouts episodes."""
+    other_tasks: Switch = False
+    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
+    others."""
+    split: Literal["auto", "train", "test", "others", "both"] = "auto"
+    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
+    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
+    on."""
+    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
+    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
+    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
+
+    def check(self, config: AnyConfig) -> None:
+        """Raise BidexError if an option does not go with the learner of a resolved config."""
+        adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
+        if adapts:
+            if self.other_tasks:
+                raise BidexError(f"{config.algo} adapts: --split others plays other tasks of its train classes.")
+            metatest.splits_of(Worlds.open(config.to_json()), self.split)
+            return
+        for name in ("split", "shots", "rollouts", "tasks"):
+            if getattr(self, name) not in (None, "auto"):
+                raise BidexError(
+                    f"--{name} is for learners that adapt (maml, promp, rl2), not {config.algo}. Leave it out."
+                )
+
+    def play(self, run: RunFolder, config: AnyConfig) -> "RunEvaluation | RunMetaTest":
+        """Evaluate a run on the device of its training, and write its ``evaluation.json``."""
+        device = launch().own_device(config.device)
+        if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
+            return meta_test(
+                run, split=self.split, shots=self.shots, rollouts=self.rollouts, episodes=self.episodes,
+                tasks=self.tasks, device=device, engine=config.engine, save=True,
+            )  # fmt: skip
+        return evaluate(
+            run, episodes=self.episodes, random=True, other_tasks=self.other_tasks, device=device,
+            engine=config.engine, save=True,
+        )  # fmt: skip
+
+
+USUAL_EVALUATION = FinalEvaluation()
 
 
 @checked_arguments

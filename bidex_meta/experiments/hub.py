@@ -128,7 +128,7 @@ def copied(files: Files, folder: Path) -> None:
 
 
 def library() -> Any:
-    """The module ``huggingface_hub``; BidexError where it is missing."""
+    """Return the module ``huggingface_hub``; raise BidexError if it is missing."""
     try:
         import huggingface_hub
     except ImportError:
@@ -141,7 +141,7 @@ def library() -> Any:
 
 
 def called(function: str, name: str, **options: Any) -> Any:
-    """Calls the library for a repository, ``datasets/`` before the name of a data set; its errors as one line."""
+    """Call the library for a repository (``datasets/NAME`` of a data set); raise its errors as one line."""
     if name.startswith(DATASETS):
         kind = "dataset"
     else:

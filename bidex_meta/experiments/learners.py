@@ -30,7 +30,7 @@ ALGOS: dict[str, str] = {
     "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
     "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
     # For a single task.
-    "ppo": "bidex_algos.onpolicy.mtppo:PPO",
+    "ppo": "bidex_algos.onpolicy.single_task:PPO",
     "trpo": "bidex_algos.onpolicy.mttrpo:TRPO",
     "sac": "bidex_algos.offpolicy.mtsac:SAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
@@ -44,6 +44,11 @@ ALGOS: dict[str, str] = {
     "td3bc": "bidex_algos.offline.td3bc:TD3BC",
     "iql": "bidex_algos.offline.iql:IQL",
 }
+
+USUAL_SETTINGS = (
+    "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "updates_per_step",
+)  # fmt: skip
+"""Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those of its learner."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ def learner_class(name: str) -> type[Learner]:
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
-    """The learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; BidexError where there is none.
+    """Return the learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; else raise BidexError.
 
     It may have presets of its own for the ``task`` that it shall learn alone.
     """
@@ -86,7 +91,7 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 
 
 def _from_elsewhere(name: str) -> type[Learner]:
-    """The learner ``package.module:Class``, with the defaults of :class:`Learner` and its module's ``PRESETS``."""
+    """Return a learner by ``package.module:Class``, with defaults of :class:`Learner` and its module's ``PRESETS``."""
     make, module = outside_class(name, "--algo")
     if issubclass(make, Learner):
         bases = (make,)
@@ -109,7 +114,7 @@ def _from_elsewhere(name: str) -> type[Learner]:
 
 
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
-    """The preset's name and, in words, why this one.
+    """Return the preset's name and, in words, the reason for this preset.
 
     ``asked`` may be ``auto``; then ``first`` (``Worlds.preset``: a preset and why) goes before what fits the device.
     """

@@ -140,7 +140,7 @@ def check_worlds(worlds: Worlds, algo: str) -> None:
 
 
 def splits_of(worlds: Worlds, asked: str) -> list[str]:
-    """The splits that a meta-test plays: the one of this name, or all there are for ``both`` and ``auto``."""
+    """Return the splits that a meta-test plays: the named split, or all splits for ``both`` and ``auto``."""
     if asked == OTHERS:
         return [OTHERS]
     if asked in ("train", "test") and asked not in worlds.splits:

@@ -54,7 +54,7 @@ def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
 
 @contextlib.contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """What happens within puts a run's checkpoint into what its config describes; each error says that it does not fit.
+    """Turn errors while a checkpoint is loaded into a BidexError: the checkpoint does not fit the run's config.
 
     A checkpoint may be of another version, or of anybody: its tensors and words can be any.
     """
@@ -87,13 +87,13 @@ def load_policy(
 
 
 def policy_of(folder: RunFolder, state: Json, device: str) -> Agent:
-    """The policy in a run's checkpoint; BidexError where it does not fit the run's config, or its own."""
+    """Return the policy in a run's checkpoint; raise BidexError if the checkpoint does not fit the run's config."""
     with fitting(folder.path):
         return learner_kind(folder.config().algo).make.load_policy(state["learner"]["policy"], device)
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
-    """What makes the policy of a run's checkpoint anew with each call, and that checkpoint's steps.
+    """Return a function that makes a new policy of a run's checkpoint with each call, and the checkpoint's steps.
 
     The checkpoint is read once: a run that trains on meanwhile gives no other.
     """
@@ -110,5 +110,5 @@ def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
 
 
 def slots_of(worlds: Worlds) -> list[str]:
-    """The class of each slot of some worlds; a slot of listed tasks is named Class/task."""
+    """Return the class of each slot of some worlds; a slot of listed tasks is named Class/task."""
     return [name.split("/")[0] for name in worlds.tasks("train")]

@@ -41,24 +41,33 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     if Capability.OFFLINE in kind.make.capabilities:
         num_envs = max(1, len(source.tasks("train")))  # it takes sizes and names from its world
         steps = run_data.UPDATES
+    given: dict[str, Any] = {}
+    if config.suite is not None:
+        given["suite"] = _written(source.name)
+    if config.task is not None:
+        given["task"] = source.class_name or source.name
+    if config.start_from is not None:
+        given["start_from"] = str(absolute(config.start_from))
+    if config.task_seed is None:
+        given["task_seed"] = run_data.task_seed(datasets)
+    if config.num_envs is None:
+        given["num_envs"] = num_envs
+    if config.steps is None:
+        given["steps"] = steps
+    if config.threads is None:
+        given["threads"] = max(1, usable_cores() // launch().local_count)
     config = replace(
         config,
-        suite=None if config.suite is None else _written(source.name),
-        task=None if config.task is None else source.class_name or source.name,
         object=_written(config.object),
-        start_from=None if config.start_from is None else str(absolute(config.start_from)),
         dataset=dataset,
         demonstrations=run_data.whole_paths(config.demonstrations),
         teacher=run_teachers.whole_paths(config.teacher),
-        task_seed=run_data.task_seed(datasets) if config.task_seed is None else config.task_seed,
         algo=kind.name,
         preset=preset,
         learner=_learner_config(kind.presets[preset], config, where),
-        num_envs=num_envs if config.num_envs is None else config.num_envs,
-        steps=steps if config.steps is None else config.steps,
-        threads=max(1, usable_cores() // launch().local_count) if config.threads is None else config.threads,
         processes=launch().count,
         device=device,
+        **given,
     )
     share = config.record / max(config.steps, 1)
     return replace(config, record_share=config.record_share or share)

@@ -38,35 +38,40 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     names = {name.partition("/")[0] for name in world.task_names}
     references = {name: known for name, known in source.references().items() if name in names}
     altered = source.object or source.points or source.moving_base is not None
-    if alone and not altered:
+    env_id = None
+    if alone and not altered and task_id(alone) in gymnasium.registry:
         env_id = task_id(alone)
-    else:
-        env_id = None
+    base = None
+    if alone:
+        base = {None: "own", True: "moving", False: "fixed"}[source.moving_base]
+    slots = getattr(world, "slots", ())
+    rules = asdict(slots[0].task_class.rules) if slots else asdict(V1)
+    version = source.suite.version if source.suite else None
     return {
         "suite": None if alone else source.name,
-        "suite_version": source.suite.version if source.suite else None,
+        "suite_version": version,
         "task": alone, "object": source.object, "points": source.points,
-        "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
+        "base": base,
         "tasks": list(world.task_names),
-        "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
-        "rules": next((asdict(slot.task_class.rules) for slot in getattr(world, "slots", ())), asdict(V1)),
+        "reward_scales": {slot.name: slot.reward_scale for slot in slots},
+        "rules": rules,
         "hides_goals": source.hides_goals,
         "observation_groups": [[g.name, [[p.start, p.stop] for p in g.where]] for g in world.observation_groups],
         "kind": kind, "policies": list(policies), "seed": source.seed,
         "references": {n: {"random": k.random, "zero": k.zero, "expert": k.expert} for n, k in references.items()},
         "versions": versions, "commit": (versions["git"] or {}).get("commit"),
-        "gymnasium_id": env_id if env_id in gymnasium.registry else None,
+        "gymnasium_id": env_id,
         **more,
     }  # fmt: skip
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
-    """Data sets as a config holds them: of folders the whole path, since a run may be resumed from another folder."""
+    """Return data sets as a config holds them; folders get whole paths, because a run may resume in another folder."""
     return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 
 
 def open_datasets(names: Sequence[str]) -> list[Dataset]:
-    """Data sets by names or folders; errors as of ``open_dataset``."""
+    """Open data sets by names or folders; errors are those of ``open_dataset``."""
     return [open_dataset(name) for name in names]
 
 
@@ -90,7 +95,7 @@ def implied(datasets: Sequence[Dataset]) -> Json:
 
 
 def task_seed(datasets: Sequence[Dataset]) -> int | None:
-    """The seed of the tasks that the first data set was collected on: a learner is evaluated on those."""
+    """Return the seed of the tasks of the first data set: a learner is evaluated on those tasks."""
     if datasets:
         return datasets[0].metadata.get("seed")
     return None

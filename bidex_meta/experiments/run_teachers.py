@@ -54,16 +54,17 @@ def _takes(kind: LearnerKind) -> bool:
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
-    """The first teacher that knows a class, by the class's name in ``source.task_classes()``; others are left out.
+    """Return the first teacher that knows a class, by the class's name in ``source.task_classes()``.
 
     Raises BidexError for a run that cannot teach here.
     """
     knows = {name: _scripted(source) if name == SCRIPTS else _known_to(name, source) for name in names}
-    return {
-        task: next(name for name in names if task in knows[name])
-        for task in source.task_classes()
-        if any(task in known for known in knows.values())
-    }
+    teachers = {}
+    for task in source.task_classes():
+        knowing = [name for name in names if task in knows[name]]
+        if knowing:
+            teachers[task] = knowing[0]
+    return teachers
 
 
 def _scripted(source: Worlds) -> set[str]:
@@ -106,7 +107,7 @@ def _alike(one: object, other: object) -> bool:
 
 
 def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teachers:
-    """The teachers of a run in its world, after a line of who teaches what."""
+    """Return the teachers of a run in its world, and log which class each teacher labels."""
     assigned = teacher_of_class(config.teacher, source)
     classes = source.task_classes()
     slots = slots_of(source)
@@ -139,6 +140,6 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
 
 
 def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:
-    """The environments of some classes, int64 (k,)."""
+    """Return the environments of some classes, int64 (k,)."""
     chosen = torch.tensor([i for i, task in enumerate(slots) if task in tasks], device=world.device)
     return torch.isin(world.task_id, chosen).nonzero().squeeze(1)

@@ -1,24 +1,31 @@
-"""A sweep's file as the runs it asks for, each as the words of ``bidex-meta run``. docs/sweeps.md explains the file."""
+"""Plans of sweeps: runs with their configs, in a list or by a study file, which docs/sweeps.md explains."""
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from msgspec import Meta
 
 from bidex_meta.config import RunConfig, flat
-from bidex_meta.errors import BidexError, shortened
-from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.folder import RunFolder
-from bidex_meta.utils.files import absolute, expanded, read_toml
+from bidex_meta.errors import BidexError, known_name, shortened
+from bidex_meta.experiments.evaluating import USUAL_EVALUATION, FinalEvaluation
+from bidex_meta.runs.folder import AnyConfig, RunFolder
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.files import Json, JsonObject, absolute, expanded, read_toml
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Seed, Text, check_fields, parse
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
 """Flags of a run that no override sets: other entries of the file do, or the sweep."""
+_NO_FLAGS = ("task_seed", "record_share", "processes")
+"""Fields of a resolved config that ``bidex-meta run`` fills in itself."""
+_LISTS = ("dataset", "demonstrations", "teacher")
+"""Fields whose flag is given once for each value."""
+_WHOLE = ("steps", "record")
+"""Fields that may be written 2e7."""
 _MOST_RUNS = 10_000
 _IN_NAMES = r"\w.+ -"  # characters of a run folder's name, before blanks become hyphens
 
@@ -32,7 +39,7 @@ class _Shared:
     name: _Name
     suites: _Texts | None = None
     tasks: _Texts | None = None
-    overrides: Json = field(default_factory=dict)
+    overrides: JsonObject = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,57 +53,125 @@ class _Arm(_Shared):
 class _File(_Shared):
     seeds: _Seeds
     algos: _Texts = ()
-    grid: Json = field(default_factory=dict)
+    grid: JsonObject = field(default_factory=dict)
     arms: tuple[_Arm, ...] = ()
-    slurm: Json = field(default_factory=dict)
+    slurm: JsonObject = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run that a sweep's file asks for."""
+    """A run of a plan. It trains in a process of its own, ``bidex-meta run`` with the words of this run."""
 
-    path: Path  # its folder, which need not be there yet
-    arm: str  # what tables call it and its like on other seeds
-    subject: str  # the suite or class, as the file names it
-    seed: int
-    words: tuple[str, ...]  # flags of ``bidex-meta run``, without seed and folder
-    after: Path | None = None  # the folder of the run whose policy it starts from
-    config: RunConfig = field(default=None, compare=False)  # pyright: ignore  # of the words; the command adds it
+    path: Path
+    """The run's folder, which need not be there yet."""
+    given: AnyConfig
+    """The values that were given. The rest is resolved on the machine that trains."""
+    arm: str
+    """The name in tables of this run and of the same run with other seeds."""
+    final: FinalEvaluation = USUAL_EVALUATION
+    """The evaluation at the end of the run."""
+    config: AnyConfig = field(default=None, compare=False)  # pyright: ignore[reportAssignmentType]
+    """``given``, resolved and checked on this machine by ``bidex_meta.experiments.sweeping.resolved``."""
 
     @property
     def name(self) -> str:
-        """Its folder's name."""
+        """The name of the run's folder."""
         return self.path.name
 
     @property
     def folder(self) -> RunFolder:
-        """Its folder."""
+        """The run's folder."""
         return RunFolder(self.path)
 
     @property
+    def seed(self) -> int:
+        """The run's seed."""
+        return self.given.seed
+
+    @property
+    def subject(self) -> str:
+        """The suite or class that the run trains on, as it was given."""
+        return self.given.suite or self.given.task or ""
+
+    @property
+    def after(self) -> Path | None:
+        """The folder of the run whose policy the run starts from."""
+        if self.given.start_from is None:
+            return None
+        return Path(self.given.start_from)
+
+    @property
     def begin(self) -> list[str]:
-        """The words that begin it."""
-        if self.after is None:
-            start = []
-        else:
-            start = [f"--start-from={self.after}"]
-        return ["run", *self.words, *start, f"--seed={self.seed}", "--threads=1", f"--run-dir={self.path}"]
+        """The words of the command line that begin the run."""
+        return ["run", *self._words(), f"--run-dir={self.path}"]
+
+    @property
+    def resume(self) -> list[str]:
+        """The words of the command line that resume the run."""
+        return ["run", f"--resume={self.path}", *self._words(may_change=True)]
+
+    def _words(self, may_change: bool = False) -> list[str]:
+        """Return a flag for each given value; with ``may_change`` also for values that a resumed run may change."""
+        content = self.given.to_json()
+        learner = content.pop("learner")
+        words = []
+        for entry in fields(RunConfig):
+            if entry.name not in content or entry.name in _NO_FLAGS:
+                continue
+            value = content[entry.name]
+            is_given = value not in (entry.default, []) or entry.name in ("algo", "seed")
+            # A value that was given before may have been taken out since; only steps have no word for their default.
+            if is_given or (may_change and "may_change" in entry.metadata and entry.name != "steps"):
+                words += words_of(entry.name, value)
+        for name, value in flat(learner).items():
+            words += words_of(f"learner.{name}", value)
+        for entry in fields(FinalEvaluation):
+            value = getattr(self.final, entry.name)
+            if value != entry.default:
+                words += words_of(entry.name, value)
+        return words
 
 
-class Sweep(NamedTuple):
-    """What a file asks for: its runs in order (all arms of the first seed, then of the second), and their folder."""
+@dataclass(frozen=True)
+class SweepPlan:
+    """Runs to train: in a list, or by a study file."""
 
-    out: Path
-    runs: list[PlannedRun]
-    slurm: Json  # parameters of submitit's executor
+    folder: Path
+    """The folder of the runs' folders."""
+    runs: Sequence[PlannedRun]
+    """The runs in their order; a run that starts from another stands behind it."""
+    slurm: JsonObject = field(default_factory=dict)
+    """Parameters of submitit's executor."""
+    source: str = "sweep"
+    """The study file, for messages."""
+
+    @classmethod
+    @checked_arguments
+    def of(cls, folder: str | Path, configs: Mapping[str, RunConfig]) -> "SweepPlan":
+        """Plan a run for each config, by the names of the runs' folders. Each run trains with one thread by default.
+
+        Raises BidexError for a name that no folder can have.
+        """
+        runs = []
+        for name, config in configs.items():
+            if re.fullmatch(rf"[{_IN_NAMES}]+", name) is None:
+                raise BidexError(f"Expected the name of a folder, got {shortened(name)}.")
+            given = replace(config, threads=config.threads or 1)
+            runs.append(PlannedRun(expanded(folder) / name, given, name))
+        return cls(expanded(folder), runs)
+
+    @classmethod
+    @checked_arguments
+    def read(cls, file: str | Path, root: str | Path = "runs") -> "SweepPlan":
+        """Read a study file (docs/sweeps.md): all arms with the first seed, then with the second.
+
+        ``root`` is where the folder of the study is. Raises BidexError if the file is wrong, or if two of its runs have
+        one name. Values that ``bidex-meta run`` refuses are refused by ``bidex_meta.sweep``.
+        """
+        return _read(Path(file), expanded(root))
 
 
-def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
-    """A sweep's file; ``root`` is where the sweep's folder lies.
-
-    Raises BidexError where the file is wrong, or two of its runs have one name; what ``bidex-meta run`` would refuse is
-    not checked here.
-    """
+def _read(path: Path, root: Path) -> SweepPlan:
     file = parse(read_toml(path, "a sweep"), _File, str(path), exact=True)
     arms = [*(_Arm(name=short_name(algo), algo=algo) for algo in file.algos), *file.arms]
     if not arms:
@@ -115,83 +190,118 @@ def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
             )
         if not (arm.suites or arm.tasks or file.suites or file.tasks):
             raise BidexError(f"{path}: expected suites or tasks, for all or for {arm.name!r}, found neither.")
-    out = expanded(root) / file.name.replace(" ", "-")
+    folder = root / file.name.replace(" ", "-")
     runs: dict[str, PlannedRun] = {}
-    for run in _runs(path, file, arms, out):
+    for run in _runs(path, file, arms, folder):
         if run.name in runs:
             raise BidexError(f"{path}: two runs are called {run.name}. Name arms apart, each seed and value once.")
         if len(runs) == _MOST_RUNS:
             raise BidexError(f"{path}: expected at most {_MOST_RUNS:,} runs, got more. Make several sweeps of it.")
         runs[run.name] = run
-    return Sweep(out, list(runs.values()), file.slurm)
+    return SweepPlan(folder, list(runs.values()), file.slurm, str(path))
 
 
-def _check_flags(path: Path, place: str, flags: Json) -> None:
+def _check_flags(path: Path, place: str, flags: JsonObject) -> None:
     for flag in flat(flags):
         if flag.replace("-", "_") in _OWN:
             raise BidexError(f"{path}: {place}.{flag}: the file's other entries or the sweep decide that.")
 
 
-def _runs(path: Path, file: _File, arms: Sequence[_Arm], out: Path) -> Iterator[PlannedRun]:
+def _runs(path: Path, file: _File, arms: Sequence[_Arm], folder: Path) -> Iterator[PlannedRun]:
     for seed in file.seeds:
         above: list[tuple[str, str, PlannedRun]] = []
-        for arm in (arm for arm in arms if seed in (arm.seeds or file.seeds)):
+        for arm in arms:
+            if seed not in (arm.seeds or file.seeds):
+                continue
             on = arm if arm.suites or arm.tasks else file
             subjects = [("suite", suite) for suite in on.suites or ()] + [("task", task) for task in on.tasks or ()]
             for (values, flags), (kind, subject) in itertools.product(_combinations(file, arm), subjects):
-                if subject.endswith(".toml"):
-                    given = absolute(path.parent / expanded(subject))
-                else:
-                    given = subject
                 called = Path(short_name(subject)).stem
                 label = arm.name + values
-                words = (f"--{kind}={given}", f"--algo={arm.algo}", *(w.replace("{subject}", called) for w in flags))
-                folder = out / f"{called}-{label}-seed{seed}".replace(" ", "-")
-                after = None
+                if subject.endswith(".toml"):
+                    subject = str(absolute(path.parent / expanded(subject)))
+                given, final = _parsed(f"{path}: {label}", flags, called)
+                given = replace(given, **{kind: subject}, algo=arm.algo, seed=seed, threads=1)
+                name = f"{called}-{label}-seed{seed}".replace(" ", "-")
                 if arm.start_from is not None:
-                    same = [(v, run) for name, v, run in above if (name, run.subject) == (arm.start_from, subject)]
-                    found = [run for v, run in same if v == values] or [run for _, run in same]
-                    if len(found) != 1:
+                    same = [(v, run) for start, v, run in above if (start, run.subject) == (arm.start_from, subject)]
+                    starts = [run for v, run in same if v == values] or [run for _, run in same]
+                    if len(starts) != 1:
                         raise BidexError(
-                            f"{path}: {folder.name} is to start from the arm {arm.start_from!r}, of which there are "
-                            f"{len(found)} runs on {subject} above it. Give both the same suites, tasks and grid."
+                            f"{path}: {name} is to start from the arm {arm.start_from!r}, of which there are "
+                            f"{len(starts)} runs on {subject} above it. Give both the same suites, tasks and grid."
                         )
-                    after = found[0].path
-                run = PlannedRun(folder, label, subject, seed, words, after)
+                    given = replace(given, start_from=str(starts[0].path))
+                run = PlannedRun(folder / name, given, label, final)
                 above.append((arm.name, values, run))
                 yield run
 
 
-def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, list[str]]]:
-    """Every combination of the grid for an arm, without what the arm sets itself: for the name, and as all flags."""
-    shared = flat(file.overrides)
-    own = flat(arm.overrides)
-    fixed = {flag.replace("-", "_") for flag in own}
-    grid = {flag: values for flag, values in flat(file.grid).items() if flag.replace("-", "_") not in fixed}
+def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, JsonObject]]:
+    """Yield every combination of the grid for an arm, without what the arm sets itself: its label, and all values."""
+    shared = _by_field(file.overrides)
+    own = _by_field(arm.overrides)
+    grid = {name: values for name, values in _by_field(file.grid).items() if name not in own}
     for values in itertools.product(*grid.values()):
         chosen = dict(zip(grid, values, strict=True))
-        label = "".join(f" {flag.rpartition('.')[2]}={_named(value)}" for flag, value in chosen.items())
-        yield label, [word for flag, value in {**shared, **chosen, **own}.items() for word in words_of(flag, value)]
+        label = "".join(f" {name.rpartition('.')[2]}={_named(value)}" for name, value in chosen.items())
+        yield label, {**shared, **chosen, **own}
 
 
-def words_of(flag: str, value: object) -> list[str]:
-    """A flag of ``bidex-meta run`` with its value, as words of the command line."""
-    flag = flag.replace("_", "-")
+def _by_field(flags: JsonObject) -> JsonObject:
+    """Return values without nesting by the names of fields, which a file may write with hyphens, as flags are."""
+    return {flag.replace("-", "_"): value for flag, value in flat(flags).items()}
+
+
+def _parsed(where: str, values: JsonObject, called: str) -> tuple[RunConfig[JsonObject], FinalEvaluation]:
+    """Return values as a config and an evaluation; ``called`` stands for ``{subject}`` in texts."""
+    parts: dict[str, JsonObject] = {"config": {}, "learner": {}, "final": {}}
+    of_final = {entry.name for entry in fields(FinalEvaluation)}
+    of_config = {entry.name for entry in fields(RunConfig)}.difference(_OWN, _NO_FLAGS, ["start_from"])
+    for name, value in values.items():
+        value = _filled(value, called)
+        if name.startswith("learner."):
+            parts["learner"][name.removeprefix("learner.")] = value
+        elif name in of_final:
+            parts["final"][name] = value
+        else:
+            known_name("override", name, sorted(of_config | of_final))
+            if name in _LISTS and isinstance(value, str):
+                value = [value]
+            if name in _WHOLE and isinstance(value, float) and value.is_integer():
+                value = int(value)
+            parts["config"][name] = value
+    config = parse(parts["config"] | {"learner": parts["learner"]}, RunConfig[JsonObject], where)
+    return config, parse(parts["final"], FinalEvaluation, where)
+
+
+def _filled(value: Json, called: str) -> Json:
+    if isinstance(value, list):
+        return [_filled(item, called) for item in value]
+    if isinstance(value, str):
+        return None if value == "None" else value.replace("{subject}", called)
+    return value
+
+
+def words_of(name: str, value: Json) -> list[str]:
+    """Return a field of the config of ``bidex-meta run`` with its value, as words of the command line."""
+    flag = name.replace("_", "-")
     if isinstance(value, bool):
         before, dot, last = flag.rpartition(".")
         return [f"--{flag}" if value else f"--{before}{dot}no-{last}"]
-    if isinstance(value, list) and flag not in ("dataset", "demonstrations", "teacher"):
-        return [f"--{flag}", *map(_text, value)]
-    # Of these each value is given with the flag's name.
-    return [f"--{flag}={_text(each)}" for each in (value if isinstance(value, list) else [value])]
+    if not isinstance(value, list):
+        return [f"--{flag}={_text(value)}"]
+    if name in _LISTS:
+        return [f"--{flag}={_text(item)}" for item in value]
+    return [f"--{flag}", *map(_text, value)]
 
 
-def _text(value: object) -> str:
+def _text(value: Json) -> str:
     if isinstance(value, list):
         return "x".join(map(_text, value))
     return str(value)
 
 
-def _named(value: object) -> str:
-    """A value as a part of a folder's name: data sets and paths have slashes."""
+def _named(value: Json) -> str:
+    """Return a value as a part of a folder's name: data sets and paths have slashes."""
     return re.sub(rf"[^{_IN_NAMES}]+", "-", _text(value).strip("/"))

@@ -141,7 +141,7 @@ def _where(device: str, engine: str | None, then: Conditions, config: AnyConfig)
 
 
 def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
-    """The checkpoint that was evaluated."""
+    """Return the checkpoint that was evaluated."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         if there:

@@ -11,7 +11,7 @@ import torch
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.filming import film_tiles
+from bidex_meta.evaluation.filming import Look, film_tiles
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments import metatest
@@ -30,7 +30,7 @@ from bidex_meta.worlds import Worlds
 
 TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
 _LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
-_FILM = {"width": 240, "height": 180}
+_FILM: Look = {"width": 240, "height": 180}
 _FILM_EVERY = 2
 _MOST_FILM_STEPS = 300
 
@@ -82,7 +82,7 @@ class Watch:
         return every is not None and self._iterations % every == 0
 
     def _policy(self, device: str) -> Agent:
-        """A copy: recurrent ones remember what they saw, adapting ones learn."""
+        """Copy the policy, because recurrent policies keep a memory and adapting policies learn."""
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
@@ -119,7 +119,7 @@ class Watch:
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
 
     def _film(self) -> None:
-        """A film of an environment of each class beside each other; its failure is reported and ends nothing."""
+        """Film an environment of each class side by side; report a failure without ending the training."""
         try:
             if "film" not in self._worlds:
                 worlds = Worlds.open({**self._config.to_json(), "device": "cpu", "engine": "auto"})

@@ -64,8 +64,8 @@ def _triangles(rings: int) -> np.ndarray:
     first = np.arange(_AROUND)
     a = first
     b = (first + 1) % _AROUND
-    sides = [np.stack((a, b, b + _AROUND, a, b + _AROUND, a + _AROUND), axis=1).reshape(-1, 3) + _AROUND * r
-             for r in range(rings - 1)]  # fmt: skip
+    strip = np.stack((a, b, b + _AROUND, a, b + _AROUND, a + _AROUND), axis=1).reshape(-1, 3)
+    sides = [strip + _AROUND * ring for ring in range(rings - 1)]
     fan = np.stack((np.zeros(_AROUND - 2, int), first[1:-1], first[2:]), axis=1)
     return np.concatenate((*sides, fan[:, ::-1], fan + _AROUND * (rings - 1)))
 
@@ -130,10 +130,11 @@ class _Tailor:
         self._add(body, material, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"looks/{mesh}")
 
     def _pin(self, body: str, radius: float, half: float, axis: tuple[float, float, float], z: float = 0.0) -> None:
-        start, end = (
-            0.001 * np.array((s * half * axis[0], s * half * axis[1], z + s * half * axis[2])) for s in (-1, 1)
-        )
-        self._add(body, "link", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.001 * radius, 0, 0], fromto=[*start, *end])
+        ends: list[float] = []
+        for sign in (-1, 1):
+            end = (sign * half * axis[0], sign * half * axis[1], z + sign * half * axis[2])
+            ends += [*(0.001 * np.array(end))]
+        self._add(body, "link", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.001 * radius, 0, 0], fromto=ends)
 
     def dress(self) -> None:
         self._skin("forearm", "forearm", "forearm")

@@ -180,10 +180,10 @@ def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length
 
 def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
     """Return whether LFJ4 (n,) lifts the little finger's metacarpal into an egg, (n,)."""
-    low, high = (
-        torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1)
-        for x, rise, z in _METACARPAL
-    )
+    ends = []
+    for x, rise, z in _METACARPAL:
+        ends.append(torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1))
+    low, high = ends
     length = norm(high - low)
     along = (high - low) / length[:, None]
     return _gap(centre, support, low, along, length) < _METACARPAL_RADIUS - _SLACK

@@ -66,6 +66,6 @@ def units_by_agent(line: str) -> dict[str, list[str]]:
 def _line(content: object, where: str) -> str:
     agents = parse(content, _Partition, where, exact=True).agents
     for name, units in agents.items():
-        if any(sign in text for text in (name, *units) for sign in ";=+"):
+        if set(";=+").intersection("".join((name, *units))):
             raise BidexError(f"{where}: agents.{name}: expected names without ; = and +, got {units!r}.")
     return ";".join(f"{name}={'+'.join(units)}" for name, units in agents.items())

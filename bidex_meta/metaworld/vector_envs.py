@@ -40,11 +40,9 @@ def make_mt_envs(
     if _is_class(name):
         benchmark = MT1(name, seed)
         [(env_name, env_class)] = benchmark.train_classes.items()
-        one = {
-            "num_tasks": num_tasks or 1,
-            "env_id": 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None,
-        }
-        return make_env(env_class.recipe, benchmark.tasks_of(env_name), seed, **(one | options))
+        env_id = 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None
+        given = {"num_tasks": num_tasks or 1, "env_id": env_id, **options}
+        return make_env(env_class.recipe, benchmark.tasks_of(env_name), seed, **given)
     return _multi_task(Benchmark(name, seed or 0), seed, num_tasks, **options)
 
 
@@ -169,8 +167,8 @@ def _meta(
     else:
         size = meta_batch_size
     if size < 1 or size % len(classes):
-        what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
-        raise BidexError(f"meta_batch_size: expected {what}; got {size}.")
+        fault = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
+        raise BidexError(f"meta_batch_size: expected {fault}; got {size}.")
     envs = []
     for name, env_class in classes.items():
         tasks = benchmark.tasks_of(name, split)[:total_tasks_per_cls]
@@ -204,10 +202,11 @@ def make_env(
     turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
     wrappers = mended().wrappers  # not needed by the package's other names
-    env: Any = recipe.make_class()(**options)
+    single = recipe.make_class()(**options)
     if seed is not None:
-        env.seed(seed)
-    env.toggle_terminate_on_success(terminate_on_success)
+        single.seed(seed)
+    single.toggle_terminate_on_success(terminate_on_success)
+    env: gymnasium.Env = single
     if max_episode_steps is not None:
         env = gymnasium.wrappers.TimeLimit(env, max_episode_steps)
     if use_one_hot:
@@ -224,8 +223,7 @@ def make_env(
     if normalize_observations:
         env = gymnasium.wrappers.NormalizeObservation(env)
     env = gymnasium.wrappers.RecordEpisodeStatistics(env)
-    random = task_select == "random"
-    select: Any = wrappers.RandomTaskSelectWrapper if random else wrappers.PseudoRandomTaskSelectWrapper
+    select = wrappers.RandomTaskSelectWrapper if task_select == "random" else wrappers.PseudoRandomTaskSelectWrapper
     return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.env_name}_{env_id}")
 
 

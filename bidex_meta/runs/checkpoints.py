@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import IO
 
 from bidex_meta.errors import BidexError, one_line, shortened
@@ -95,9 +94,9 @@ class Checkpoints:
             old.unlink(missing_ok=True)
 
     @checked_arguments
-    def save_best(self, policy: State, step: int, found: dict[str, float]) -> None:
+    def save_best(self, policy: State, step: int, results: dict[str, float]) -> None:
         """Write ``best.pt``: only a policy (entry ``learner.policy`` of a checkpoint) and its results."""
-        self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": found})
+        self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": results})
 
     def found_of_best(self) -> dict[str, float] | None:
         """Return the results of the policy in ``best.pt``; None if there is no readable one."""
@@ -110,7 +109,7 @@ class Checkpoints:
     def load_one(self, path: Path) -> tuple[State, int]:
         """Load one given checkpoint as ``load`` returns it; raises BidexError if it is missing or unreadable."""
         if not is_file(path):
-            there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
+            there = ", ".join(sorted(path.name for path in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
         try:
             content = _opened(path)
@@ -151,11 +150,11 @@ class Checkpoints:
             paths = self.folder.iterdir()
         else:
             paths = ()
-        found = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
-        return [path for _, path in sorted(found, reverse=True)]
+        numbered = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
+        return [path for _, path in sorted(numbered, reverse=True)]
 
 
-def _torch() -> ModuleType:
+def _torch():
     import torch  # not at the top: `bidex-meta list` starts without it
 
     return torch
@@ -219,43 +218,43 @@ def weights_digest(policy: State) -> str:
 def _halved(value: object) -> object:
     if isinstance(value, dict):
         return {name: _halved(part) for name, part in sorted(value.items())}
-    is_number = isinstance(value, _torch().Tensor) and value.is_floating_point()
-    if is_number:
-        return value.to(_torch().float16)
+    torch = _torch()
+    if isinstance(value, torch.Tensor) and value.is_floating_point():
+        return value.to(torch.float16)
     return value
 
 
 def _digest(content: State) -> str:
-    found = hashlib.blake2b(digest_size=32)
-    _feed(content, found, 0)
-    return found.hexdigest()
+    digest = hashlib.blake2b(digest_size=32)
+    _feed(content, digest, 0)
+    return digest.hexdigest()
 
 
-def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
+def _feed(value: object, digest: "hashlib.blake2b", depth: int) -> None:
     """Feed a hash with a value, its type and its shape, so that different contents give different hashes."""
     torch = _torch()
     if depth > _DEEPEST:
         raise ValueError(f"it is nested more than {_DEEPEST} deep")
     if isinstance(value, torch.Tensor):
-        found.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
+        digest.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
         flat = value.detach().cpu().contiguous()
         # A single number can have any stride, but a view of bytes requires 1.
         flat = flat.as_strided((flat.numel(),), (1,))
-        found.update(flat.view(torch.uint8).numpy().data)
+        digest.update(flat.view(torch.uint8).numpy().data)
     elif isinstance(value, dict):
-        found.update(f"dict {len(value)}:".encode())
+        digest.update(f"dict {len(value)}:".encode())
         for name, entry in value.items():
-            _feed(name, found, depth + 1)
-            _feed(entry, found, depth + 1)
+            _feed(name, digest, depth + 1)
+            _feed(entry, digest, depth + 1)
     elif isinstance(value, list | tuple):
-        found.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}:".encode())
+        digest.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}:".encode())
         for entry in value:
-            _feed(entry, found, depth + 1)
+            _feed(entry, digest, depth + 1)
     else:
         # repr gives every bit of a float, except for NaN.
         if isinstance(value, bytes):
             content = value
         else:
             content = repr(value).encode()
-        found.update(f"{type(value).__name__} {len(content)}:".encode())
-        found.update(content)
+        digest.update(f"{type(value).__name__} {len(content)}:".encode())
+        digest.update(content)

@@ -16,8 +16,7 @@ from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Threads, Whole, parse
 
-Interval = tuple[Finite, Finite]
-"""Lower and upper end of a 95 % bootstrap interval."""
+Interval = tuple[Finite, Finite]  # Lower and upper end of a 95 % bootstrap interval.
 Engine = Literal["auto", "c", "warp"]
 
 
@@ -148,8 +147,7 @@ class PolicyEvaluation:
     split: Text = "train"
     seed: Seed | None = None  # of the episodes' starts
     policy: Summary
-    random: Summary | None = None
-    """The results of a random policy on the same tasks."""
+    random: Summary | None = None  # The results of a random policy on the same tasks.
     return_above_random: dict[str, Estimate] | None = None
     other_tasks: OtherTasks | None = None
     conditions: Conditions = Conditions()
@@ -239,11 +237,6 @@ def evaluation_json(evaluation: Evaluated) -> Json:
     if "other_tasks" in content:
         content["other_tasks"] = _without_none(content["other_tasks"])
     return content
-
-
-def summary_json(summary: Summary | SplitSummary | ClassSummary) -> Json:
-    """Return a part of ``evaluation.json``."""
-    return msgspec.to_builtins(summary)
 
 
 def _without_none(content: Json) -> Json:

@@ -33,6 +33,11 @@ from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 from bidex_meta.utils.validation import Whole
 
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None
+
 AnyConfig = RunConfig[Any]  # A run's config, with its learner's settings in any form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
 """Entries of a run folder before the end of its first iteration, apart from TensorBoard's file."""
@@ -170,9 +175,7 @@ class RunFolder:
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
-            with contextlib.suppress(ImportError):  # Windows has no such locks
-                import fcntl
-
+            if fcntl is not None:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:

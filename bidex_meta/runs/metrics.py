@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json, write_atomic
@@ -34,7 +35,7 @@ class MetricsWriter:
         self.writer: Writer = make_writer(logger, folder, resume_step)
 
     @checked_arguments
-    def log(self, metrics: Mapping[str, float], step: Whole) -> None:
+    def log(self, metrics: Mapping[str, Any], step: Whole) -> None:
         """Write one line, with null for values that are not finite, and one point of the logger per value."""
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
@@ -77,14 +78,11 @@ def training_seconds(rows: Sequence[Json]) -> float:
     For runs that did not yet log the time it is the time of the iterations, without the time of checkpoints.
     """
     logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
-    if logged:
-        return max(logged)
-    unlogged = 0.0
+    unlogged = []
     for row in rows:
         if "Perf/training_time" not in row:
-            unlogged += row.get("Perf/collection_time") or 0.0
-            unlogged += row.get("Perf/learning_time") or 0.0
-    return unlogged
+            unlogged += [row.get("Perf/collection_time") or 0.0, row.get("Perf/learning_time") or 0.0]
+    return max(logged, default=sum(unlogged))
 
 
 @checked_arguments

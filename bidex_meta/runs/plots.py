@@ -36,20 +36,20 @@ Bar = tuple[str, float, Interval | None]  # a label, a value, and its interval i
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
-_STYLES = ("-", "--")
+_STYLES = {"Train": "-", "Eval": "--"}  # of lines, by family of tags
 _FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
 _MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
 
 
-def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "Eval")) -> "Figure":
+def draw_learning(groups: Sequence[Group]) -> "Figure":
     """Draw return and success of every task against environment steps, a line for each group of runs.
 
-    Each task has its own panels, because returns differ by orders of magnitude. Each family of tags has its line style;
-    evaluations during training are dashed. Raises BidexError if no episode has ended yet.
+    Each task has its own panels, because returns differ by orders of magnitude. Evaluations during training are dashed.
+    Raises BidexError if no episode has ended yet.
     """
-    starts = tuple(f"{family}/{measure}/" for measure, family in product(_MEASURES, families))
+    starts = tuple(f"{family}/{measure}/" for measure, family in product(_MEASURES, _STYLES))
     tags = [tag for tag in chain.from_iterable(curves for _, curves in groups) if tag.startswith(starts)]
     names = list(dict.fromkeys(tag.split("/", 2)[2] for tag in tags))
     if not names:
@@ -58,7 +58,7 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
     for name, panels in zip(names, axes[0], strict=True):
         for axis, measure in zip(panels, _MEASURES, strict=True):
             for number, (label, curves) in enumerate(groups):
-                for family, style in zip(families, _STYLES, strict=False):
+                for family, style in _STYLES.items():
                     _draw_curve(axis, curves.get(f"{family}/{measure}/{name}"), label, number, style)
             axis.grid(alpha=0.3)
         panels[0].set_title(_plain(name))
@@ -202,10 +202,10 @@ def svg(figure: "Figure") -> bytes:
     return out.getvalue()
 
 
-def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, style: str, one: float = 1e6) -> None:
+def _draw_curve(axis: "Axes", curve: Curve | None, label: str, number: int, style: str, unit: float = 1e6) -> None:
     if curve is None:
         return
-    steps = curve.steps / one
+    steps = curve.steps / unit
     colour = _colour(number)
     if len(steps) == 1 or (style != "-" and len(steps) <= _FEW):
         marker = "."

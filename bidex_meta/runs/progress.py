@@ -148,12 +148,12 @@ class Progress:
         return ["  ".join(speed), f"return {_number(mean_return)}", f"success {_percent(success)}", *plays]
 
 
-def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
+def counted(items: Iterable[Item], total: int, subject: str) -> Iterator[Item]:
     """Yield the items and show their count out of ``total`` on stderr: a bar in a terminal, plain lines elsewhere."""
-    console = PlainConsole(file=stream or sys.stderr)
+    console = PlainConsole(file=sys.stderr)
     if console.is_terminal:
         note("")  # the bar moves by itself
-        yield from track(items, description=what, total=total, console=console, transient=True)
+        yield from track(items, description=subject, total=total, console=console, transient=True)
         return
     reported = time.monotonic()
     for number, item in enumerate(items, start=1):
@@ -161,7 +161,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
         if time.monotonic() - reported >= _COUNTED_SECONDS:
             reported = time.monotonic()
             told()
-            console.print(f"{number} of {total} {what}", highlight=False, markup=False)
+            console.print(f"{number} of {total} {subject}", highlight=False, markup=False)
 
 
 def _lines(parts: Iterable[str], width: int) -> list[str]:

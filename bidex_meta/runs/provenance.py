@@ -42,11 +42,11 @@ class Difference(NamedTuple):
 def differences(then: Record, now: Record) -> list[Difference]:
     """Return the entries of both records whose values differ; packages missing in ``now`` do not count."""
     before = _values(then)
-    found = []
+    differing = []
     for name, value in _values(now).items():
         if name in before and before[name] != value:
-            found.append(Difference(name, before[name], value))
-    return found
+            differing.append(Difference(name, before[name], value))
+    return differing
 
 
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
@@ -59,11 +59,12 @@ def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
     for run, record in zip(runs, records, strict=True):
         for name, value in record.items():
             seen[_subject(run), name].add(value)
-    found = []
+    differing = []
     for run, record in zip(runs, records, strict=True):
         own = _subject(run)
-        found.append({name: record.get(name) for (of, name), values in seen.items() if of == own and len(values) > 1})
-    return found
+        names = [name for (subject, name), values in seen.items() if subject == own and len(values) > 1]
+        differing.append({name: record.get(name) for name in names})
+    return differing
 
 
 def check_alike(runs: Sequence[Run]) -> None:

@@ -60,9 +60,9 @@ class Recorder:
     def film(self, name: str, frames: Iterable[np.ndarray], fps: float, step: int) -> Path:
         """Write ``videos/<name>_<step>.mp4`` and log it; frames ``(height, width, 3)``, uint8, both even."""
         path = self._videos / f"{name}_{step}.mp4"
-        kept = list(frames)
-        write_video(path, kept, fps)
-        self._metrics.writer.film(f"Film/{name}", path, kept, fps, step)
+        pictures = list(frames)
+        write_video(path, pictures, fps)
+        self._metrics.writer.film(f"Film/{name}", path, pictures, fps, step)
         return path
 
     def __enter__(self) -> "Recorder":

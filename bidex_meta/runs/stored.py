@@ -51,8 +51,7 @@ class _Content(TypedDict):
 class StoredRun:
     """A run of a study's file, created by :func:`read_study`; methods as those of :class:`RunFolder`."""
 
-    path: Path
-    """``FILE:RUN``, which names it in messages and on the command line."""
+    path: Path  # ``FILE:RUN``, which names it in messages and on the command line.
     content: Json
 
     @property

@@ -8,15 +8,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
-FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}
-"""Suffixes of films, and their media types on web pages."""
+FILMS = {".mp4": "video/mp4", ".webp": "image/webp"}  # Suffixes of films, and their media types on web pages.
 SUFFIXES = (".png", *FILMS)
-LABEL = 20
-"""Height of a name under a tile, pixels."""
+LABEL = 20  # Height of a name under a tile, pixels.
 _BACK = (24, 26, 30)
 _INK = (215, 218, 224)
 _DONE = (110, 220, 130)
@@ -52,8 +51,6 @@ def check_films() -> None:
 
 def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
     """Encode frames ``(height, width, 3)``, uint8, in a Pillow format with its options; several form an animation."""
-    from PIL import Image
-
     out = io.BytesIO()
     pictures = (Image.fromarray(frame) for frame in frames)
     if kind == "PNG":
@@ -73,10 +70,10 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     write(path, frames, fps)
 
 
-def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 60) -> None:
-    """Write frames ``(height, width, 3)``, uint8, as a WebP that loops forever on web pages; ``quality`` 0 to 100."""
+def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write frames ``(height, width, 3)``, uint8, as a WebP that loops forever on web pages."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    film = encoded(frames, "WEBP", duration=round(1000 / fps), quality=quality, method=6)
+    film = encoded(frames, "WEBP", duration=round(1000 / fps), quality=60, method=6)
     write_atomic(path, lambda file: file.write(film))
 
 
@@ -147,8 +144,6 @@ def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[b
 
 
 def _label(name: str, width: int, done: bool) -> np.ndarray:
-    from PIL import Image, ImageDraw, ImageFont
-
     strip = Image.new("RGB", (width, LABEL), _BACK)
     pen = ImageDraw.Draw(strip)
     pen.text((width / 2, LABEL / 2), name, fill=_DONE if done else _INK, font=ImageFont.load_default(13), anchor="mm")

@@ -40,11 +40,6 @@ def at_least(value: Tensor, least: float, tolerance: float) -> Error:
     return Error((least + tolerance - value).clamp(min=0.0), tolerance)
 
 
-def at_most(value: Tensor, most: float, tolerance: float) -> Error:
-    """Return the error of a value that must stay below ``most``."""
-    return Error((value - most + tolerance).clamp(min=0.0), tolerance)
-
-
 def within(errors: list[Error]) -> Tensor:
     """Return whether every error is below its tolerance. Shape (n,), bool."""
     return torch.stack([error.value < error.tolerance for error in errors]).all(dim=0)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import mujoco
 import torch
@@ -243,9 +244,9 @@ class Switch(ReachTask):
     camera_target = (0.08, 0.0, 0.70)
     camera_distance = 1.1
     camera_angle = (20.0, -42.0)
-    variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
+    variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i, axis in product((1, 2), "xy")))
     wide_space = join(
-        *(component(f"switch{i}_{axis}", -3 * SHIFT, 3 * SHIFT) for i in (1, 2) for axis in "xy"),
+        *(component(f"switch{i}_{axis}", -3 * SHIFT, 3 * SHIFT) for i, axis in product((1, 2), "xy")),
         *(component(f"switch{i}_angle", 0.1, _TRAVEL) for i in (1, 2)),
     )
     wide_solved = "each rocker within 0.08 rad of its angle"

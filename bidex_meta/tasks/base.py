@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import ClassVar, Literal
 
@@ -15,7 +16,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import meets_box, noisy_joints
-from bidex_meta.suite import V1, Rules
+from bidex_meta.rules import V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
@@ -295,7 +296,7 @@ class TaskClass(ABC):
     def hidden_columns(self) -> list[int]:
         """Return the columns of a variation that hold hidden components."""
         names = self.variation_space.names
-        return [names.index(name) for part in self.hides() for name in part.names]
+        return [names.index(name) for name in chain.from_iterable(part.names for part in self.hides())]
 
     def guides(self, state: TaskState) -> list[Tensor]:
         """Return distances (m), each (n,), from hands to points; the reward of version 2 rewards small distances."""

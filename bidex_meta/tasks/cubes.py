@@ -1,6 +1,7 @@
 """Classes of two cubes: appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes."""
 
 import math
+from itertools import chain, product
 from typing import ClassVar
 
 import mujoco
@@ -107,7 +108,7 @@ class PushBlock(_TwoBlocks):
     variation_space = join(placed("block1"), placed("block2"))
     wide_space = join(
         *(placed(f"block{i}", 3 * SHIFT, 3 * TURN) for i in (1, 2)),
-        *(component(f"goal{i}_{axis}", -0.15, 0.15) for i in (1, 2) for axis in "xy"),
+        *(component(f"goal{i}_{axis}", -0.15, 0.15) for i, axis in product((1, 2), "xy")),
     )
     wide_solved = "both blocks within 5 cm of their goals"
     wide_blocks = goal_blocks("goal")
@@ -315,15 +316,16 @@ class ReOrientation(TaskClass):
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]
-        return [axis for goal in goals for axis in _axes(goal)]
+        return list(chain.from_iterable(map(_axes, goals)))
 
 
 def _axes(goal: Tensor) -> list[Ghost]:
     """Return three rods that start at a pose (n, 7) and follow its axes."""
-    return [
-        Ghost(posed(goal[:, :3] + rotate(goal[:, 3:], constant(middle, goal)), goal[:, 3:]), size, colour)
-        for middle, size, colour in _RODS
-    ]
+    rods = []
+    for middle, size, colour in _RODS:
+        centre = goal[:, :3] + rotate(goal[:, 3:], constant(middle, goal))
+        rods.append(Ghost(posed(centre, goal[:, 3:]), size, colour))
+    return rods
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:

@@ -235,10 +235,10 @@ class DoorCloseInward(_Close):
         """Return the panel of each leaf; an open leaf ends next to the fingertips of its hand."""
         door = qpos["object"]
         base = posed(door[:, :3], xyzw(door[:, 3:]))
-        return [
-            (side, _on_leaf(base, i, qpos[f"object/hinge{i + 1}"], _PANELS[i]), _PANEL_HALF)
-            for i, side in enumerate(SIDES)
-        ]
+        panels = []
+        for i, side in enumerate(SIDES):
+            panels.append((side, _on_leaf(base, i, qpos[f"object/hinge{i + 1}"], _PANELS[i]), _PANEL_HALF))
+        return panels
 
 
 class DoorOpenInward(_Open):

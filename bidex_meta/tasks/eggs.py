@@ -29,13 +29,18 @@ JOINT_DRAWS = 24
 
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
     """Return, for ``""``, or ``"1"`` and ``"2"``, the blocks of ``object`` or ``object1``, ... and its goal."""
-    return tuple(block for i in numbers for block in (*object_blocks(f"object{i}"), *goal_blocks(f"goal{i}")))
+    blocks: list[Block] = []
+    for i in numbers:
+        blocks += (*object_blocks(f"object{i}"), *goal_blocks(f"goal{i}"))
+    return tuple(blocks)
 
 
 def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]:
     """Return the goal blocks of ``goal_object_blocks``."""
-    goals = [observe_goal(state, f"object{i}/quaternion", f"goal{i}") for i in numbers]
-    return {name: value for goal in goals for name, value in goal.items()}
+    blocks: dict[str, Tensor] = {}
+    for i in numbers:
+        blocks |= observe_goal(state, f"object{i}/quaternion", f"goal{i}")
+    return blocks
 
 
 def goal_pose(position: Tensor, draws: Tensor) -> Tensor:

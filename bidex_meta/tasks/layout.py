@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import chain, product
 
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
@@ -77,14 +78,18 @@ class Layout:
 
     def goal_indices(self) -> list[int]:
         """Return the indices of all entries that show the goal."""
-        return [i for block, where in self if block.goal for i in range(where.start, where.stop)]
+        indices: list[int] = []
+        for block, where in self:
+            if block.goal:
+                indices += range(where.start, where.stop)
+        return indices
 
 
 def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
     """Return one hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
 
     def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
-        sensors = tuple(f"{side}/{part}_{kind}" for part in parts for kind in kinds.split())
+        sensors = tuple(f"{side}/{part}_{kind}" for part, kind in product(parts, kinds.split()))
         return Block(f"{side}_{name}", size, sensors, scale, description=description)
 
     joints = hand().joints
@@ -143,4 +148,4 @@ def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
 @cache
 def both_hands(moving: bool) -> tuple[Block, ...]:
     """Return Table 7: 398 entries with moving bases, 374 with fixed bases."""
-    return tuple(block for side in SIDES for block in hand_blocks(side, moving))
+    return tuple(chain.from_iterable(hand_blocks(side, moving) for side in SIDES))

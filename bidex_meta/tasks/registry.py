@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
-from bidex_meta.suite import V2, plain_name, versioned_name
+from bidex_meta.rules import V2, plain_name, versioned_name
 from bidex_meta.utils.arguments import check_attributes
 from bidex_meta.utils.plugins import is_outside, outside_class
 

@@ -127,7 +127,7 @@ class Learner(ABC):
 
     @abstractmethod
     def iterate(self) -> dict[str, float]:
-        """Collects experience and learns from it; returns metrics by tag (``docs/metrics.md``)."""
+        """Collect experience and learn from it; return metrics by tag (``docs/metrics.md``)."""
 
     @abstractmethod
     def state_dict(self) -> State:
@@ -139,13 +139,13 @@ class Learner(ABC):
 
     @abstractmethod
     def policy_state_dict(self) -> State:
-        """The policy, for :meth:`load_policy`."""
+        """Return the policy, for :meth:`load_policy`."""
 
     @classmethod
     @abstractmethod
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
-        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
+        """Return the agent of a checkpoint's entry ``learner.policy``, for a world of any number of environments."""
 
     def start_from(self, policy: State) -> None:
-        """Takes the policy of another run's checkpoint in the place of fresh weights."""
+        """Start from the policy of another run's checkpoint instead of fresh weights."""
         raise BidexError(f"{self.name}: cannot start from another run's policy.")

@@ -11,9 +11,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
 
-import gymnasium
+from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.recorder import Recorder
@@ -152,11 +151,11 @@ def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps
     return world_size() * (own + stored)
 
 
-def _numbers(space: gymnasium.Space[Any]) -> int:
+def _numbers(space: Box) -> int:
     return math.prod(space.shape or (0,))
 
 
-def _tensor_bytes(state: Any) -> int:
+def _tensor_bytes(state: object) -> int:
     if isinstance(state, dict):
         return sum(_tensor_bytes(part) for part in state.values())
     if isinstance(state, list | tuple):

@@ -14,7 +14,19 @@ import types
 from collections.abc import Callable, Collection, Iterable, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Protocol,
+    TypeGuard,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from msgspec import Meta
@@ -22,7 +34,7 @@ from msgspec import Meta
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.utils.validation import MOST
 
-Target = TypeVar("Target", bound=Callable[..., Any])
+Target = TypeVar("Target", bound=Callable[..., object])
 
 _MOST_ELEMENTS = 1000
 """Elements of a collection that are looked at: enough to see that it holds something else."""
@@ -55,18 +67,19 @@ def checked_arguments(target: Target) -> Target:
         return get_type_hints(target, include_extras=True)  # not at import: names may be defined further down
 
     @functools.wraps(target)
-    def checked(*arguments: Any, **keywords: Any) -> Any:
+    def checked(*arguments: object, **keywords: object) -> object:
         try:
             given = signature.bind(*arguments, **keywords).arguments
         except TypeError:  # Python's own words for missing and unknown arguments
             return target(*arguments, **keywords)
         for argument, value in given.items():
-            hint = hints().get(argument, Any)
+            hint = hints().get(argument, object)
             kind = signature.parameters[argument].kind
             if kind is inspect.Parameter.VAR_KEYWORD:
                 continue
-            for each in value if kind is inspect.Parameter.VAR_POSITIONAL else (value,):
-                check_argument(f"{name}: {argument}", each, hint)
+            values = value if kind is inspect.Parameter.VAR_POSITIONAL else (value,)
+            for given_value in values:
+                check_argument(f"{name}: {argument}", given_value, hint)
         return target(*arguments, **keywords)
 
     return checked  # type: ignore[return-value]
@@ -126,7 +139,7 @@ def _fits(value: object, hint: object) -> bool:
     return True
 
 
-def _fits_generic(value: object, origin: Any, parts: tuple[Any, ...]) -> bool:
+def _fits_generic(value: object, origin: type, parts: tuple[object, ...]) -> bool:
     if not isinstance(value, origin):
         return False
     if isinstance(value, str | bytes):
@@ -165,11 +178,11 @@ def _within(value: Any, bound: Meta) -> bool:
     )
 
 
-def _is_protocol(hint: object) -> bool:
+def _is_protocol(hint: object) -> TypeGuard[type]:
     return isinstance(hint, type) and getattr(hint, "_is_protocol", False)
 
 
-def _lacking(value: object, protocol: Any) -> list[str]:
+def _lacking(value: object, protocol: type) -> list[str]:
     """Return the attributes of a protocol that a value does not have."""
     return [name for name in _members(protocol) if not hasattr(value, name)]
 
@@ -184,7 +197,7 @@ def _members(protocol: type) -> list[str]:
     return list(names)
 
 
-def _expected(hint: Any) -> str:
+def _expected(hint: object) -> str:
     """Return an annotation in words."""
     origin = get_origin(hint)
     parts = get_args(hint)

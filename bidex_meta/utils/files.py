@@ -150,6 +150,11 @@ def bounded(content: Json) -> Json:
         for value in level:
             if isinstance(value, int) and abs(value) > _LARGEST:
                 raise ValueError(f"a number has more than {len(str(_LARGEST)) - 1} digits")
-        inner = [value for value in level if isinstance(value, dict | list)]
-        level = [each for value in inner for each in (value.values() if isinstance(value, dict) else value)]
+        inner: list[Json] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+        level = inner
     raise ValueError(f"it is nested more than {_DEEPEST} deep")

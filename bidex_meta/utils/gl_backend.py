@@ -55,7 +55,8 @@ def prepare() -> None:
             raise BidexError(f"Drawing by {_VARIABLE}={asked or 'default'} failed ({reason}). Unset it, or mend that.")
         return
     reasons = []
-    for backend in [*(["glfw"] if has_screen() else []), *_LIBRARIES]:
+    with_screen = ["glfw"] if has_screen() else []
+    for backend in [*with_screen, *_LIBRARIES]:
         reason = _reason(lambda backend=backend: _load(backend, gl_context))
         if reason is None:
             return

@@ -83,7 +83,8 @@ def _groups(controller: str) -> Iterator[Path]:
             continue
         place = Path(path.lstrip("/"))
         # Version 2 has one tree, which lies in a folder "unified" where the machine has version 1 too.
-        for tree in (controller, controllers) if controllers else (".", "unified"):
+        trees = (controller, controllers) if controllers else (".", "unified")
+        for tree in trees:
             yield from (root / tree / group for group in (place, *place.parents))
 
 

@@ -6,6 +6,7 @@ the field, what was expected and the value.
 
 import dataclasses
 import functools
+import itertools
 import math
 import operator
 import re
@@ -189,7 +190,10 @@ def _refuse_unknown(content: object, kind: object, where: str, place: str = "") 
 
 def _message(error: msgspec.ValidationError, content: object, kind: object, field: str = "") -> str:
     """Rewrite msgspec's complaint as ``place: expected ..., got ....``."""
-    complaint, _, path = str(error).rpartition(" - at `$") if " - at `$" in str(error) else (str(error), "", "")
+    complaint, found, path = str(error).rpartition(" - at `$")
+    if not found:
+        complaint = str(error)
+        path = ""
     path = path.rstrip("`")
     place = (field + path).removeprefix(".")
     if isinstance(error.__cause__, BidexError):  # of a dataclass that checks more than its annotations
@@ -223,7 +227,8 @@ def _choices(hint: object) -> list[object]:
     """Return all values that literals within an annotation allow."""
     if get_origin(hint) is Literal:
         return list(get_args(hint))
-    return [value for part in get_args(hint) if not isinstance(part, Meta) for value in _choices(part)]
+    parts = [part for part in get_args(hint) if not isinstance(part, Meta)]
+    return list(itertools.chain.from_iterable(map(_choices, parts)))
 
 
 # A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.

@@ -17,13 +17,12 @@ _SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 def visible(model: mujoco.MjModel) -> list[int]:
     """Return the geoms that a viewer shows, without planes."""
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if model.geom_group[geom] < _SHOWN_GROUPS
-        and model.geom_type[geom] != _TYPE.mjGEOM_PLANE
-        and colour(model, geom)[3] > 0.0
-    ]
+    geoms = []
+    for geom in range(model.ngeom):
+        in_shown_group = model.geom_group[geom] < _SHOWN_GROUPS
+        if in_shown_group and model.geom_type[geom] != _TYPE.mjGEOM_PLANE and colour(model, geom)[3] > 0.0:
+            geoms.append(geom)
+    return geoms
 
 
 def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
@@ -112,7 +111,10 @@ class Browser:
             self._tour.value = False
             self.show(stage)
         while self._asked:
-            stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
+            if self._asked.pop(0) == "Another episode":
+                stage.restart()
+            else:
+                stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
         scene = self._server.scene
@@ -159,12 +161,11 @@ class Browser:
     def _show_ghosts(self, stage: Stage) -> None:
         ghosts = stage.ghosts()
         if len(ghosts) != len(self._ghosts):
-            self._ghosts = [
-                self._server.scene.add_icosphere(
-                    f"/goals/{i}", radius=1.0, scale=ghost.size, color=ghost.colour, opacity=GHOST_ALPHA, subdivisions=3
-                )
-                for i, ghost in enumerate(ghosts)
-            ]
+            self._ghosts = []
+            for i, ghost in enumerate(ghosts):
+                look = {"scale": ghost.size, "color": ghost.colour, "opacity": GHOST_ALPHA}
+                handle = self._server.scene.add_icosphere(f"/goals/{i}", radius=1.0, subdivisions=3, **look)
+                self._ghosts.append(handle)
         for handle, ghost in zip(self._ghosts, ghosts, strict=True):
             handle.position = ghost.position
             handle.wxyz = ghost.quaternion

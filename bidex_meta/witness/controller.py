@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, quaternion_product, rotate, xyzw
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
@@ -23,7 +23,7 @@ _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2")
 _MIDDLES = ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
-_Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
+_Quaternion = tuple[float, float, float, float]  # (w, x, y, z)
 
 
 class Lead(NamedTuple):
@@ -72,7 +72,7 @@ class HandController:
         self.taken = 0
         self.wide = task.rules.wide  # whether a task asks for more than version 1's
         self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
-        self._first = {side: _numbers(xyzw(self.where(f"{side}/mount_quaternion"))) for side in SIDES}
+        self._first = {side: _numbers(self.where(f"{side}/mount_quaternion")) for side in SIDES}
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
 
     def orientation(self, sensor: str) -> Tensor:
@@ -94,21 +94,21 @@ class HandController:
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
-    def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
+    def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
         """Hold a hand's start orientation, turned about the world's axes, rad, from now on.
 
         A hand that no script holds may turn.
         """
-        w, x, y, z = quaternion_from_rpy((roll, pitch, yaw))
-        self._held[side] = _product((x, y, z, w), self._first[side])
+        self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
     def turn(self, side: str, way: Tensor) -> None:
         """Turn a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
         x, y, z = way.tolist()
         angle = math.sqrt(x * x + y * y + z * z)
         sine = math.sin(0.5 * angle) / (angle + 1e-9)
-        turn = sine * x, sine * y, sine * z, math.cos(0.5 * angle)
-        self._held[side] = _product(turn, _numbers(self.orientation(f"{side}/mount_quaternion")))
+        turn = math.cos(0.5 * angle), sine * x, sine * y, sine * z
+        now = self.where(f"{side}/mount_quaternion")
+        self._held[side] = quaternion_product(turn, _numbers(now / now.norm()))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
         """Move the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
@@ -134,12 +134,10 @@ class HandActions:
 
     def __call__(self, leads: Sequence[Lead], sensor: Callable[[str], Tensor]) -> Tensor:
         """Return actions (n, action_size) of n environments; ``sensor`` returns values (n, k), in double precision."""
-        at, now = (
-            torch.stack([sensor(f"{side}/{name}") for side in SIDES], 1)
-            for name in ("hand_point_position", "mount_quaternion")
-        )
+        at = torch.stack([sensor(f"{side}/hand_point_position") for side in SIDES], 1)
+        now = torch.stack([sensor(f"{side}/mount_quaternion") for side in SIDES], 1)
         goals = at.new_tensor([lead.points for lead in leads])
-        held = at.new_tensor([lead.held for lead in leads])
+        held = xyzw(at.new_tensor([lead.held for lead in leads]))
         speed = at.new_tensor([lead.speed for lead in leads])[:, None, None]
         way = GAIN * (goals - at)
         way *= (speed / (way.norm(dim=-1, keepdim=True) + 1e-9)).clamp_max(1.0)
@@ -160,20 +158,8 @@ class HandActions:
 
 
 def _numbers(quaternion: Tensor) -> _Quaternion:
-    x, y, z, w = quaternion.tolist()
-    return x, y, z, w
-
-
-def _product(a: _Quaternion, b: _Quaternion) -> _Quaternion:
-    """Multiply quaternions of plain numbers: ``multiply`` on tensors takes fifty times as long."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    w, x, y, z = quaternion.tolist()
+    return w, x, y, z
 
 
 @cache

@@ -17,31 +17,7 @@ from bidex_meta.world.part import Part, base_rotations
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
-class ActionSequences:
-    """Plays ``sequences`` (n, steps, action), number ``which`` in each environment, and repeats the last action."""
-
-    def __init__(self, sequences: Tensor, which: Tensor):
-        self._sequences = sequences
-        self._which = which
-        self._step = torch.zeros_like(which)
-
-    def eval_action(self, obs: Tensor) -> Tensor:
-        """Return the next actions (num_envs, action)."""
-        action = self._sequences[self._which, self._step.clamp_max(self._sequences.shape[1] - 1)]
-        self._step += 1
-        return action
-
-    def reset(self, env_mask: Tensor) -> None:
-        """Restart the sequences of the environments of a mask."""
-        self._step[env_mask] = 0
-
-    def _store(self, sequence: int, actions: Tensor) -> None:
-        """Write actions (T, a) into the first columns of a sequence, and repeat the last one to its end."""
-        into = self._sequences[sequence]
-        into[:, : actions.shape[1]] = actions[torch.arange(len(into)).clamp_max(len(actions) - 1)]
-
-
-class OpenLoopReplay(ActionSequences):
+class OpenLoopReplay:
     """Plays the witness of each environment's class, without observations; a class without one gets zero actions.
 
     ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, ``actions`` the size
@@ -52,21 +28,30 @@ class OpenLoopReplay(ActionSequences):
         self, witnesses: Mapping[str, Witness], task_names: Sequence[str], task_id: Tensor, actions: int,
         noise: float = 0.0, seed: int = 0
     ):  # fmt: skip
-        longest = max((len(each.actions) for each in witnesses.values()), default=1)
-        super().__init__(torch.zeros(len(task_names), longest, actions, device=task_id.device), task_id)
+        longest = max((len(witness.actions) for witness in witnesses.values()), default=1)
+        self._sequences = torch.zeros(len(task_names), longest, actions, device=task_id.device)
         for slot, name in enumerate(task_names):
             if name in witnesses:
-                self._store(slot, torch.from_numpy(witnesses[name].actions))
+                recorded = torch.from_numpy(witnesses[name].actions)
+                steps = torch.arange(longest).clamp_max(len(recorded) - 1)  # repeats the last action
+                self._sequences[slot, :, : recorded.shape[1]] = recorded[steps]
+        self._task_id = task_id
+        self._step = torch.zeros_like(task_id)
         self._noise = noise
         self._generator = torch.Generator(task_id.device).manual_seed(seed)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return the next actions (num_envs, action)."""
-        action = super().eval_action(obs)
+        action = self._sequences[self._task_id, self._step.clamp_max(self._sequences.shape[1] - 1)]
+        self._step += 1
         if self._noise:
             noise = torch.randn(action.shape, generator=self._generator, device=action.device)
             action = (action + self._noise * noise).clamp(-1.0, 1.0)
         return action
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Restart the sequences of the environments of a mask."""
+        self._step[env_mask] = 0
 
 
 class Scripted:
@@ -87,12 +72,11 @@ class Scripted:
         self._generator = torch.Generator().manual_seed(seed)
         if names is None:
             names = world.task_names
-        self._classes = [
-            _Class(world, part, k, member, int(misled))
-            for part in world.parts
-            for k, member in enumerate(part.group.members)
-            if world.slots[member.slot].name in names
-        ]
+        self._classes: list[_Class] = []
+        for part in world.parts:
+            for number, member in enumerate(part.group.members):
+                if world.slots[member.slot].name in names:
+                    self._classes.append(_Class(world, part, number, member, int(misled)))
         self._actions = torch.zeros(world.num_envs, world.action_size)
 
     def eval_action(self, obs: Tensor) -> Tensor:

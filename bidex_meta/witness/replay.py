@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
-from bidex_meta.suite import plain_name
+from bidex_meta.rules import plain_name
 from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig

@@ -5,7 +5,7 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -13,13 +13,12 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.tasks import registry
 from bidex_meta.utils import paths
-from bidex_meta.utils.files import bounded, read_bytes
+from bidex_meta.utils.files import JsonObject, bounded, read_bytes
 from bidex_meta.utils.validation import Finite, Whole, parse
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Json = dict[str, Any]
 LEVELS = 127  # actions are whole multiples of 1/127, so that a byte holds one exactly
 _MOST_BYTES = 50_000_000
 _MOST_STEPS = 100_000
@@ -31,7 +30,9 @@ class Witness:
     """Recorded actions that solve a task, and their record."""
 
     actions: np.ndarray  # actions (T, action_size), float32, multiples of 1/127
-    made: Json  # return, first successful step, best unsuccessful episode's return (``rival``), settings, versions
+    made: (
+        JsonObject  # return, first successful step, best unsuccessful episode's return (``rival``), settings, versions
+    )
 
 
 def quantised(actions: "Tensor") -> "Tensor":
@@ -64,7 +65,7 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     return witness
 
 
-def save_witness(path: Path, actions: np.ndarray, made: Json) -> Path:
+def save_witness(path: Path, actions: np.ndarray, made: JsonObject) -> Path:
     """Write a witness; actions (T, action_size) must be multiples of 1/127."""
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)

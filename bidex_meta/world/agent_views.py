@@ -6,6 +6,7 @@ hand it has a unit of, and all that is of no hand: object, goal, task id. All sh
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.hands.hand import SIDES, hand
@@ -27,7 +28,11 @@ class AgentView:
     @property
     def columns(self) -> tuple[int, ...]:
         """The entries of the world's observation that it sees, ascending."""
-        return tuple(sorted(i for group in self.groups for part in group.where for i in range(part.start, part.stop)))
+        columns: list[int] = []
+        for group in self.groups:
+            for part in group.where:
+                columns += range(part.start, part.stop)
+        return tuple(sorted(columns))
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
         """Return the groups as they stand in its own observation, which is :attr:`columns` side by side."""
@@ -48,7 +53,8 @@ def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Ag
     for name, own in _units_of_agents(units, partition_line(agents)).items():
         others = {f"{side}_hand" for side in SIDES} - {f"{unit.partition('/')[0]}_hand" for unit in own}
         visible = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
-        views.append(AgentView(name, visible, tuple(sorted(action for unit in own for action in units[unit]))))
+        actions = tuple(sorted(chain.from_iterable(units[unit] for unit in own)))
+        views.append(AgentView(name, visible, actions))
     return tuple(views)
 
 
@@ -63,7 +69,8 @@ def _joined(parts: Iterable[slice]) -> tuple[slice, ...]:
 
 
 def _has_hands(groups: Sequence[ObservationGroup]) -> bool:
-    return any(group.name == f"{side}_hand" for group in groups for side in SIDES)
+    names = {group.name for group in groups}
+    return any(f"{side}_hand" in names for side in SIDES)
 
 
 def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, list[int]]:

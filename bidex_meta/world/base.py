@@ -4,8 +4,8 @@
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Self, cast
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 import torch
@@ -56,8 +56,8 @@ class Transition(NamedTuple):
 class BatchedWorld(VectorEnv, ABC):
     """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
 
-    Worlds pickle and copy: a copy is built anew and continues bit for bit. Of attributes set from outside only
-    ``stagger`` is copied.
+    Worlds pickle and copy: a copy is built again and continues bit for bit. Of the attributes that were set from
+    outside, only ``stagger`` is copied.
     """
 
     single_observation_space: Box
@@ -70,14 +70,14 @@ class BatchedWorld(VectorEnv, ABC):
     _masked = False
     """True if the host may read no number within a step, because it would wait for the accelerator."""
     _stepper: Stepper = EagerStepper()
-    _arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    _arguments: tuple[tuple[object, ...], dict[str, object]]
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:  # noqa: D102
+    def __new__(cls, *args: object, **kwargs: object) -> Self:  # noqa: D102
         world = super().__new__(cls)
         world._arguments = args, kwargs
         return world
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return _recreate, (type(self), *self._arguments, self.state_dict(), self._ready, self.stagger)
 
     def __init__(
@@ -118,11 +118,10 @@ class BatchedWorld(VectorEnv, ABC):
         return torch.tensor(values, device=self.device)[self.task_id]
 
     def _set_spaces(self, single_observation: Box, action_size: int) -> None:
-        spaces = make_spaces(single_observation, action_size, self.num_envs)
-        self.single_observation_space = spaces.single_observation
-        self.single_action_space = spaces.single_action
-        self.observation_space = spaces.observation
-        self.action_space = spaces.action
+        self.single_observation_space = single_observation
+        self.single_action_space = Box(-1.0, 1.0, (action_size,), np.float32)
+        self.observation_space = cast(Box, batch_space(single_observation, self.num_envs))
+        self.action_space = cast(Box, batch_space(self.single_action_space, self.num_envs))
         self.observation_size = int(np.prod(single_observation.shape))
         self.action_size = action_size
         self._obs = torch.zeros(self.num_envs, self.observation_size, device=self.device)
@@ -298,7 +297,7 @@ class BatchedWorld(VectorEnv, ABC):
         return NumpyWorld(self, stagger)
 
     @checked_arguments
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[object, ...]:
         """Return an attribute for each environment: its own entry if there is one for each, else the world's value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
@@ -307,34 +306,17 @@ class BatchedWorld(VectorEnv, ABC):
         return (value,) * self.num_envs
 
     @checked_arguments
-    def set_attr(self, name: Text, values: Any) -> None:
+    def set_attr(self, name: Text, values: object) -> None:
         """Set an attribute of the world."""
         setattr(self, name, values)
 
     @checked_arguments
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
         """Call a method of the world (or read an attribute) and return the result for each environment."""
         value = getattr(self, name)
         if callable(value):
             return (value(*args, **kwargs),) * self.num_envs
         return self.get_attr(name)
-
-
-class Spaces(NamedTuple):
-    """The four spaces of a Gymnasium vector environment."""
-
-    single_observation: Box
-    single_action: Box
-    observation: Box
-    action: Box
-
-
-def make_spaces(single_observation: Box, action_size: int, num_envs: int) -> Spaces:
-    """Return the spaces of environments with these observations and ``action_size`` actions within [-1, 1]."""
-    single_action = Box(-1.0, 1.0, (action_size,), np.float32)
-    observation = cast(Box, batch_space(single_observation, num_envs))
-    action = cast(Box, batch_space(single_action, num_envs))
-    return Spaces(single_observation, single_action, observation, action)
 
 
 def split_envs(num_envs: int, slots: int) -> list[slice]:
@@ -345,7 +327,12 @@ def split_envs(num_envs: int, slots: int) -> list[slice]:
 
 
 def _recreate(
-    kind: type[BatchedWorld], args: tuple[Any, ...], kwargs: dict[str, Any], state: State, ready: bool, stagger: bool
+    kind: Callable[..., BatchedWorld],
+    args: tuple[object, ...],
+    kwargs: dict[str, object],
+    state: State,
+    ready: bool,
+    stagger: bool,
 ) -> BatchedWorld:
     world = kind(*args, **kwargs)
     world.load_state_dict(state)

@@ -14,6 +14,7 @@ from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
+from bidex_meta.world.contract import State
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
@@ -70,7 +71,7 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.dev
     return tensor
 
 
-def one_row(action: Any) -> Any:
+def one_row(action: np.ndarray) -> np.ndarray | Tensor:
     """Return the action (a,) of a single environment as a batch (1, a); anything but an array of numbers unchanged."""
     given = dense(action, torch.device("cpu"))
     return action if given is None else given[None]
@@ -83,7 +84,7 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
     return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
 
 
-def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
+def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
     """Return the slots with the pools of a saved state, checked against the world's own state and slots.
 
     ``task_id`` (n,): slot of each environment.
@@ -106,7 +107,7 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
     return filled
 
 
-def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
+def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
     """Raise BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
 
     The entry ``made`` of a world's state must be equal. ``inside``: where in a larger state both stand.
@@ -132,7 +133,7 @@ def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
         seed(given["seed"])
 
 
-def _check_made(given: Any, own: Mapping[str, str]) -> None:
+def _check_made(given: object, own: Mapping[str, str]) -> None:
     """Raise BidexError, naming the differences, where a state's world was made otherwise."""
     there = given if isinstance(given, Mapping) else {}
     told: dict[str, str] = {}
@@ -190,7 +191,8 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
     _check_shape(f"{name}.success", task.success(state), kind=torch.bool)
     _check_shape(f"{name}.failed", task.failed(state), kind=torch.bool)
     sizes = {block.name: block.size for block, _ in task.layout}
-    for key, value in task.observe(state).items() if observed else ():
+    blocks = task.observe(state) if observed else {}
+    for key, value in blocks.items():
         if key not in sizes:
             raise BidexError(f"{name}.observe: expected blocks of the layout ({', '.join(sizes)}), got {key!r}.")
         _check_shape(f"{name}.observe: {key!r}", value, sizes[key])
@@ -248,5 +250,6 @@ def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtyp
 
 
 def _shown(shape: tuple[int | None, ...]) -> str:
-    words = ["n" if size == _ROWS else "k" if size is None else str(size) for size in shape]
+    letters = {_ROWS: "n", None: "k"}
+    words = [letters.get(size, str(size)) for size in shape]
     return f"({', '.join(words)}{',' * (len(words) == 1)})"

@@ -58,18 +58,13 @@ _CHUNK = 32
 """Environments that a CPU computes at once: their numbers fit its cache."""
 
 
-@dataclass(frozen=True)
-class Sharpness:
-    """Tolerances of the visibility test in a depth buffer of ``pixels`` squared.
-
-    A visible point may lie ``depth`` (m) behind the nearest one around its pixel, on slanted surfaces further by
-    a share ``slope`` of the change of depth across a pixel, at most ``most`` (m).
-    """
-
-    pixels: int = 128
-    depth: float = 0.004
-    slope: float = 1.5
-    most: float = 0.05
+_PIXELS = 128
+"""Edge of the square depth buffer in which visibility is tested."""
+_DEPTH = 0.004
+_SLOPE = 1.5
+_MOST_SLOPE = 0.05
+"""A visible point may lie ``_DEPTH`` (m) behind the nearest one around its pixel, on slanted surfaces further by a
+share ``_SLOPE`` of the change of depth across a pixel, at most ``_MOST_SLOPE`` (m)."""
 
 
 class Cloud:
@@ -88,14 +83,12 @@ class Cloud:
         count: int,
         kinds: bool = False,
         device: str | torch.device = "cpu",
-        sharpness: Sharpness | None = None,
     ) -> None:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
 
         self.shape = (count, 4 if kinds else 3)
         self.camera = camera
-        self.sharpness = sharpness or Sharpness()
         self._bodies = torch.as_tensor(surfaces.bodies, device=device).long()
         points = surfaces.points.T
         normals = surfaces.normals.T
@@ -139,10 +132,6 @@ class Cloud:
         # where, not a product: where physics broke, candidates are NaN.
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
-    def seen(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Return which candidates are visible, (n, P), bool; arguments as of a call."""
-        return self._seen(*self._in_camera(position, rotation))
-
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return right, down and forward of the candidates from the camera, and distances to their tangent planes.
 
@@ -162,26 +151,25 @@ class Cloud:
         return places[:, 0], places[:, 1], places[:, 2], facing
 
     def _seen(self, x: Tensor, y: Tensor, depth: Tensor, facing: Tensor) -> Tensor:
-        s = self.sharpness
         camera = self.camera
-        focal = camera.focal * s.pixels
+        focal = camera.focal * _PIXELS
         scale = focal / depth
-        column = x * scale + 0.5 * s.pixels
-        row = y * scale + 0.5 * s.pixels
+        column = x * scale + 0.5 * _PIXELS
+        row = y * scale + 0.5 * _PIXELS
         # False for NaN, where physics broke.
-        inside = (column >= 0) & (column < s.pixels) & (row >= 0) & (row < s.pixels)
+        inside = (column >= 0) & (column < _PIXELS) & (row >= 0) & (row < _PIXELS)
         candidate = inside & (depth > camera.near) & (depth < camera.far) & (facing > 0)
-        pixel = torch.where(candidate, row.floor() * s.pixels + column.floor(), 0.0).long()
+        pixel = torch.where(candidate, row.floor() * _PIXELS + column.floor(), 0.0).long()
         # A neighbour on the same slanted surface must hide nothing: each draws what its surface reaches a pixel further
         # away. Depth changes by tan(angle) / focal of itself from pixel to pixel; cos(angle) = facing / distance.
         cosine = (facing / torch.sqrt(x * x + y * y + depth * depth)).clamp_min(1e-3)
         slant = torch.sqrt((1.0 - cosine * cosine).clamp_min(0.0)) / cosine
-        reach = (s.slope * slant * depth / focal).clamp_max(s.most)
+        reach = (_SLOPE * slant * depth / focal).clamp_max(_MOST_SLOPE)
         drawn = torch.where(candidate, depth + reach, torch.inf)
-        buffer = torch.full((len(depth), s.pixels**2), torch.inf, device=depth.device)
+        buffer = torch.full((len(depth), _PIXELS**2), torch.inf, device=depth.device)
         buffer.scatter_reduce_(1, pixel, drawn, "amin")
-        nearest = _spread(buffer.view(-1, s.pixels, s.pixels)).flatten(1).gather(1, pixel)
-        return candidate & (depth <= nearest + s.depth)
+        nearest = _spread(buffer.view(-1, _PIXELS, _PIXELS)).flatten(1).gather(1, pixel)
+        return candidate & (depth <= nearest + _DEPTH)
 
 
 def _spread(buffer: Tensor) -> Tensor:

@@ -74,12 +74,10 @@ def privileged_columns(scene: Scene) -> list[int]:
     """
     task = scene.task
     layout = scene.task.layout
-    found = {
-        i
-        for block, where in layout
-        if any(not sensor.startswith(_OF_HANDS) for sensor in block.sensors)
-        for i in range(where.start, where.stop)
-    }
+    found = set[int]()
+    for block, where in layout:
+        if any(not sensor.startswith(_OF_HANDS) for sensor in block.sensors):
+            found.update(range(where.start, where.stop))
     for name, values in task.observe(_without_objects(scene)).items():
         start = layout.range(name).start
         found |= {start + int(i) for i in values[0].isnan().nonzero()}

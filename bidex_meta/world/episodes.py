@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import HELD_STEPS
+from bidex_meta.rules import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import true_or_false, whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
@@ -93,7 +93,7 @@ class Episodes:
             setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))
 
 
-def ended_info(info: Info) -> dict[str, Any]:
+def ended_info(info: Info) -> Info:
     """Return Gymnasium's keys for what ended in a step, from the contract's keys; zero outside each mask.
 
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last

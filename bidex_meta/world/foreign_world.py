@@ -53,10 +53,10 @@ class ForeignWorld(BatchedWorld):
         super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger, seed)
         self.num_id_columns = count if count > 1 else 0
         self.observation_groups = plain_groups(sizes.state + self.num_id_columns, self.num_id_columns)
-        low, high = (
-            np.concatenate([np.full(sizes.state, far), np.full(self.num_id_columns, one_hot)]).astype(np.float32)
-            for far, one_hot in ((-np.inf, 0.0), (np.inf, 1.0))
-        )
+        low = np.full(sizes.state + self.num_id_columns, -np.inf, np.float32)
+        high = np.full_like(low, np.inf)
+        low[sizes.state :] = 0.0
+        high[sizes.state :] = 1.0
         self._set_spaces(Box(low, high, dtype=np.float32), sizes.action)
         if self.num_id_columns:
             self._obs[:, sizes.state :] = torch.eye(count)[self.task_id]

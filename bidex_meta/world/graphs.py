@@ -5,17 +5,14 @@ reads and leaves behind lives in tensors at fixed addresses; so does its result,
 """
 
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Protocol
+from typing import Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-Work = Callable[..., Any]
-"""Tensors in, any nest of tensors out; on the way it may read and rebind the state."""
-
-Record = Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]
-"""Takes work without inputs; gives how to do it again in the same memory, and the tensors that it then leaves there."""
+Result = TypeVar("Result")
+"""Any nest of tensors, which a stretch of work makes of tensors. On the way it may read and rebind the state."""
 
 Together = Callable[[Sequence[Callable[[], None]]], None]
 """Does jobs that need nothing of each other, as ``SideBySide.run``."""
@@ -25,7 +22,15 @@ _BEFORE = 3
 stepped a few times only, or whose tasks change as often, never pays for a recording."""
 
 
-def cuda_graph(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+class Record(Protocol):
+    """Records work as ``cuda_graph`` does."""
+
+    def __call__(self, work: Callable[[], Result], /) -> tuple[Callable[[], None], Result]:
+        """Return a function that repeats the work in the same memory, and the tensors that it then leaves there."""
+        ...
+
+
+def cuda_graph(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
     """Record work as one CUDA graph."""
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -53,9 +58,9 @@ class GraphCache:
         """Drop all recordings; stretches run plainly again for a while."""
         self._state: dict[str, Tensor] = {}
         self._runs: dict[Hashable, int] = {}
-        self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], Any]] = {}
+        self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], object]] = {}
 
-    def run(self, key: Hashable, work: Work, *inputs: Tensor) -> Any:
+    def run(self, key: Hashable, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """Run or replay the work and return what it returns; the next replay of this stretch overwrites it.
 
         A key must always come with the same work and inputs of the same shapes.
@@ -67,7 +72,7 @@ class GraphCache:
         if key not in self._recorded:
             own = [value.clone() for value in inputs]
 
-            def settled() -> Any:
+            def settled() -> Result:
                 result = work(*own)
                 self._settle()
                 return result
@@ -77,7 +82,7 @@ class GraphCache:
         for fixed, value in zip(own, inputs, strict=True):
             fixed.copy_(value)
         replay()
-        return result
+        return cast(Result, result)
 
     def _settle(self) -> None:
         """Bring the state into its fixed place."""
@@ -90,8 +95,8 @@ class GraphCache:
         self._put(self._state)
 
 
-def fresh(result: Any) -> Any:
-    """Return a nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
+def fresh(result: Result) -> Result:
+    """Copy a nest of tensors into new memory; a tensor that occurs twice is copied once."""
     tensors = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
     copies = {key: torch.empty_like(value) for key, value in tensors.items()}
     for kind in {value.dtype for value in tensors.values()}:  # one call per dtype launches few kernels
@@ -103,14 +108,14 @@ def fresh(result: Any) -> Any:
 class Stepper(Protocol):
     """Runs the stretches of a world's step that read no number on the host."""
 
-    def run(self, work: Work, *inputs: Tensor) -> Any:
+    def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """Run a method of the world on tensors whose shapes never change, and return what it returns.
 
         The next run of the same method may overwrite what it returned.
         """
         ...
 
-    def keep(self, result: Any) -> Any:
+    def keep(self, result: Result) -> Result:
         """Return what a run returned such that no later run overwrites it."""
         ...
 
@@ -122,11 +127,11 @@ class Stepper(Protocol):
 class EagerStepper:
     """Runs each stretch as it is."""
 
-    def run(self, work: Work, *inputs: Tensor) -> Any:
+    def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """See ``Stepper``."""
         return work(*inputs)
 
-    def keep(self, result: Any) -> Any:
+    def keep(self, result: Result) -> Result:
         """See ``Stepper``."""
         return result
 
@@ -146,11 +151,11 @@ class CapturedStepper:
         """Take the same arguments as ``GraphCache``."""
         self._graphs = GraphCache(get, put, record)
 
-    def run(self, work: Work, *inputs: Tensor) -> Any:
+    def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """See ``Stepper``."""
         return self._graphs.run(work, work, *inputs)
 
-    def keep(self, result: Any) -> Any:
+    def keep(self, result: Result) -> Result:
         """See ``Stepper``."""
         return fresh(result)
 

@@ -131,10 +131,15 @@ def build_groups(slots: list[Slot], env_ids: list[slice], make_engine: EngineMak
 
 def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
     """Return the depth sensor of each slot, in the slots' order; clouds begin at entry ``first`` of observations."""
-    scenes = {m.slot: (m.scene, group.engine.device) for group in groups for m in group.members}
-    unique = {id(scene): (scene, device) for scene, device in scenes.values()}
-    sensors = {key: DepthSensor(scene, rule, first, device) for key, (scene, device) in unique.items()}
-    return [sensors[id(scenes[slot][0])] for slot in sorted(scenes)]
+    by_scene: dict[int, DepthSensor] = {}
+    by_slot: dict[int, DepthSensor] = {}
+    for group in groups:
+        for member in group.members:
+            key = id(member.scene)
+            if key not in by_scene:
+                by_scene[key] = DepthSensor(member.scene, rule, first, group.engine.device)
+            by_slot[member.slot] = by_scene[key]
+    return [by_slot[slot] for slot in sorted(by_slot)]
 
 
 def _alike(a: Scene, b: Scene) -> bool:

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES, hand
-from bidex_meta.tasks.layout import Layout, hand_blocks
+from bidex_meta.tasks.layout import Layout, both_hands
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.utils.maths import conjugate, xyzw
 from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
 """The observation of a suite: everything; everything and the task's id; everything but the goal."""
-_HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_blocks(side, moving=True)}
+_HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both_hands(moving=True)}
 """By name and not by prefix: ``right_handle_position`` is of an object."""
 
 
@@ -45,9 +45,8 @@ class Observer:
         self._columns = slice(0, sensors), slice(sensors, actions), slice(actions, actions + turns)
         self._source = torch.zeros(width, dtype=torch.int64, device=device)
         self._scale, self._offset = torch.zeros(2, width, device=device).unbind()
-        span, middle = (
-            torch.as_tensor(x).float().to(device) for x in (hand().high - hand().low, hand().high + hand().low)
-        )
+        span = torch.as_tensor(hand().high - hand().low).float().to(device)
+        middle = torch.as_tensor(hand().high + hand().low).float().to(device)
         for block, where in self.layout:
             if block.sensors:
                 self._source[where] = torch.cat([_indices(scene, name) for name in block.sensors]).to(device)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple, Protocol
 
 import torch
@@ -105,8 +106,12 @@ class Part:
         return mounts
 
     def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
-        self._tasks = [torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata) for m in self.group.members]
-        self._pools = [m.scene.task.frozen(tasks) for m, tasks in zip(self.group.members, self._tasks, strict=True)]
+        self._tasks = list[Tensor]()
+        self._pools = list[dict[str, Tensor]]()
+        for member in self.group.members:
+            tasks = torch.as_tensor(slots[member.slot].tasks).to(self._engine.sensordata)
+            self._tasks.append(tasks)
+            self._pools.append(member.scene.task.frozen(tasks))
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
         """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
@@ -342,7 +347,7 @@ def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: in
 
     rotations = base_rotations(parts)
     together([partial(look, part, rotation) for part, rotation in zip(parts, rotations, strict=True)])
-    names = list(dict.fromkeys(name for _, own in found for name in own))
+    names = list(dict.fromkeys(chain.from_iterable(own for _, own in found)))
     terms = dict(zip(names, torch.zeros(len(names), n, device=device), strict=True))
     for env_ids, own in found:
         for name, value in own.items():

@@ -1,6 +1,6 @@
 """Domain randomisation of a world: draws, and their way into models, actions and observations.
 
-A draw depends on seed, slot, environment, episode and, of noise and pushes, on the elapsed steps alone.
+A draw depends only on seed, slot, environment and episode; noise and pushes also depend on the elapsed steps.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.suite import FACTORS, Randomisation
+from bidex_meta.rules import FACTORS, Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP, Layout
 from bidex_meta.world.model_factors import exponents, heights, object_bodies
@@ -134,10 +134,9 @@ class _Models:
         self._rules = [{name: rule[name] for name in self._fields} for rule in rules]
         self._bases = [{n: f[m.engine_rows.start].clone() for n, f in self._fields.items()} for m in members]
         self._first = [int(object_bodies(member.scene.model).argmax()) for member in members]
-        self._masses = [
-            torch.as_tensor(m.scene.model.body_mass[first:], device=engine.device)
-            for m, first in zip(members, self._first, strict=True)
-        ]
+        self._masses = []
+        for member, first in zip(members, self._first, strict=True):
+            self._masses.append(torch.as_tensor(member.scene.model.body_mass[first:], device=engine.device))
         self._heights = [heights(member.scene) for member in members]
 
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:

@@ -1,7 +1,7 @@
 """Pictures of an environment: its scene from a fixed camera, with its goal as a ghost if observations show it."""
 
 import threading
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -43,13 +43,13 @@ class DrawnGhost(NamedTuple):
 class Painter(threading.local):
     """Draws environments of a world; renderers are cached. A copy starts without renderers: they cannot be copied.
 
-    A renderer draws in the thread that made it alone. Each thread therefore has its own cache, which ends with it.
+    A renderer draws only in the thread that made it. Each thread therefore has its own cache, which ends with it.
     """
 
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int, int], tuple[mujoco.Renderer, mujoco.MjData]] = {}
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type["Painter"], tuple[()]]:
         return Painter, ()
 
     def picture(self, world: "PartedWorld", env_id: int, width: int, height: int, camera: str | None) -> np.ndarray:

@@ -4,9 +4,10 @@ For code that is written so; all environments of a suite at once are `Benchmark.
 """
 
 import copyreg
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import gymnasium
 import numpy as np
@@ -14,7 +15,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, Rules, versioned_name
+from bidex_meta.rules import V1, Rules, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.utils.arguments import checked_arguments
@@ -50,20 +51,20 @@ class EnvRecipe:
 
     name: str
     moving_base: bool | None
-    """Whether the hands' bases are driven; None: as the class has it alone."""
+    """True if the hands' bases move, False if they are fixed; None: as the class has it on its own."""
     options: tuple[tuple[str, float | str], ...]
     padded_size: int
     """Entries of an observation, without a point cloud."""
     hides_goal: bool
     reward_scale: float
     class_name: str | None = None
-    """The task class, where it is called otherwise: with an object."""
+    """The task class, if its name differs from ``name``, as with an object."""
     rules: Rules = V1
-    """Those of the suite."""
+    """The suite's rules."""
     points: tuple[int, bool] = (0, False)
-    """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
+    """Points of the cloud in place of objects' states (0: the states), and whether each point has its kind."""
     listed: bool = False
-    """Whether the suite's file lists the tasks, which may then lie outside of the class's variation space."""
+    """True if the suite's file lists the tasks, which may then lie outside of the class's variation space."""
 
     @property
     def env_name(self) -> str:
@@ -79,8 +80,11 @@ class _Remade(type):
     """Of classes that no module holds: they are pickled as their recipes."""
 
 
-def _reduced(made: Any) -> str | tuple[Any, ...]:
-    return (_make_class, (made.recipe,)) if "recipe" in vars(made) else made.__qualname__  # one of a module's own
+def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
+    recipe = vars(made).get("recipe")
+    if recipe is None:
+        return made.__qualname__  # one of a module's own
+    return _make_class, (recipe,)
 
 
 copyreg.pickle(_Remade, _reduced)
@@ -129,6 +133,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         recipe = self.recipe
         space = self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
+        points = PointsRule(*recipe.points) if recipe.points[0] else None
         config = WorldConfig(
             num_envs=1,
             engine="c",
@@ -136,7 +141,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             autoreset_mode="DISABLED",
             observation="masked" if recipe.hides_goal else "plain",
             pad_to=recipe.padded_size,
-            points=PointsRule(*recipe.points) if recipe.points[0] else None,
+            points=points,
         )
         self._world = World([slot], config)
         self.observation_space = self._world.single_observation_space
@@ -249,10 +254,13 @@ def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
 
 def _camera(name: str | None, number: int | None) -> str:
     names = list(CAMERAS)
-    chosen = (names[0] if name is None else name) if number is None else next(iter(names[number : number + 1]), None)
-    if chosen not in names:
-        raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
-    return chosen
+    if number is None and name is None:
+        return names[0]
+    if number is None and name in names:
+        return name
+    if number is not None and number < len(names):
+        return names[number]
+    raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
 
 
 def _array(batch: torch.Tensor) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Starts of episodes, drawn ahead for many environments at once.
 
-A start depends on the environment's key and the number of its episode alone. A vectorised draw for a thousand
+A start depends only on the environment's key and the number of its episode. A vectorised draw for a thousand
 environments takes hardly longer than a draw for ten. If starts were drawn one by one as episodes end, they would take a
 tenth of a step's time.
 """

@@ -190,7 +190,7 @@ _OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """Kinds of points: what stands still in an episode; either hand; what physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
-"""Shares of the candidates: by area alone a table would leave an egg a handful."""
+"""Shares of the candidates: by area only, a table would leave an egg a handful of points."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers draw geoms of groups 0 to 2."""
 _PROBES = 512
@@ -216,14 +216,13 @@ class Surfaces:
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
     """Return the geoms with a surface that are in a shown group and not transparent."""
-    materials = model.geom_matid
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if int(model.geom_type[geom]) in DRAWN
-        and model.geom_group[geom] < _SHOWN_GROUPS
-        and (model.mat_rgba[materials[geom], 3] if materials[geom] >= 0 else model.geom_rgba[geom, 3]) > 0.0
-    ]
+    geoms = []
+    for geom in range(model.ngeom):
+        material = model.geom_matid[geom]
+        opacity = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
+        if int(model.geom_type[geom]) in DRAWN and model.geom_group[geom] < _SHOWN_GROUPS and opacity > 0.0:
+            geoms.append(geom)
+    return geoms
 
 
 def body_kinds(model: mujoco.MjModel) -> list[float]:
@@ -251,7 +250,9 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
     open_area = np.array([area(model, g) * len(seen[g][0]) / _PROBES for g in geoms])
     # Only geoms of the world itself have the fixtures' share: a door's frame has its points from the objects'.
     owners = model.geom_bodyid[geoms]
-    kinds = np.array([FIXTURE if body == 0 else HAND if of_body[body] == HAND else OBJECT for body in owners])
+    kinds = np.full(len(owners), OBJECT)
+    kinds[np.array(of_body)[owners] == HAND] = HAND
+    kinds[owners == 0] = FIXTURE
     found = []
     for geom, number in zip(geoms, _portions(open_area, kinds, count), strict=True):
         tries = int(np.ceil(1.3 * number * _PROBES / max(len(seen[geom][0]), 1))) + 8

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Randomisation
+from bidex_meta.rules import Randomisation
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument
@@ -137,18 +137,13 @@ class World(BatchedWorld):
         groups = build_groups(self.slots, self.slot_env_ids, make_engine)
         self._masked = groups[0].engine.masked
         self._describe_observations(groups)
-        self.parts = [
-            Part(group, self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
-            for group in groups
-        ]
-        if config.randomisation is None:
-            self._randomiser = None
-        else:
+        own = (self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
+        self.parts = [Part(group, *own) for group in groups]
+        self._randomiser = None
+        remembered = 0
+        if config.randomisation is not None:
             self._randomiser = self._randomised(config.randomisation)
-        if self._randomiser:
             remembered = self._randomiser.remembered
-        else:
-            remembered = 0
         self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
         self._side_by_side = SideBySide(len(groups), self.device)
         if self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -186,17 +181,12 @@ class World(BatchedWorld):
             self.num_id_columns = 0
         self._one_hot = torch.eye(self.num_tasks, device=self.device)[self.task_id]
         layouts = [slot.task_class.layout for slot in self.slots]
-        if points is None:
-            self._sights = None
-        else:
+        self._sights = None
+        hidden = None
+        cloud = None
+        if points is not None:
             self._sights = sights(groups, points, width)
-        if self._sights is None:
-            hidden = None
-        else:
             hidden = [sight.hidden for sight in self._sights]
-        if points is None:
-            cloud = None
-        else:
             cloud = (points.group, points.entries)
         self.observation_groups = observation_groups(layouts, width, self.num_id_columns, hidden, cloud)
         size = sum(group.size for group in self.observation_groups)

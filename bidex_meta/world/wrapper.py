@@ -1,7 +1,7 @@
-"""Worlds around a world: what recorders, statistics and the like are made from, and the form that Gymnasium expects.
+"""Wrappers of a world, the base of recorders and statistics, and the NumPy form that Gymnasium expects.
 
-Take the class of what is wrapped, so that evaluation and learners still see what it can do, and override what shall be
-done besides::
+Extend the wrapper of the wrapped world's class, so that evaluation and learners still see its abilities, and override
+the methods that shall do more::
 
     class Count(WorldWrapper):
         steps = 0
@@ -14,7 +14,6 @@ done besides::
 from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
@@ -122,23 +121,23 @@ class NumpyWorld(VectorEnv):
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Start episodes; see ``VectorWorld.reset``."""
         obs, info = self.world.reset(seed=seed, options=options)
-        return _arrays(obs), {name: _arrays(value) for name, value in info.items()}
+        return _array(obs), {name: _arrays(value) for name, value in info.items()}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(self, actions: Tensor | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Take actions (num_envs, a).
 
         Returns observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
         """
         *flags, step_info = self.world.step(checked.action(actions, self.world.action_space.shape, self.world.device))
-        info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}
-        ended = _arrays(step_info["_final_obs"])
+        info: Info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}
+        ended = _array(step_info["_final_obs"])
         if ended.any():
             step_info = ended_info(step_info) | step_info  # a world's own has the time on the clock
             info |= {"final_obs": np.full(self.num_envs, None, dtype=object), "_final_obs": ended}
-            for env_id, obs in zip(np.flatnonzero(ended), _arrays(step_info["final_obs"])[ended], strict=True):
+            for env_id, obs in zip(np.flatnonzero(ended), _array(step_info["final_obs"])[ended], strict=True):
                 info["final_obs"][env_id] = obs
             info |= {name: _arrays(step_info[name]) for name in ("final_info", "_final_info")}
-        obs, reward, terminated, truncated = map(_arrays, flags)
+        obs, reward, terminated, truncated = map(_array, flags)
         return obs, reward, terminated & ended, truncated & ended, info
 
     def render(self) -> tuple[np.ndarray, ...]:
@@ -146,15 +145,19 @@ class NumpyWorld(VectorEnv):
         world: Any = self.world
         return tuple(world.render(env_id=env_id) for env_id in range(self.num_envs))
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Free the world."""
         self.world.close()
 
 
-def _arrays(value: Any) -> Any:
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.cpu().numpy()
+
+
+def _arrays(value: object) -> object:
     """Return tensors, and those in a dict, as arrays."""
     if isinstance(value, dict):
-        return {name: _arrays(each) for name, each in value.items()}
-    if isinstance(value, torch.Tensor):
-        return value.cpu().numpy()
+        return {name: _arrays(part) for name, part in value.items()}
+    if isinstance(value, Tensor):
+        return _array(value)
     return value

@@ -3,31 +3,22 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import (
-    METAWORLD_SUITES,
-    OTHER_SEED,
-    SPLITS,
-    Rules,
-    Suite,
-    load_randomisation,
-    load_suite,
-    plain_name,
-    suite_names,
-)
+from bidex_meta.rules import Rules, plain_name
+from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.utils.files import Json
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 
-Json = Mapping[str, Any]
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
@@ -51,7 +42,7 @@ class WorldsConfig:
     randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
-    def of(config: "Json | WorldsConfig") -> "WorldsConfig":
+    def of(config: "Mapping[str, Json] | WorldsConfig") -> "WorldsConfig":
         """Return the entries of a run's config that concern worlds; the others are left out."""
         if isinstance(config, WorldsConfig):
             return config
@@ -66,15 +57,15 @@ Identity = dict[str, str | int | None]
 class Worlds(ABC):
     """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
-    hides_goals: bool = False  # whether it is a meta suite that does not show its goals
+    hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
-    class_name: str | None = None  # the class, where it is a single one
+    class_name: str | None = None  # the class, if there is a single one
     object: str | None = None
-    moving_base: bool | None = None  # whether the bases of a single class move; None: as it has them
-    on_gpu: ClassVar[bool] = True  # whether a GPU is of use to its worlds
+    moving_base: bool | None = None  # whether a single class has moving bases; None: the class's own bases
+    on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
-    """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
-    default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
+    """A preset that precedes the others for these worlds, if the learner has it; and the reason in words."""
+    default_episodes: ClassVar[int] = 4  # default number of episodes per task in an evaluation
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
         self.name = name
@@ -93,7 +84,7 @@ class Worlds(ABC):
             self.randomisation = load_randomisation(config.randomisation)
 
     @staticmethod
-    def open(config: Json | WorldsConfig) -> "Worlds":
+    def open(config: Mapping[str, Json] | WorldsConfig) -> "Worlds":
         """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
 
         Raises BidexError for unknown or faulty ones.

@@ -25,7 +25,7 @@ _HUMANOIDS = 50
 
 
 class Foreign(Worlds):
-    """Classes of another library: the split train alone, without references or pictures."""
+    """Classes of another library: only the split train, without references or pictures."""
 
     on_gpu = False
     bytes_per_environment: int

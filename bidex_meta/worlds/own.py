@@ -5,7 +5,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, V2, Rules, Split, Suite, load_suite, plain_name
+from bidex_meta.rules import V1, V2, Rules, plain_name
+from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig, physics_of
@@ -55,7 +56,10 @@ class OwnSuite(Worlds):
         pools = {c.name: [task.name for task in c.tasks if task.of(split)] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
-        return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
+        listed: dict[str, list[str]] = {}
+        for name, pool in pools.items():
+            listed |= {f"{name}/{task}": [task] for task in pool}
+        return listed
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """See ``Worlds``."""

@@ -9,16 +9,15 @@ from bidex_meta.experiments.learners import ALGOS, learner_kind
 
 WRONG: dict[str, dict[str, Any]] = {
     "mtppo": {
-        "epochs": 0, "gamma": 1.5, "std_range": (1.0, 0.5), "clip": -0.2, "max_grad_norm": -1.0, "cagrad_radius": 1.0,
-        "demonstration_weight": -0.1, "demonstration_half_life": 0.0, "demonstration_batch": 0, "modules": 0,
-        "demonstration_cloning": -1, "critic_first": -1, "points_read": -1, "task_embedding": -1,
-        "point_widths": (8, 0), "teacher_updates": -1, "teacher_success": 0.0, "teacher_learning_rate": 0.0,
-        "teacher_batch": 0, "teacher_samples": 0,
+        "epochs": 0, "gamma": 1.5, "std_range": (1.0, 0.5), "clip": -0.2, "demonstration_batch": 0,
+        "demonstration_cloning": -1, "critic_first": -1, "point_widths": (8, 0), "teacher_updates": -1,
+        "learning_rate_range": (1.0, 0.5),
     },
     "mttrpo": {"max_kl": 0.0, "backtrack_factor": 1.5, "fisher_stride": 0, "cg_iterations": 0, "damping": -1.0},
     "mtsac": {
         "updates_per_step": 0, "batch_per_task": 0, "warmup_steps": -1, "gamma": 1.0, "tau": 0.0, "cut_share": 2.0,
-        "replay_memory": 0.0, "init_alpha": 0.0, "std_range": (1.0, 0.5), "init_std": 3.0, "point_widths": (),
+        "replay_memory": 0.0, "task_embedding": -1, "init_alpha": 0.0,
+        "std_range": (1.0, 0.5), "init_std": 3.0, "point_widths": (),
     },
     "ddpg": {"tau": 0.0, "exploration_std": (0.5, 0.1), "squash_price": -1.0},
     "td3": {"target_std": -0.1, "target_bound": float("nan"), "policy_delay": 0, "exploration_std": (-0.1, 0.1)},
@@ -39,16 +38,16 @@ WRONG: dict[str, dict[str, Any]] = {
     "icl": {"reward_unit": 0.0, "candidates": 0, "batch_size": 0, "trials": 0, "head": (0,)},
 }  # fmt: skip
 TOGETHER: list[tuple[str, dict[str, Any], str]] = [
-    ("mtppo", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
+    ("mtsac", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
     ("mtppo", {"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
-    ("mtppo", {"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
-    ("mtppo", {"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
+    ("mtppo", {"architecture": "moore", "hidden": (32, 3)}, "the last width of hidden must be at least 4"),
+    ("mtppo", {"architecture": "moore", "hidden": ()}, "the last width of hidden must be at least 4"),
     ("dagger", {"architecture": "transformer", "hidden": (32, 16)}, "one width for all of hidden"),
-    ("mtppo", {"architecture": "transformer", "hidden": (33, 33)}, "a multiple of modules"),
+    ("mtppo", {"architecture": "transformer", "hidden": (33, 33)}, "a multiple of its 4 attention heads"),
     ("mtppo", {"architecture": "transformer", "hidden": ()}, "one width for all of hidden"),
     ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
-    ("mappo", {"popart": True, "value_heads": False}, "leave per_task_values and value_heads on"),
+    ("mappo", {"popart": True, "value_heads": False}, "leave value_heads on"),
     ("varibad", {"chunk": 25}, "whole trials"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
 ]

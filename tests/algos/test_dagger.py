@@ -14,7 +14,6 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import Sources
 from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.problems import Track
-from tests.algos.ranks import resumed
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = DAggerConfig(
@@ -181,10 +180,6 @@ def test_with_teachers_that_follow_a_resumed_run_begins_new_episodes_in_all_rows
     assert torch.equal(again.world.episodes.number, learner.world.episodes.number + 1)
     assert again.lessons.data is not None and again.lessons.data.added == 8
     again.iterate()
-
-
-def test_with_policies_it_goes_on_bit_for_bit() -> None:
-    resumed(lambda seed: taught(two_tasks(), SMALL, Constant(0.3, 0.3), Constant(0.1, 0.2)), iterations=3)
 
 
 def test_without_teachers_or_with_others_it_is_refused() -> None:

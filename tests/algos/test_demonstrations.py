@@ -7,16 +7,23 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig, imitation
+from bidex_algos.onpolicy import demonstrations
+from bidex_algos.onpolicy.demonstrations import Demonstrations, imitation
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import Sources
 from tests.algos.ranks import resumed
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
 
-SMALL = MTPPOConfig(
-    hidden=(16,), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off", demonstration_half_life=400.0
-)
+SMALL = MTPPOConfig(hidden=(16,), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")
+
+
+@pytest.fixture(autouse=True)
+def fast_fading(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "HALF_LIFE", 400.0)
+
+
 NOTHING = [lambda action: torch.zeros(len(action)), lambda action: torch.zeros(len(action))]
 
 
@@ -59,8 +66,8 @@ def test_the_term_is_the_log_density_and_leaves_deviations_alone() -> None:
 
 
 def test_the_weight_falls_to_half_in_each_half_life() -> None:
-    demonstrations = Demonstrations(shown(), SMALL, 0, torch.device("cpu"))
-    assert [demonstrations.weight(steps) for steps in (0, 400, 1200)] == pytest.approx([0.1, 0.05, 0.0125])
+    some = Demonstrations(shown(), 256, 0, torch.device("cpu"))
+    assert [some.weight(steps) for steps in (0, 400, 1200)] == pytest.approx([0.1, 0.05, 0.0125])
     learner, told = trained(SMALL, shown(), iterations=3)
     before = learner.env_steps - learner.env_steps // 3  # the last update came before these steps were counted
     assert told["Policy/demonstration_weight"] == pytest.approx(0.1 * 0.5 ** (before / 400))
@@ -68,12 +75,13 @@ def test_the_weight_falls_to_half_in_each_half_life() -> None:
 
 
 @pytest.mark.parametrize("surgery", ["none", "pcgrad"])
-def test_weight_0_is_mt_ppo_bit_for_bit(surgery: str) -> None:
-    config = replace(SMALL, demonstration_weight=0.0, gradient_surgery=surgery)
+def test_weight_0_is_mt_ppo_bit_for_bit(surgery: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "WEIGHT", 0.0)
+    config = replace(SMALL, gradient_surgery=surgery)
     plain, told = trained(config, None)
     with_data, more = trained(config, shown())
     assert same(plain, with_data)
-    assert more["Policy/demonstration_weight"] == 0.0 and "Loss/demonstrations" not in more
+    assert more["Policy/demonstration_weight"] == 0.0
     assert "Policy/demonstration_weight" not in told
 
 
@@ -81,14 +89,16 @@ def test_each_task_that_has_some_is_drawn_equally_often() -> None:
     both = shown(seed_rows=2)
     one = torch.nonzero(both.task == 1).flatten()
     few = replace(both, task=torch.where(torch.isin(torch.arange(len(both)), one[1:]), 0, both.task))  # one of task 1
-    drawn = Demonstrations(few, replace(SMALL, demonstration_batch=4000), 0, torch.device("cpu")).draw()[1]
+    drawn = Demonstrations(few, 4000, 0, torch.device("cpu")).draw()[1]
     assert float((drawn == both.actions[one[0]]).all(1).float().mean()) == pytest.approx(0.5, abs=0.03)
-    alone = Demonstrations(shown(only=1), SMALL, 0, torch.device("cpu"))
+    alone = Demonstrations(shown(only=1), 256, 0, torch.device("cpu"))
     assert torch.equal(alone.draw()[0][:, 1:], torch.tensor([0.0, 1.0]).expand(256, 2))
 
 
-def test_where_nothing_is_rewarded_the_policy_does_what_it_was_shown() -> None:
-    config = replace(SMALL, demonstration_weight=1.0, demonstration_half_life=1e9, learning_rate_range=(1e-3, 3e-3))
+def test_where_nothing_is_rewarded_the_policy_does_what_it_was_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "WEIGHT", 1.0)
+    monkeypatch.setattr(demonstrations, "HALF_LIFE", 1e9)
+    config = replace(SMALL, learning_rate_range=(1e-3, 3e-3))
     obs = torch.tensor([[0.3, 1.0, 0.0], [-0.2, 0.0, 1.0]])
     shown_to, _ = trained(config, shown(0.4), 40, NOTHING)
     assert float((shown_to.eval_action(obs) - 0.4).abs().max()) < 0.1
@@ -96,7 +106,7 @@ def test_where_nothing_is_rewarded_the_policy_does_what_it_was_shown() -> None:
 
 def test_a_cloned_policy_does_what_it_was_shown_before_it_learns_anything() -> None:
     still = {"learning_rate": 1e-9, "learning_rate_range": (1e-9, 2e-9)}
-    config = replace(SMALL, demonstration_cloning=300, demonstration_weight=0.0, **still)
+    config = replace(SMALL, demonstration_cloning=300, **still)
     obs = torch.tensor([[0.3, 1.0, 0.0], [-0.2, 0.0, 1.0]])
     cloned, _ = trained(config, shown(0.4), 1)
     assert float((cloned.eval_action(obs) - 0.4).abs().max()) < 0.05

@@ -52,7 +52,7 @@ def test_a_world_without_discounts_leaves_the_number_as_it_is():
 def test_advantages_and_targets_are_those_by_hand(kind: str, terminal: bool):
     make, config = KINDS[kind]
     world = paying(unstable=((3, 2), (5, 11)), terminal=terminal)
-    learner = make(world, replace(config, per_task_advantages=True), seed=0)
+    learner = make(world, config, seed=0)
     learner.iterate()
     r = learner.rollout
     with torch.no_grad():

@@ -41,7 +41,7 @@ from tests.algos.test_runner import Notes
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
-ONE_BATCH = replace(CONFIG, num_minibatches=1, entropy_weight=0.01)
+ONE_BATCH = replace(CONFIG, num_minibatches=1)
 SURGERY = replace(ONE_BATCH, gradient_surgery="pcgrad", policy_heads=True)
 CONFLICT_AVERSE, LOSS_WEIGHTS = (replace(SURGERY, gradient_surgery=way) for way in ("cagrad", "famo"))
 TRUST_REGION = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, num_minibatches=1, fisher_stride=1)

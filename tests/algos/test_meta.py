@@ -149,10 +149,9 @@ def returns(learner: Any) -> list[float]:
     return [before, played(policy.eval_action, world, seed=9)]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @both
-def test_one_inner_step_closes_the_gap_to_a_policy_that_sees_the_goal(kind: Any, config: Any, seed: int):
-    learner = kind(PointGoals(rows=80, seed=seed), config, seed=seed)
+def test_one_inner_step_closes_the_gap_to_a_policy_that_sees_the_goal(kind: Any, config: Any):
+    learner = kind(PointGoals(rows=80), config, seed=0)
     for _ in range(25 if kind is ProMP else 12):
         learner.iterate()
     before, after = returns(learner)

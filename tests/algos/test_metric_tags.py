@@ -22,7 +22,7 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mtppo": [
-        {}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1},
+        {}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_batch": 32},
         {"teacher_updates": 2},
     ],
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
@@ -48,7 +48,7 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         else:
             world = ToyWorld(bandits, rows=8)
         sources: dict[str, Any] = {}
-        if known.get("demonstration_weight") or Capability.OFFLINE in kind.make.capabilities:
+        if known.get("demonstration_batch") or Capability.OFFLINE in kind.make.capabilities:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
             sources["data" if Capability.OFFLINE in kind.make.capabilities else "demonstrations"] = data
         if Capability.TAUGHT in kind.make.capabilities or known.get("teacher_updates"):

@@ -48,10 +48,10 @@ def assert_alike(one: Any, other: Any, iterations: int = 3) -> None:
     assert (weights_of(one) - start).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("more", [{}, {"policy_heads": True, "entropy_weight": 0.01}])
+@pytest.mark.parametrize("more", [{}, {"policy_heads": True}])
 def test_mappo_of_one_agent_is_mt_ppo(more: dict[str, Any]) -> None:
     plain = MTPPO(opposite_bandits(), MTPPOConfig(**SMALL, **more), seed=1)
-    config = MAPPOConfig(**SMALL, **more, agents="single", value_loss_weight=plain.config.value_loss_weight)
+    config = MAPPOConfig(**SMALL, **more, agents="single", value_loss_weight=2.0)
     assert_alike(plain, MAPPO(opposite_bandits(), config, seed=1))
 
 

@@ -1,5 +1,6 @@
 """Worlds of points in the place of hands, and the commands in one line each."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.experiments import learners
+from bidex_meta.utils import waiting
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 from tests.points import PointWorld, ring
@@ -42,6 +44,9 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Command:
     return call
 
 
+SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
+
+
 def toy(source, split="train", rows=None, mode="DISABLED"):
     return ToyWorld(rows or 6, mode, source.seed)
 
@@ -49,6 +54,29 @@ def toy(source, split="train", rows=None, mode="DISABLED"):
 @pytest.fixture
 def toy_worlds(monkeypatch):
     monkeypatch.setattr(OwnSuite, "world", toy)
+
+
+@pytest.fixture(scope="session")
+def trained_once(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("toy") / "r"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OwnSuite, "world", toy)
+        assert main(["run", *SMALL, "--steps", "96", "--run-dir", str(path), "--episodes", "4"]) == 0
+    return path
+
+
+@pytest.fixture
+def run(trained_once, toy_worlds, tmp_path) -> Path:
+    """An evaluated run of 96 steps on the small worlds."""
+    return shutil.copytree(trained_once, tmp_path / "r")
+
+
+@pytest.fixture
+def noted(monkeypatch) -> list[str]:
+    """What a command says it is at, in order."""
+    told: list[str] = []
+    monkeypatch.setattr(waiting._Watch, "what", property(lambda self: "x", lambda self, what: told.append(what)), False)
+    return told
 
 
 def points(source, split="train", rows=None, mode="DISABLED"):

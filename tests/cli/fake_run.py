@@ -11,9 +11,11 @@ import sys
 import time
 from pathlib import Path
 
+import bidex_meta.runs.folder
 from bidex_meta.config import config_of
 from bidex_meta.runs import RunFolder
 
+bidex_meta.runs.folder.collect_versions = dict  # type: ignore[assignment]  (it takes seconds to import torch)
 STEPS = 6
 asked: list[int] = []
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from bidex_algos.nets.shape import Shape
-from bidex_meta.cli import export
-from bidex_meta.cli.export import exported
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import exporting as export
+from bidex_meta.experiments.exporting import exported
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.world.contract import ObservationGroup
 from tests.fakes import trained_run
@@ -34,22 +34,25 @@ def policy(algo: str, **options: object) -> torch.nn.Module:
     return made
 
 
-@pytest.mark.parametrize(
-    ("algo", "options"),
-    [
-        ("mtppo", {"architecture": "towers"}),
-        ("mtppo", {"architecture": "moore", "modules": 2}),
-        ("mtppo", {"architecture": "soft_modules", "modules": 2}),
-        ("mtppo", {"architecture": "transformer", "modules": 2, "hidden": (8,)}),
-        ("mtsac", {}),
-        ("dagger", {"normalise_per_task": True}),
-        ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
-    ],
-    ids=str,
-)
-def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: dict[str, object]) -> None:
+POLICIES: list[tuple[str, dict[str, object]]] = [
+    ("mtppo", {"architecture": "towers"}), ("mtppo", {"architecture": "moore", "modules": 2}),
+    ("mtppo", {"architecture": "soft_modules", "modules": 2}),
+    ("mtppo", {"architecture": "transformer", "modules": 2, "hidden": (8,)}), ("mtsac", {}),
+    ("dagger", {"normalise_per_task": True}), ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("onnx")
+
+
+@pytest.mark.parametrize("number", range(len(POLICIES)))
+def test_a_file_does_what_torch_does_for_any_number_of_rows(number: int, folder: Path) -> None:
+    algo, options = POLICIES[number]
     made = policy(algo, **{"hidden": (8, 8), **options})
     content, gap, _ = exported(made, SHAPE.state_dict(), {"suite": "mine"})
+    (folder / f"{number}.onnx").write_bytes(content)
     assert gap < 1e-5
     assert str(ROOT).encode() not in content and b".py" not in content
     obs = torch.randn(5, 16)
@@ -58,12 +61,17 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(algo: str, options: 
     wanted = made.eval_action(obs)  # type: ignore[operator]
     assert wanted.std() > 0.05
     torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
+
+
+def test_no_rows_end_no_process(folder: Path) -> None:
+    """Of any file that the test above has written."""
+    files = sorted(map(str, folder.iterdir()))
     code = (
-        "import sys, numpy, onnxruntime; session = onnxruntime.InferenceSession(sys.stdin.buffer.read()); "
-        "print(session.run(None, {'observations': numpy.zeros((0, 16), numpy.float32)})[0].shape)"
+        "import sys, numpy, onnxruntime; sessions = map(onnxruntime.InferenceSession, sys.argv[1:]); "
+        "print([s.run(None, {'observations': numpy.zeros((0, 16), numpy.float32)})[0].shape for s in sessions])"
     )
-    done = subprocess.run([sys.executable, "-c", code], input=content, capture_output=True, check=False)
-    assert (done.returncode, done.stdout) == (0, b"(0, 4)\n"), "no rows end no process"
+    done = subprocess.run([sys.executable, "-c", code, *files], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"{[(0, 4)] * len(files)}\n")
 
 
 def test_the_difference_to_a_policy_in_bfloat16_is_told(shown, tmp_path: Path, monkeypatch) -> None:

@@ -12,11 +12,17 @@ import pytest
 import bidex_meta
 from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
+from bidex_meta.data import open_dataset
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments.evaluating import evaluate, meta_test
+from bidex_meta.experiments import sweeping
+from bidex_meta.experiments.evaluating import FinalEvaluation, evaluate, meta_test
 from bidex_meta.experiments.plotting import plot
+from bidex_meta.experiments.recording import RecordConfig, record
 from bidex_meta.experiments.run_config import resolve
+from bidex_meta.experiments.sweep_plan import SweepPlan
+from bidex_meta.experiments.sweeping import sweep
 from bidex_meta.experiments.training import Event, Stopped, train
+from bidex_meta.experiments.transferring import transfer
 from bidex_meta.experiments.verifying import verify
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.evaluations import parse_evaluation
@@ -107,6 +113,48 @@ def test_a_meta_test_is_that_of_the_command(adapted: Path) -> None:
     found = json.loads(json.dumps(meta_test(adapted, device="cpu").to_json()))
     recorded = RunFolder.open(adapted).evaluation()
     assert parse_evaluation(found, "found") == recorded
+
+
+def test_a_sweep_of_configs_is_trained_once_and_resumed(toy_worlds: None, tmp_path: Path, monkeypatch) -> None:
+    def work(runs, cores) -> int:
+        return sum(main(run.begin) != 0 for run in runs)
+
+    monkeypatch.setattr(sweeping, "work", work)  # in this process, on toy worlds
+    final = FinalEvaluation(episodes=1)
+    plan = SweepPlan.of(tmp_path / "gammas", {f"g{gamma}": gamma_config(gamma) for gamma in (0.9, 0.95)})
+    plan = replace(plan, runs=[replace(run, final=final) for run in plan.runs])
+    result = sweep(plan)
+    assert [state.state for state in result.states] == ["done", "done"] and not result.failures
+    assert RunFolder.open(tmp_path / "gammas" / "g0.95").config().learner_values["gamma"] == 0.95
+    monkeypatch.setattr(sweeping, "work", lambda runs, cores: pytest.fail("trained twice") if runs else 0)
+    assert sweep(plan).states == result.states
+    with pytest.raises(BidexError, match=r"g0\.9 is a run of another config: learner\.gamma is 0\.9 there"):
+        sweep(SweepPlan.of(tmp_path / "gammas", {"g0.9": gamma_config(0.8)}))
+    with pytest.raises(BidexError, match="Expected the name of a folder"):
+        SweepPlan.of(tmp_path, {"../up": CONFIG})
+
+
+def gamma_config(gamma: float) -> RunConfig:
+    return replace(CONFIG, learner={**CONFIG.learner, "gamma": gamma})
+
+
+def test_a_data_set_is_that_of_the_command(tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs the extra data")
+    small = {"size": 20, "num_envs": 2, "device": "cpu", "threads": 1}
+    found = record(RecordConfig("random", task="HandOver", out=tmp_path / "python-v0", **small))
+    words = "random --task HandOver --size 20 --num-envs 2 --device cpu --threads 1 --out"
+    assert main(["record", *words.split(), str(tmp_path / "command-v0")]) == 0
+    other = open_dataset(tmp_path / "command-v0")
+    assert found.num_steps == other.num_steps >= 20
+    with pytest.raises(BidexError, match="record random takes no run folders, got 1"):
+        record(RecordConfig("random", runs=(tmp_path,)))
+
+
+def test_a_transfer_needs_held_out_classes_and_ppo(toy_worlds: None, tmp_path: Path) -> None:
+    run = train(CONFIG, run_dir=tmp_path / "r")
+    with pytest.raises(BidexError, match="Expected a run on a suite with classes that are not trained on"):
+        transfer(run, tmp_path / "t")
+    assert not (tmp_path / "t").exists()
 
 
 def test_a_signal_saves_and_raises(toy_worlds: None, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import report as page
+from bidex_meta.experiments import report_page as page
 from bidex_meta.runs import RunFolder
 from tests.fakes import evaluated_run, log
 

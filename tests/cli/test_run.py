@@ -9,11 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.runs import RunFolder, read_metrics
-from bidex_meta.utils import waiting
 from bidex_meta.worlds import Worlds
 from tests.algos.ranks import same
 from tests.pages import ROOT
@@ -50,7 +48,8 @@ def test_waiting_threads_spin_shortly_unless_the_user_says_otherwise(given: dict
     code = (
         "import os, subprocess, sys, bidex_meta\n"
         f"print({{name: os.environ[name] for name in {SPINS} if name in os.environ}}, flush=True)\n"
-        "subprocess.run([sys.executable, '-c', 'import torch'])"  # a worker inherits them
+        + "subprocess.run([sys.executable, '-c', 'import torch'])"
+        * (not given)  # a worker inherits them
     )
     free = {name: value for name, value in os.environ.items() if name not in SPINS}
     done = subprocess.run(
@@ -59,8 +58,7 @@ def test_waiting_threads_spin_shortly_unless_the_user_says_otherwise(given: dict
     )  # fmt: skip
     assert done.returncode == 0 and done.stdout.strip().splitlines()[0] == str(after)
     shown = re.findall(r"GOMP_SPINCOUNT = '(\d+)'", done.stderr)
-    if shown:  # a torch with GNU's OpenMP: what it took
-        assert set(shown) == {after["GOMP_SPINCOUNT"]} if "GOMP_SPINCOUNT" in after else int(shown[-1]) > 10**9
+    assert set(shown) <= {"1000"}  # what a torch with GNU's OpenMP took
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -115,6 +113,28 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("bench speed", "Unknown bench"),
         ("render --task HandOver --out a.gif", ".png"),
         ("render --task HandOver --out a.mp4 --width 101", "even"),
+        ("render --task gymnasium/Humanoid-v5 --out a.png", "got gymnasium/Humanoid-v5. Name another."),
+        ("render --task gymnasium/Humanoid-v5 --tiled --out a.png", "got gymnasium/Humanoid-v5. Name another."),
+        ("render --suite metaworld/MT10 --out a.png", "got metaworld/MT10. Name another."),
+        ("render --suite metaworld/MT10 --tiled --out a.png", "got metaworld/MT10. Name another."),
+        ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "classes of our own"),
+        ("baseline random --suite metaworld/MT3", "classes of our own"),
+        ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
+        ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
+        ("bench world --steps 0", "--steps of 1 or more"),
+        ("bench world --repeats 0", "--repeats: expected a whole number >= 1"),
+        ("bench world --suite MT5", "MT4"),
+        ("bench world --device tpu", "device: expected auto"),
+        ("bench world --engine d", "Unknown engine"),
+        ("bench world --against HEAD", "Unknown flag --against"),
+        ("witness", "--task"),
+        ("witness --task HandOver --all", "--task"),
+        ("witness --task HandOve", "Did you mean 'HandOver'?"),
+        ("witness --all --out film.mp4", "--out"),
+        ("witness --task HandOver --file a.npz", "a.npz"),
+        ("witness --find", "Unknown flag --find"),
+        ("run --task HandOver --points -1", "--points: "),
+        ("run --suite MT4 --points 99999", "16384"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, expected, capsys, tmp_path, monkeypatch):
@@ -125,6 +145,34 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, expected, capsys, tmp_
     assert captured.err.startswith("bidex-meta: ")
     assert captured.err.count("\n") == 1
     assert captured.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+HUMANOID = "run --task gymnasium/Humanoid-v5 --num-envs 4 --device cpu --algo ppo"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
+        ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
+        ("run --suite metaworld/MT10 --points 16", "scenes of our own"),
+        ("run --suite ML1 --algo maml --points 16 --threads 1", "does not read point clouds"),
+        *(
+            (
+                f"{HUMANOID} {flag} {value}",
+                f"{flag} is of the classes with hands, got {value} with gymnasium/Humanoid-v5",
+            )
+            for flag, value in (("--points", 8), ("--object", "mug"), ("--base", "moving"))
+        ),
+        (f"{HUMANOID} --engine warp", "CPU"),
+    ],
+)
+def test_what_worlds_refuse_is_one_line_after_what_the_run_is(arguments, expected, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith("bidex-meta: ")] == lines[-1:] and expected in lines[-1]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -142,12 +190,6 @@ def test_print_config_is_json_of_everything_and_writes_nothing(shown, tmp_path, 
     assert (config["suite"], config["task"], config["algo"], config["preset"]) == ("MT4", None, "mtppo", "laptop")
     assert (config["steps"], config["threads"], config["learner"]["gamma"]) == (20_000_000, 1, 0.91)
     assert config["learner"]["hidden"] == [8] and list(tmp_path.iterdir()) == []
-
-
-def test_preset_sets_what_no_flag_sets(shown):
-    flags = [*SMALL[:2], "--device", "cpu", "--preset", "paper", "--learner.epochs", "3", "--print-config"]
-    learner = json.loads(shown("run", *flags))["learner"]
-    assert (learner["hidden"], learner["gamma"], learner["epochs"]) == ([2048, 1024, 512], 0.96, 3)
 
 
 TABLE = {"rl2": "RL2", "varibad": "VariBAD", "pearl": "PEARL", "promp": "ProMP", "maml": "MAML"}
@@ -230,19 +272,6 @@ def test_what_a_run_publishes_holds_no_path_of_this_machine(toy_worlds, tmp_path
     assert len(texts) == 5 and not any(str(tmp_path).encode() in text for text in texts)
 
 
-def test_a_resumed_run_equals_an_unbroken_one(toy_worlds, tmp_path):
-    assert run("--steps", 240, "--run-dir", tmp_path / "whole", "--no-evaluate") == 0
-    assert run("--steps", 96, "--run-dir", tmp_path / "parts", "--no-evaluate") == 0
-    torch.set_num_threads(2)
-    assert main(["run", "--resume", str(tmp_path / "parts"), "--steps", "240", "--no-evaluate"]) == 0
-    assert torch.get_num_threads() == 1
-    assert same(final(tmp_path / "whole"), final(tmp_path / "parts"))
-    rows = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts")]
-    keep = [[{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in r] for r in rows]
-    assert keep[0] == keep[1]
-    assert RunFolder.open(tmp_path / "parts").config().steps == 240
-
-
 @pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac"])
 def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # narrower tables leave columns out
@@ -284,11 +313,7 @@ def test_a_resume_with_all_steps_made_says_what_to_add(toy_worlds, tmp_path, cap
     assert "For as many more: --steps 96." in told
 
 
-def test_whatever_takes_long_is_noted(toy_worlds, tmp_path, monkeypatch):
-    noted = []
-    monkeypatch.setattr(
-        waiting._Watch, "what", property(lambda self: "x", lambda self, what: noted.append(what)), False
-    )
+def test_whatever_takes_long_is_noted(toy_worlds, tmp_path, noted):
     assert run("--steps", 48, "--run-dir", tmp_path / "r", "--episodes", 1) == 0
     expected = ["run, starting", "Building the world of MT4", "Making the learner", "Iteration 1", "Saving"]
     expected += ["Playing episodes to evaluate"]
@@ -367,10 +392,9 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR2, signal.SIGPIPE]
-)
-def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR2, signal.SIGPIPE])
+def test_a_stopped_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
+    """SIGKILL: tests/test_real_run.py and tests/robust."""
     path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -386,12 +410,10 @@ def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     else:
         process.send_signal(number)
         _, errors = process.communicate()
-    assert process.returncode == (0 if number == signal.SIGTERM else -9 if number == signal.SIGKILL else 128 + number)
-    if number not in (signal.SIGKILL, signal.SIGPIPE):
-        assert f"bidex-meta run --resume {path}" in errors
-    if number != signal.SIGKILL:
-        assert final(path)[1] == RunFolder.open(path).metrics()[-1]["step"]
+    assert process.returncode == (0 if number == signal.SIGTERM else 128 + number)
+    assert number == signal.SIGPIPE or f"bidex-meta run --resume {path}" in errors
     stopped = final(path)[1]
+    assert stopped == RunFolder.open(path).metrics()[-1]["step"]
     assert 0 < stopped < steps, errors
     goal = stopped + 480
     assert main(["run", "--resume", str(path), "--steps", str(goal), "--no-evaluate"]) == 0

@@ -14,11 +14,11 @@ from bidex_meta.evaluation import leaderboard, statistics
 from bidex_meta.evaluation.leaderboard import check_apart, improvement, profile, read_entry, success_iqm
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
+from tests.cli.conftest import SMALL
 from tests.pages import ROOT
 from tools.pages.leaderboard import leaderboard_table
 
 SHIPPED = sorted((ROOT / "results" / "leaderboard").glob("*.json"))
-SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 
 
 def classes(*rates: float, tasks: int = 10) -> list[np.ndarray]:

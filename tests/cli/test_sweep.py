@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli import sweep as queue
-from bidex_meta.cli.sweep import State, state_of
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments.sweep_plan import PlannedRun, read_sweep
+from bidex_meta.experiments import sweeping as queue
+from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
+from bidex_meta.experiments.sweeping import State, state_of
 from bidex_meta.runs import RunFolder
 from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config
@@ -35,7 +35,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(queue, "COMMAND", FAKE)
     # Configs are `bidex-meta run`'s matter; the stand-in has but a few entries.
-    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {run.words: CONFIG for run in sweep.runs})
+    monkeypatch.setattr(queue, "_resolved", lambda run: CONFIG)
     path = tmp_path / "sweep.toml"
     path.write_text(FILE)
     return path
@@ -47,15 +47,16 @@ def starts(root: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def state(run: PlannedRun, config: RunConfig[Any] = CONFIG) -> State:
-    return state_of(replace(run, config=config))
+    return state_of(replace(run, config=replace(config, seed=run.seed, start_from=run.given.start_from)))
 
 
 def planned() -> list[PlannedRun]:
-    return [replace(run, config=CONFIG) for run in read_sweep(Path("sweep.toml")).runs]
+    return [replace(run, config=replace(CONFIG, seed=run.seed)) for run in SweepPlan.read(Path("sweep.toml")).runs]
 
 
 def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, shown) -> None:
     core = max(CORES)
+    assert "--run-dir=runs/tiny/HandOver-ppo-seed0" in shown("sweep", file, "--dry-run") and not Path("runs").exists()
     out = shown("sweep", file, "--cores", core)
     assert out.count(" done ") == 2 and "2 done, 0 runs, 0 failed, 0 left" in out
     begun = starts(tmp_path)
@@ -72,12 +73,12 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, sho
 def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(file: Path, tmp_path, monkeypatch, shown) -> None:
     file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
     config = replace(CONFIG, stop_at_return=4.0)
-    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
+    monkeypatch.setattr(queue, "_resolved", lambda run: config)
     assert "2 done, 0 runs, 0 failed, 0 left" in shown("sweep", file)
     begun = starts(tmp_path)
     shown("sweep", file)
     assert starts(tmp_path) == begun, "and not trained further"
-    run = read_sweep(file).runs[0]
+    run = SweepPlan.read(file).runs[0]
     found = state(run, config)
     assert (found.state, found.step, found.goal) == ("done", 4, 4)
     (run.path / "evaluation.json").unlink()
@@ -107,7 +108,7 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     path.write_text(
         FILE.replace('["HandOver"]', '["HandOver", "Switch"]') + "[grid]\nlearner.gamma = [0.8, 0.9]\n" + STARTING
     )
-    runs = [run for run in read_sweep(path).runs if run.after is not None]
+    runs = [run for run in SweepPlan.read(path).runs if run.after is not None]
     assert len(runs) == 2 * 2 * 2
     for run in runs:
         assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
@@ -120,7 +121,7 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     ):
         path.write_text(FILE + text)
         with pytest.raises(BidexError, match=told):
-            read_sweep(path)
+            SweepPlan.read(path)
 
 
 def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp_path: Path, capsys) -> None:
@@ -134,7 +135,7 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
     begun = json.loads((second / "starts").read_text())["at"]
     assert begun >= (first / "evaluation.json").stat().st_mtime - 0.05
     assert json.loads((second / "config.json").read_text())["start_from"] == str(first)
-    assert read_sweep(file).runs[-1].after == first.relative_to(tmp_path)
+    assert SweepPlan.read(file).runs[-1].after == first.relative_to(tmp_path)
     (second / "config.json").write_text((second / "config.json").read_text().replace("ppo-seed1", "ppo-seed2"))
     assert main(["sweep", str(file), "--status"]) == 2
     assert "start_from is" in capsys.readouterr().err
@@ -145,9 +146,10 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: str) -> None:
     """SIGKILL of the sweep, and of its runs or not, which then go on and are waited for; or SIGTERM of the sweep."""
     code = (
-        "import signal; from bidex_meta.cli import sweep as queue; from tests.cli.test_sweep import planned; "
+        "import signal; from bidex_meta.experiments import sweeping as queue; "
+        "from tests.cli.test_sweep import planned; "
         "signal.signal(signal.SIGTERM, signal.default_int_handler); "
-        f"queue.COMMAND = {FAKE!r}; queue.work(planned(), [None, None], print)"
+        f"queue.COMMAND = {FAKE!r}; queue.work(planned(), [None, None])"
     )
     environment = {**os.environ, "FAKE_SECONDS": "0.4", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
     Path("runs/tiny").mkdir(parents=True)
@@ -165,7 +167,7 @@ def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: 
     assert main(["sweep", str(file), "--workers", "1"]) == 0
     begun = [[start["resumed"] for start in each] for each in starts(tmp_path).values()]
     assert begun == [[False] if how == "sweep killed" else [False, True]] * 2
-    for run in read_sweep(file).runs:
+    for run in SweepPlan.read(file).runs:
         assert state(run).state == "done" and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
 
 
@@ -190,8 +192,8 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
         assert "Another sweep works in" in capsys.readouterr().err
     assert main(["sweep", str(file)]) == 0
     with pytest.raises(BidexError, match="num_envs is 8 there, not 16"):
-        state(read_sweep(file).runs[0], replace(CONFIG, num_envs=16))
-    more = state(read_sweep(file).runs[0], replace(CONFIG, steps=12))
+        state(SweepPlan.read(file).runs[0], replace(CONFIG, num_envs=16))
+    more = state(SweepPlan.read(file).runs[0], replace(CONFIG, steps=12))
     assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"
 
 
@@ -208,14 +210,14 @@ def test_cores_that_are_not_there(asked: str | None, count: int | None, told: st
 def test_how_long_the_rest_takes(file: Path, monkeypatch, shown) -> None:
     """At the run's own speed, else at the mean of those on its suite; where time ends it, that."""
     file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
-    run = read_sweep(file).runs[0]
+    run = SweepPlan.read(file).runs[0]
     run.path.mkdir(parents=True)
     (run.path / "config.json").write_text(json.dumps(CONFIG.to_json()))
     (run.path / "metrics.jsonl").write_text('{"step": 3, "Perf/training_time": 3600}\n')
     left = "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours"
     assert left in shown("sweep", file, "--status"), "1 h of 2, and 2 · 2 h"
     timed = replace(CONFIG, minutes=90.0)
-    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
+    monkeypatch.setattr(queue, "_resolved", lambda run: timed)
     assert "about 3.50 core-hours" in shown("sweep", file, "--status"), "0.5 h, and 2 · 1.5 h"
 
 
@@ -226,7 +228,7 @@ def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, refused) -
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("submitit", reason="needs the extra slurm")
-    out, runs = Path("runs/tiny"), planned()
+    out, runs = Path("runs/tiny"), planned()[:1]
     out.mkdir(parents=True)
     for job in queue.submit(runs, out, "local", {"timeout_min": 2}).values():
         assert job.result()
@@ -336,7 +338,7 @@ def test_real_runs_survive_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
     command = [sys.executable, "-m", "bidex_meta.cli", "sweep", "s.toml"]
     sweep = subprocess.Popen(command, env=environment, start_new_session=True)
-    first, second = read_sweep(Path("s.toml")).runs
+    first, second = SweepPlan.read(Path("s.toml")).runs
     _wait(lambda: first.folder.metrics_path.is_file() and len(first.folder.metrics()) > 5, 300)
     runs = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit() and _parent(path) == sweep.pid]
     sweep.kill()

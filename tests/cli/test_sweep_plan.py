@@ -6,7 +6,7 @@ import pytest
 
 from bidex_meta.cli.parsing import peek_all
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments.sweep_plan import PlannedRun, read_sweep
+from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
 from tests.pages import ROOT
 
 FILE = """
@@ -25,7 +25,7 @@ def runs(tmp_path: Path):
     def read(text: str, *change: str) -> list[PlannedRun]:
         path = tmp_path / "s.toml"
         path.write_text(text.replace(*change) if change else text)
-        return read_sweep(path).runs
+        return list(SweepPlan.read(path).runs)
 
     return read
 
@@ -38,7 +38,7 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
         '[[arms]]\nname = "my arm"\nalgo = "mtsac"\ntasks = ["HandOver"]\n'
         "overrides = { learner = { policy_heads = false } }\n"
     )
-    sweep = read_sweep(path)
+    sweep = SweepPlan.read(path)
     names = [run.name for run in sweep.runs]
     half = len(names) // 2
     assert all("seed3" in name for name in names[:half]) and all("seed1" in name for name in names[half:])
@@ -46,10 +46,10 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
         "MT4-mtppo-gamma=0.9-seed3", "own-mtppo-gamma=0.9-seed3", "MT4-mtppo-gamma=0.99-seed3",
         "own-mtppo-gamma=0.99-seed3", "HandOver-my-arm-gamma=0.9-seed3",
     ]  # fmt: skip
-    assert sweep.runs[1].words[0] == f"--suite={tmp_path / 'own.toml'}" and sweep.out == Path("runs/two-words")
+    assert sweep.runs[1].given.suite == str(tmp_path / "own.toml") and sweep.folder == Path("runs/two-words")
     assert sweep.runs[4].begin == [
-        "run", "--task=HandOver", "--algo=mtsac", "--steps=1000", "--learner.hidden", "64", "32", "--learner.gamma=0.9",
-        "--learner.no-policy-heads", "--seed=3", "--threads=1",
+        "run", "--task=HandOver", "--algo=mtsac", "--steps=1000", "--seed=3", "--threads=1",
+        "--learner.hidden", "64", "32", "--learner.gamma=0.9", "--learner.no-policy-heads",
         "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
     ]  # fmt: skip
 
@@ -69,8 +69,8 @@ def test_values_with_slashes_make_no_folders(runs) -> None:
 
 def test_a_flag_may_name_the_subject_and_several_data_sets_are_named_one_by_one(runs) -> None:
     run = runs(FILE, "steps = 6", 'steps = 6, demonstrations = "{subject}/script-v0", dataset = ["a/x", "b/x"]')[0]
-    assert run.subject == "HandOver" and "--demonstrations=HandOver/script-v0" in run.words
-    assert peek_all(run.words, "--dataset") == ["a/x", "b/x"]
+    assert run.subject == "HandOver" and "--demonstrations=HandOver/script-v0" in run.begin
+    assert peek_all(run.begin, "--dataset") == ["a/x", "b/x"]
 
 
 def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(runs) -> None:
@@ -80,7 +80,7 @@ def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(runs) -> Non
     )
     own = [run for run in every if run.arm.startswith("x")]
     assert [run.arm for run in own] == ["x gamma=0.8", "x gamma=0.9"] and len(every) == 4 + 2
-    assert [word for word in own[0].words if word.startswith("--num-envs")][-1] == "--num-envs=4"
+    assert [word for word in own[0].begin if word.startswith("--num-envs")][-1] == "--num-envs=4"
 
 
 def test_an_arm_may_leave_seeds_out(runs) -> None:
@@ -125,7 +125,7 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
     for change, told in (
         (('["ppo"]', '["ppoo"]'), "ppoo on HandOver: Unknown algo 'ppoo'"),
         (('"HandOver"', '"HandOvr"'), "Unknown task 'HandOvr'"),
-        (("steps = 6", 'learner = { gama = "x" }'), "Unknown flag --learner.gama of bidex-meta run"),
+        (("steps = 6", 'learner = { gama = "x" }'), "sets gama, which this version of ppo does not have"),
         (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
     ):
         Path("s.toml").write_text(FILE.replace(*change))

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli.compare import class_table, group_table
 from bidex_meta.cli.plot import named_runs
 from bidex_meta.cli.tables import Sheet, evaluation_table, plain_table, print_table, result_table
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.experiments.comparing import class_table, group_table
 from bidex_meta.tasks import registry
 from tests.fakes import evaluated_run
 

@@ -1,6 +1,7 @@
 """Held-out classes: the suite's own form, demonstrations, the runs of each start, tables of what is done."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -13,27 +14,31 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.cli import main, transfer
-from bidex_meta.cli.run_flags import config_of_words
-from bidex_meta.cli.sweep import state_of
-from bidex_meta.cli.transfer_plan import (
+from bidex_meta.cli import main
+from bidex_meta.data import Episode, open_dataset, part_files
+from bidex_meta.data.writer import DatasetWriter, finish
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation import statistics
+from bidex_meta.evaluation.transfer_measures import at_the_end
+from bidex_meta.experiments import transferring
+from bidex_meta.experiments.evaluating import FinalEvaluation
+from bidex_meta.experiments.run_config import resolve
+from bidex_meta.experiments.sweeping import state_of
+from bidex_meta.experiments.transfer_plan import (
     Arm,
     arms_of,
     cells_of,
     demonstrations_of,
+    evaluate_every,
     held_out,
-    reinforced,
-    shared_words,
     some_of,
     suite_file,
 )
-from bidex_meta.data import Episode, open_dataset, part_files
-from bidex_meta.data.writer import DatasetWriter, finish
-from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
 from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds.own import OwnSuite
+from tests.cli.conftest import toy
 from tests.data.worlds import ABOUT
 from tests.fakes import run_config
 
@@ -151,10 +156,12 @@ def test_a_policy_is_cloned_from_one_episode_of_a_script(pair: Path, tmp_path: P
     pytest.importorskip("h5py", reason="needs the extra data")
     file = suite_file(opened(pair), "DoorCloseOutward", tmp_path)
     found = demonstrations_of(file, "DoorCloseOutward", [], tmp_path, 1)
-    words = shared_words(2, ["--device", "cpu", "--episodes", "1", "--learner.demonstration-cloning", "20"])
+    usual = replace(transferring.USUAL_RUN, suite=str(file), num_envs=2, device="cpu", threads=1)
+    config = resolve(replace(usual, learner={"demonstration_cloning": 20}))
     (tmp_path / "data").mkdir()
-    fresh = Arm("nothing", None, ["--learner.hidden", "8"])
-    (cell,) = cells_of(file, "DoorCloseOutward", [fresh], 0, words, tmp_path, [], [1], found)
+    fresh = Arm("nothing", None, {"hidden": [8]})
+    final = FinalEvaluation(episodes=1)
+    (cell,) = cells_of(config, final, file, "DoorCloseOutward", [fresh], tmp_path, 0, [1], found)
     assert cell.run.config.demonstrations == (str(tmp_path / "data" / "DoorCloseOutward-1-seed0-v0"),)
     assert main(list(cell.run.begin)) == 0 and state_of(cell.run).state == "done"
     assert len(at_the_end([cell.run.folder])["success"]["of_seeds"]) == 1
@@ -184,29 +191,38 @@ def test_scripts_demonstrate_where_no_data_are_given(pair: Path, tmp_path: Path)
 # The command: real plans, and real runs of PPO on worlds of points.
 
 
-@pytest.mark.parametrize(("steps", "words", "every"), [(250_000, [], 4), (250_000, ["--learner.rollout-steps=128"], 1)])
-def test_a_run_by_reinforcement_is_evaluated_a_hundred_times_or_after_each_iteration(steps, words, every) -> None:
-    planned = config_of_words(["--task=HandOver-v2", *shared_words(64, words)])
-    assert reinforced(steps, planned) == [f"--steps={steps}", f"--evaluate-every={every}"]
-    assert reinforced(0, planned) == []
+@pytest.mark.parametrize(("learner", "every"), [({}, 4), ({"rollout_steps": 128}, 1)])
+def test_a_run_by_reinforcement_is_evaluated_a_hundred_times_or_after_each_iteration(learner, every) -> None:
+    config = resolve(replace(transferring.USUAL_RUN, task="HandOver-v2", num_envs=64, learner=learner))
+    assert evaluate_every(250_000, config) == every
 
 
 FLAGS = ["--steps", "96", "--demonstrations", "0", "--seeds", "2", "--num-envs", "6"]
 MORE = ["--", "--episodes", "1", "--device", "cpu", "--learner.critic-first", "12"]
 
 
-@pytest.fixture
-def trained(toy_worlds, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A run to start from, and runs within this process."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("trained") / "start"
     words = ["--suite", "ML4-v2", "--algo", "mtppo", "--num-envs", "6", "--steps", "480", "--device", "cpu"]
     words += ["--learner.hidden", "8", "--learner.activation", "tanh", "--threads", "1", "--logger", "none"]
-    assert main(["run", *words, "--no-evaluate", "--run-dir", "start"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OwnSuite, "world", toy)
+        assert main(["run", *words, "--no-evaluate", "--run-dir", str(path)]) == 0
+    return path
 
-    def work(runs, cores, say) -> int:
+
+@pytest.fixture
+def trained(start: Path, toy_worlds, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A run to start from, and runs within this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(statistics, "RESAMPLES", 400)
+    shutil.copytree(start, "start")
+
+    def work(runs, cores) -> int:
         return sum(main(list(run.begin)) != 0 for run in runs)
 
-    monkeypatch.setattr(transfer, "work", work)
+    monkeypatch.setattr(transferring, "work", work)
     yield tmp_path / "start"
 
 
@@ -231,7 +247,7 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
     assert (config.learner_values["hidden"], config.learner_values["critic_first"]) == ([8], 12)
     assert Path(config.suite or "") == tmp_path / "t/suites/ML4-v2-TwoCatchUnderarm.toml"
     assert {path.name for path in Path("t").glob("*.png")} == {"reinforcement.png", "demonstrations.png"}
-    monkeypatch.setattr(transfer, "work", lambda runs, cores, say: pytest.fail("run twice") if runs else 0)
+    monkeypatch.setattr(transferring, "work", lambda runs, cores: pytest.fail("run twice") if runs else 0)
     tables = shown("transfer", trained, *FLAGS, "--out", "t", *MORE)
     assert out.endswith(tables) and tables.count("TwoCatchUnderarm") == 4 and tables.count("0, 1") == 4
     assert "area over nothing" in tables and "steps to 50 %" in tables and "demonstrations" in tables
@@ -246,15 +262,15 @@ def test_what_no_demonstration_shows_plays_the_policy_itself(trained: Path, show
 
 
 def test_a_failed_run_is_left_out_and_tried_again(trained: Path, monkeypatch, shown, capsys) -> None:
-    whole = transfer.work
-    monkeypatch.setattr(transfer, "work", lambda runs, cores, say: whole(runs[1:], cores, say) + 1)
+    whole = transferring.work
+    monkeypatch.setattr(transferring, "work", lambda runs, cores: whole(runs[1:], cores) + 1)
     with pytest.raises(SystemExit, match="1"):
-        main(["transfer", str(trained), *FLAGS, "--out", "t", *MORE])
+        main(["transfer", str(trained), *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2]])
     assert "1 failed" in capsys.readouterr().err
     first = json.loads(Path("t/transfer.json").read_text())["demonstrations"][0]
     assert (first["from"], first["seeds"]) == ("start", [1])
-    monkeypatch.setattr(transfer, "work", whole)
-    shown("transfer", trained, *FLAGS, "--out", "t", *MORE)
+    monkeypatch.setattr(transferring, "work", whole)
+    shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2])
     assert json.loads(Path("t/transfer.json").read_text())["demonstrations"][0]["seeds"] == [0, 1]
 
 
@@ -282,11 +298,8 @@ def test_bad_input_is_one_line_and_writes_nothing(trained: Path, tmp_path: Path,
 def test_each_start_has_the_network_of_its_run(tmp_path: Path) -> None:
     for name, hidden in (("a", [8, 4]), ("b", [16])):
         RunFolder.create(run_config(suite="ML4-v2", learner={"hidden": hidden, "gamma": 0.5}), tmp_path / name)
-    arms = arms_of([tmp_path / "a", tmp_path / "b"])
-    assert [(arm.name, arm.network) for arm in arms] == [
-        ("a", ["--learner.hidden", "8", "4"]), ("nothing", ["--learner.hidden", "8", "4"]),
-        ("b", ["--learner.hidden", "16"]),
-    ]  # fmt: skip
+    arms = arms_of([RunFolder.open(tmp_path / "a"), RunFolder.open(tmp_path / "b")])
+    assert [(arm.name, arm.network["hidden"]) for arm in arms] == [("a", [8, 4]), ("nothing", [8, 4]), ("b", [16])]
 
 
 def test_demonstrations_without_hdf5_are_refused_at_once(trained: Path, refused, monkeypatch) -> None:

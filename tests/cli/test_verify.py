@@ -13,14 +13,6 @@ from bidex_meta.evaluation.agreement import agreements
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.runs import RunFolder
 
-SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
-
-
-@pytest.fixture
-def run(toy_worlds, tmp_path) -> Path:
-    assert main(["run", *SMALL, "--steps", "96", "--run-dir", str(tmp_path / "r"), "--episodes", "4"]) == 0
-    return tmp_path / "r"
-
 
 def verify(capsys, *arguments):
     capsys.readouterr()
@@ -156,13 +148,13 @@ def _rows(generator, classes, episodes, shift=0.0):
 
 
 def test_honest_repetitions_are_within_and_a_worse_policy_is_not():
-    """Independent samples are the worst case: of 40 pairs of twenty classes, 60 episodes each, some three have one."""
+    """Independent samples are the worst case: of 20 pairs of twenty classes, 60 episodes each, some two have one."""
     generator = np.random.default_rng(0)
     beyond = sum(
         any(each.outcome == "differs" for each in agreements(_rows(generator, 20, 60), _rows(generator, 20, 60)))
-        for _ in range(40)
+        for _ in range(20)
     )
-    assert beyond <= 8
+    assert beyond <= 5
     found = agreements(_rows(generator, 20, 60), _rows(generator, 20, 60, shift=2.0))
     assert all(each.outcome == "differs" for each in found)
 

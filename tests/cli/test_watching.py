@@ -61,6 +61,7 @@ def test_a_resumed_run_looks_when_the_unbroken_one_does(toy_worlds, tmp_path):
     assert run("--steps", 96, "--run-dir", tmp_path / "parts", *looking) == 0
     assert main(["run", "--resume", str(tmp_path / "parts"), "--steps", "240", "--no-evaluate"]) == 0
     assert learned(tmp_path / "whole") == learned(tmp_path / "parts")
+    assert RunFolder.open(tmp_path / "parts").config().steps == 240
     evaluated = [row["step"] for row in learned(tmp_path / "parts") if "Eval/success_rate" in row]
     assert evaluated == [72, 144, 216]
     assert same(final(tmp_path / "whole"), final(tmp_path / "parts"))

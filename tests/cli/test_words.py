@@ -5,24 +5,42 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
-from pathlib import Path
 
 import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS
-from bidex_meta.cli import COMMANDS, listing, main
+from bidex_meta.cli import COMMANDS, main
+from bidex_meta.experiments import catalogue
 from bidex_meta.experiments.learners import ALGOS, learner_kind
 from bidex_meta.tasks import registry
 
 
-@pytest.mark.parametrize("words", [["--help"], ["list", "suites"], ["list", "tasks"], ["list", "algos"]])
-def test_help_and_lists_need_no_torch(words):
-    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner"}
-    code = f"import sys; from bidex_meta.cli import main; main({words}); print({heavy} & set(sys.modules))"
+def test_help_and_lists_need_no_torch():
+    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner", "bidex_meta.world"}
+    lines = [["--help"], ["list", "suites"], ["list", "tasks"], ["list", "algos"]]
+    code = f"import sys; from bidex_meta.cli import main; [*map(main, {lines})]; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    named = {"--help": list(COMMANDS), "suites": ["MT10", "MT20-v2"], "tasks": registry.names(), "algos": list(ALGOS)}
-    assert all(name in done.stdout for name in named[words[-1]]) and done.stdout.rstrip().endswith("set()")
+    named = [*COMMANDS, "MT10", "MT20-v2", *registry.names(), *ALGOS]
+    assert all(name in done.stdout for name in named) and done.stdout.rstrip().endswith("set()")
+
+
+def test_the_help_of_run_fits_three_screens_and_that_of_all_flags_names_them_all(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    for algo in ("mtppo", "mtsac", "maml"):
+        brief = help_of("--algo", algo, "--help", capsys=capsys)
+        assert len(brief.splitlines()) <= 3 * 24 and "--suite" in brief and "--learner.gamma" in brief
+        assert max(map(len, brief.splitlines())) <= 80
+    every = help_of("--help-all", capsys=capsys)
+    flags = set(re.findall(r"^  (--[a-z-]+(?:\.[a-z-]+)?)", every, re.MULTILINE))
+    assert flags >= {"--engine", "--learner.desired-kl", "--split"} and "--learner.desired-kl" not in brief
+
+
+def help_of(*words, capsys):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["run", *words])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
 
 
 def test_lists_read_from_source_are_as_the_classes_say(shown):
@@ -39,7 +57,7 @@ def test_lists_read_from_source_are_as_the_classes_say(shown):
 
 
 def test_a_class_whose_docstring_gives_no_size_is_named(monkeypatch, capsys):
-    monkeypatch.setattr(listing, "_docstring", lambda *place: "Throw an egg.")
+    monkeypatch.setattr(catalogue, "_docstring", lambda *place: "Throw an egg.")
     assert main(["list", "tasks"]) == 2
     told = capsys.readouterr().err
     assert "HandOver: expected the observation's size" in told and told.count("\n") == 1
@@ -60,14 +78,6 @@ def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):
         config = json.loads(capsys.readouterr().out)
         assert (config["suite"], config["task"], config["algo"], config["preset"]) == expected
     assert main(["list", "SUITES", "--json"]) == 0
-
-
-def test_hints_name_extras_that_there_are():
-    root = Path(__file__).parents[2]
-    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    sources = [*root.glob("bidex_meta/**/*.py"), *root.glob("algos/**/*.py"), *root.glob("docs/**/*.md")]
-    named = {found for path in sources for found in re.findall(r"bidex-meta\[([\w-]+)\]", path.read_text())}
-    assert named and named <= set(extras)
 
 
 # A line of bash that completes the last of its words with the script that is read from a file.

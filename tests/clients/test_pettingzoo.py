@@ -23,16 +23,6 @@ def test_pettingzoos_own_tests(agents: str) -> None:
     parallel_seed_test(lambda: parallel_env("CatchUnderarm", agents), num_cycles=50)
 
 
-def test_copies_without_a_seed_start_differently() -> None:
-    def start(seed: int | None = None) -> np.ndarray:
-        env = parallel_env("CatchUnderarm", seed=seed)
-        env.reset()
-        return env.state()
-
-    assert not np.array_equal(start(), start())
-    np.testing.assert_array_equal(start(seed=2), start(seed=2))
-
-
 def test_agents_together_are_the_single_agent() -> None:
     alone, env = TaskEnv("HandOver"), parallel_env("HandOver", "fingers", render_mode="rgb_array")
     whole, _ = alone.reset(seed=3)

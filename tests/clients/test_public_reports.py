@@ -226,6 +226,11 @@ def start(env: Any) -> np.ndarray:
     return numbers(env.reset()[0])
 
 
+def start_of_agents(env: Any) -> np.ndarray:
+    env.reset()
+    return env.state()
+
+
 # Seeds.
 
 
@@ -242,6 +247,10 @@ def test_copies_without_a_seed_are_no_copies() -> None:
         env.set_task(benchmark.train_tasks[0])
     for one, two in pairs:
         assert not np.array_equal(start(one), start(two))
+    if find_spec("pettingzoo"):
+        make = import_module("bidex_meta.clients.pettingzoo").parallel_env
+        one, two, again = (start_of_agents(make(NAME, "single", seed=seed)) for seed in (None, 2, 2))
+        assert np.array_equal(two, again) and not np.array_equal(one, start_of_agents(make(NAME, "single")))
 
 
 @pytest.mark.parametrize("name", CLIENTS)

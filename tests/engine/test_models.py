@@ -3,8 +3,10 @@
 import mujoco
 import pytest
 
+from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.models import differing_fields, same_structure
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
 from tests.tasks.worlds import CASES
 
@@ -51,3 +53,27 @@ def test_what_is_another_structure(change: str) -> None:
     assert same_structure(other(""), other(change)) == numbers
     if numbers:
         assert bool(differing_fields(other(""), other(change))) == bool(change)
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_room_exceeds_what_was_seen(name: str) -> None:
+    seen = registry.get(name, True).needs
+    room = room_for([seen])
+    assert room.contacts >= 1.5 * seen.contacts and room.rows >= 1.5 * seen.rows
+    assert room.contacts >= room.convex >= max(2, 1.5 * seen.convex)
+
+
+def test_every_class_was_measured_and_a_stranger_has_the_largest_of_all() -> None:
+    seen = [registry.get(name, True).needs for name in registry.names()]
+    for name in ("contacts", "convex", "rows"):
+        assert getattr(TaskClass.needs, name) == max(getattr(one, name) for one in seen)
+    assert len(set(seen)) == len(seen)
+
+
+def test_more_water_gets_more_room() -> None:
+    """Against the most that was seen with 125 drops."""
+    few, many = (registry.get("PourWater", True, water=water).needs for water in (12, 125))
+    room = room_for([many])
+    assert room.contacts > 255 and room.convex > 129 and room.rows > 282
+    assert few == registry.get("PourWater", True).needs
+    assert room_for([few, many]) == room

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bidex_meta.cli.tables import evaluation_table
 from bidex_meta.evaluation import references
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference, counted_returns
@@ -54,7 +55,7 @@ def test_stored_references_are_those_of_moving_bases(name: str, known: bool) -> 
     world = class_world(name, 2, "DISABLED")
     world.set_tasks({name: world.pools[0][:2]})
     expected = references.references()[name] if known else None
-    (shot,) = meta_evaluate(Breaker(0, world.action_size), world, 0, episodes_per_task=1).by_shot
+    (shot,) = meta_evaluate(Breaker(0, world.action_size), world, 0, protocol=Protocol(episodes_per_task=1)).by_shot
     for found in (shot, evaluate(Breaker(0, world.action_size), world, 1)):
         assert found.classes[name].reference == expected
         assert found.classes[name].mean_return == (expected.random if expected else 0.0)
@@ -119,7 +120,7 @@ def test_a_success_before_the_break_is_none() -> None:
 
 def test_a_meta_test_counts_broken_episodes_alike_in_every_shot() -> None:
     """Without a reference the worst finished episode of all shots, so that breaking later gains nothing."""
-    found = meta_evaluate(Finder(), rows((0, 5)), 1, rollouts=1, episodes_per_task=1)
+    found = meta_evaluate(Finder(), rows((0, 5)), 1, protocol=Protocol(rollouts=1, episodes_per_task=1))
     for name in ("Near", "Far"):
         shots = [shot.classes[name] for shot in found.by_shot]
         worst = min(shot.returns[1:].min() for shot in shots)

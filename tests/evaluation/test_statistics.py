@@ -186,8 +186,8 @@ def test_share_above_leaves_out_ties() -> None:
 def test_an_aggregate_is_of_the_classes_means_and_of_all_classes() -> None:
     samples = [np.array([0.0, 1.0]), np.full(9, 0.25), np.full(3, 1.0), np.full(3, 0.0)]
     found = aggregate(samples)
-    assert found is not None and found["mean"] == 0.4375 and found["iqm"] == 0.375
-    assert found["interval"] == (0.3125, 0.5625), "only the first class varies: 0, 1/2 or 1"
+    assert found is not None and found.mean == 0.4375 and found.iqm == 0.375
+    assert found.interval == (0.3125, 0.5625), "only the first class varies: 0, 1/2 or 1"
     assert aggregate([*samples, None]) is None and aggregate([]) is None
 
 

@@ -11,6 +11,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
 from bidex_meta import Benchmark
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import ZeroAgent, evaluate
 from bidex_meta.experiments.learners import learner_kind
@@ -116,7 +117,7 @@ def test_our_agent_hears_the_order_of_calls_it_knows():
 def test_their_agent_in_our_evaluation():
     place = points(16, ends=True)
     native = Native(16)
-    found = meta_evaluate(FromMetaWorld(native), place, 4, episodes_per_task=2, max_adapt_steps=10)
+    found = meta_evaluate(FromMetaWorld(native), place, 4, protocol=Protocol(episodes_per_task=2, max_adapt_steps=10))
     assert found.gains().aggregate["return"].value > 0  # type: ignore[union-attr]
     played = ["reset", "eval_action"]
     shot = [*["adapt_action", "step"] * 10, "adapt", *played]

@@ -200,26 +200,6 @@ def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed["metaworld/MT3"]["train_classes"] == list(METAWORLD_SUITES["metaworld/MT3"])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
-        ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
-        ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
-        ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
-        ("baseline random --suite metaworld/MT3", "classes of our own"),
-        ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "classes of our own"),
-    ],
-)
-def test_bad_input_is_one_line(arguments, expected, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments.split()) == 2
-    error = capsys.readouterr().err
-    # A run says what it is about to do before it makes the world.
-    lines = [line for line in error.splitlines() if line.startswith("bidex-meta: ")]
-    assert lines == error.splitlines()[-1:] and expected in lines[0] and list(tmp_path.iterdir()) == []
-
-
 def test_misuse_is_refused() -> None:
     world = make()
     with pytest.raises(BidexError, match="Did you mean 'reach-v3'"):

@@ -33,20 +33,16 @@ BOTH = pytest.mark.parametrize(
 EVALUATION: dict[ModuleType, ModuleType] = {original: original_evaluation, ours: our_evaluation}
 SHORT: dict[str, Any] = {"max_episode_steps": 8}  # where a test is about the end of episodes
 ITS_OWN_CODE = """
-import metaworld
+import sys
+from bidex_meta import Benchmark
+benchmark = Benchmark('ML4', 3)
+assert 'metaworld' not in sys.modules
+import {first}, metaworld, bidex_meta.metaworld
+assert isinstance(benchmark, metaworld.Benchmark)
 env = metaworld.make_mt_envs("reach-v3", seed=0)
 env.reset()
 assert env.step(env.action_space.sample())[0].shape == (39,)
 """
-
-
-@pytest.mark.parametrize("ours", ["", "import bidex_meta.metaworld", "import metaworld, bidex_meta.metaworld"])
-def test_meta_worlds_own_code_runs_beside_ours(ours: str) -> None:
-    """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
-    command = [sys.executable, "-W", "ignore", "-c", ours + ITS_OWN_CODE]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert (done.returncode == 0) == bool(ours), done.stderr
-    assert ours or "could not broadcast input array from shape (11,) into shape (12,)" in done.stderr
 
 
 # Meta-World's examples; the benchmark is an argument.
@@ -164,9 +160,8 @@ def test_wrappers_keep_their_meaning(metaworld: ModuleType, name: str) -> None:
 # What is ours.
 
 
-@pytest.mark.parametrize("suite", ["MT4", "ML4", "MT20"])
-def test_an_environment_plays_what_a_row_of_the_world_plays(suite: str) -> None:
-    benchmark, seed = Benchmark(suite, 3), 5
+def test_an_environment_plays_what_a_row_of_the_world_plays() -> None:
+    benchmark, seed = Benchmark("MT20", 3), 5
     drawn = int(seeding.np_random(seed)[0].integers(2**31))
     classes = list(benchmark.train_classes.items())
     world = benchmark.make_world(num_envs=len(classes), device="cpu", autoreset_mode="DISABLED", threads=1)
@@ -179,7 +174,7 @@ def test_an_environment_plays_what_a_row_of_the_world_plays(suite: str) -> None:
         np.testing.assert_array_equal(obs, world_obs[i, : len(obs)].numpy(), err_msg=name)
         envs.append(env)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(6):
+    for _ in range(4):
         actions = 2.0 * torch.rand(len(envs), 52, generator=generator) - 1.0
         world_obs, reward, terminated, truncated, info = world.step(actions)
         for i, env in enumerate(envs):
@@ -412,15 +407,12 @@ def test_environments_pickle_and_go_on_alike(begun: bool) -> None:
 
 
 @pytest.mark.parametrize("first", ["metaworld", "bidex_meta.metaworld"])
-def test_a_benchmark_is_one_of_meta_worlds(first: str) -> None:
+def test_a_benchmark_is_one_of_meta_worlds_whose_own_code_runs_beside_ours(first: str) -> None:
+    """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
     made = Benchmark("ML4"), ours.MT20(1), ours.ML1("Switch", 2)
     assert all(isinstance(one, original.Benchmark) and isinstance(one, ours.Benchmark) for one in made)
     assert not isinstance("ML4", original.Benchmark) and type(made[0]) is made[0].__class__ is Benchmark
-    code = (
-        f"import sys; from bidex_meta import Benchmark; b = Benchmark('ML4', 3); assert 'metaworld' not in sys.modules;"
-        f"import {first}, metaworld, bidex_meta.metaworld; assert isinstance(b, metaworld.Benchmark)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", ITS_OWN_CODE.format(first=first)], check=True, timeout=300)
 
 
 def test_constructors_take_what_meta_worlds_take() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from bidex_meta import Benchmark, BidexError
+from bidex_meta import BidexError
 from bidex_meta.cli import main
 from bidex_meta.tasks import registry
 
@@ -138,38 +138,3 @@ def test_the_command_says_so_and_writes_nothing(tmp_path, monkeypatch, capsys):
         assert main(["render", *look, "--object", "mug", "--out", "mug.png"]) == 2
         assert "--object goes with --task alone" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["heavy.xml"]
-
-
-SUITE = """
-name = "Things"
-version = 1
-kind = "multi-task"
-description = "d"
-observation = "one-hot"
-task_id = "class"
-reward = "paper"
-base = "moving"
-tasks_per_class = 2
-[[classes]]
-name = "CatchUnderarm"
-"""
-
-
-@pytest.mark.parametrize(
-    "line, told",
-    [
-        ("objects = []", "objects"),
-        ("objects = 3", "objects"),
-        ('objects = ["egg", 3]', "objects"),
-        ('objects = ["egg", "egg"]', "each name once"),
-        ('objects = ["crate"]', "Unknown object 'crate'"),
-        ('objects = ["egg"]\noptions = { object = "mug" }', "either objects or options.object"),
-        ("options = { object = 3 }", "object"),
-        ('objects = ["missing.xml"]', "missing.xml"),
-    ],
-)
-def test_a_bad_suite_is_one_line(line: str, told: str, tmp_path: Path) -> None:
-    (tmp_path / "things.toml").write_text(SUITE + line)
-    with pytest.raises(BidexError, match=r"things\.toml") as raised:
-        Benchmark(tmp_path / "things.toml")
-    assert told in str(raised.value)

@@ -1,5 +1,6 @@
 """The offline learners: problems with a known answer, parts against independent computations, resume."""
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import Sources
 from tests.algos.problems import PointMass, discounted_return, one_step_bandit, opposite_bandits
+from tests.offline.against_d3rlpy import against
 from tests.offline.stored import as_data, noisy, played
 
 PLAIN: dict[str, Any] = {
@@ -175,3 +177,23 @@ def test_a_checkpoint_of_other_data_is_refused() -> None:
         BC(world, SMALL["bc"][1], seed=0)
     with pytest.raises(BidexError, match="bc: learns from no demonstrations"):
         BC(world, SMALL["bc"][1], 0, Sources(data, demonstrations=data))
+
+
+PYTHON = os.environ.get("D3RLPY_PYTHON")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not PYTHON, reason="D3RLPY_PYTHON names no interpreter with d3rlpy")
+def test_the_intervals_of_three_seeds_overlap() -> None:
+    world = PointMass()
+    data = as_data(played(world, noisy(world.best, 0.5, 0.4), 200))
+    found = against(
+        data, world, lambda agent: discounted_return(PointMass(rows=1024), agent.eval_action, 0.99, 20), str(PYTHON),
+        updates=3000
+    )  # fmt: skip
+    behaviour = discounted_return(PointMass(rows=1024), noisy(world.best, 0.0, 0.4), 0.99, 20)
+    print(found, behaviour, torch.get_num_threads())
+    for algo, told in found.items():
+        assert told["overlap"], algo
+        assert min(told["theirs"] + told["ours"]) > behaviour, algo

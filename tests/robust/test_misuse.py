@@ -20,13 +20,18 @@ from bidex_meta.clients.torchrl_env import TorchRLEnv
 from bidex_meta.data import open_dataset
 from bidex_meta.data.dataset import dataset_names
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import compare
 from bidex_meta.experiments import evaluating
 from bidex_meta.experiments.plotting import plot
 from bidex_meta.experiments.policies import load_policy
+from bidex_meta.experiments.recording import RecordConfig, record
+from bidex_meta.experiments.sweep_plan import SweepPlan
+from bidex_meta.experiments.sweeping import sweep
 from bidex_meta.experiments.training import train
+from bidex_meta.experiments.transferring import transfer
 from bidex_meta.experiments.verifying import verify
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
@@ -280,10 +285,8 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "references": (None, "None dict"),
     }),
     "meta_evaluate": lambda s: (meta_evaluate, {
-        "agent": (s.zero, ""), "world": (s.few, ""), "shots": (0, "zero"), "rollouts": (None, "None one"),
-        "episodes_per_task": (1, "one None"), "tasks": (None, "None one"),
-        "trials": (1, "one None"), "max_adapt_steps": (5, "one huge None"),
-        "seed": (0, SEED + " None"), "references": (None, "None dict"),
+        "agent": (s.zero, ""), "world": (s.few, ""), "shots": (0, "zero"), "protocol": (Protocol(rollouts=1), ""),
+        "references": (None, "None dict"),
         "adapt_world": (None, "None"),
         "evaluated": (None, "None"),
     }),
@@ -307,6 +310,19 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "run": (s.run, ""), "shots": (1, ""), "tasks": (1, ""), "trials": (1, ""),
     }),
     "verify": lambda s: (verify, {"run": (s.run, ""), "device": ("cpu", ""), "num_envs": (4, "")}),
+    "SweepPlan.of": lambda s: (SweepPlan.of, {
+        "folder": (s.folder / "plan", "empty word nowhere"), "configs": ({"a": run_config()}, "dict"),
+    }),
+    "SweepPlan.read": lambda s: (SweepPlan.read, {"file": (s.folder / "no.toml", ""), "root": ("runs", "")}),
+    "sweep": lambda s: (sweep, {"plan": (SweepPlan(s.folder / "plan", []), ""), "workers": (1, "None one")}),
+    "record": lambda s: (record, {"config": (RecordConfig("random"), "")}),
+    "RecordConfig": lambda s: (RecordConfig, {
+        "kind": ("random", "empty word"), "runs": ((), ""), "task": ("HandOver", "None empty word"),
+        "size": (5, "zero one"), "noise": (0.0, "zero one half"), "seed": (0, "zero one"), "actions": ("mean", ""),
+    }),
+    "transfer": lambda s: (transfer, {
+        "run": (s.run, ""), "out": (s.folder / "t", ""), "classes": ((), ""), "steps": (5, ""), "seeds": (1, ""),
+    }),
     "plot": lambda s: (plot, {"runs": ([s.run], ""), "out": (s.folder / "curves.png", "")}),
     "Checkpoints": lambda s: (lambda **a: Checkpoints(**a).load(), {
         "folder": (s.run.path, "nowhere"), "keep": (3, "one zero"),

@@ -71,15 +71,6 @@ def test_found_means_the_start_and_eight_of_ten_shifted_ones(first: int | None, 
     assert Replay(0.0, first, succeeded, 0.0).found is found
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["", "--task HandOver --all", "--task HandOve", "--all --out film.mp4", "--task HandOver --file a.npz", "--find"],
-)
-def test_bad_calls_are_answered_in_one_line(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["witness", *words.split()]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_a_missing_witness_is_not_found(monkeypatch, tmp_path, capsys) -> None:
     monkeypatch.setattr("bidex_meta.cli.witness.witness_path", lambda name: tmp_path / name)
     assert main(["witness", "--task", "HandOver", "--json"]) == 0

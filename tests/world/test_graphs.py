@@ -97,7 +97,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], t
 @pytest.mark.parametrize("suite", ["MT4", "ML4"])
 def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tuple[World, list[int]]]) -> None:
     plain, (taped_world, count) = suite_world(suite, 9), recorded(suite, 9)
-    actions = random_actions(plain, 120)
+    actions = random_actions(plain, 75)
     actions[40, 3] = torch.nan
     for one in (plain, taped_world):
         one.reset(seed=3)

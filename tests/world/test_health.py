@@ -17,21 +17,16 @@ REST = [row for row in range(ROWS) if row not in BROKEN]
 def spoil(world: World, how: str, action: torch.Tensor) -> None:
     for row in BROKEN:
         engine, place = engine_place(world, row)
-        if how in ("qpos", "qvel"):
-            getattr(engine, how)[place, 3] = math.nan
-        elif how == "infinite":
-            engine.qpos[place, 10] = math.inf
-        elif how == "fast":
+        if how == "position":
+            engine.qpos[place, 3] = math.nan
+        elif how == "speed":
             engine.qvel[place] = 1e12  # finite, but beyond what MuJoCo accepts
-        elif how == "free body":
-            engine.qpos[place, -1] = math.nan
         else:
-            action[row, 7], action[row, 30] = {"nan action": (math.nan, 0.5), "infinite action": (math.inf, -math.inf)}[
-                how
-            ]
+            action[row, 7], action[row, 30] = HOW[how]
 
 
-HOW = ["qpos", "qvel", "infinite", "fast", "free body", "nan action", "infinite action"]
+HOW = {"position": None, "speed": None, "nan action": (math.nan, 0.5), "infinite action": (math.inf, -math.inf)}
+"""Ways to break a row, and what stands in its action then. tests/world/test_breaking.py knows more ways."""
 
 
 @pytest.mark.parametrize("how", HOW)

@@ -93,7 +93,7 @@ def test_masked_resets_give_the_same_episodes(mode: str, request: pytest.Fixture
     request.getfixturevalue("masked")
     other = suite_world("MT4", 9, mode)
     assert_same([{"obs": one.reset(seed=3)[0]}], [{"obs": other.reset(seed=3)[0]}])
-    actions = random_actions(one, 120)
+    actions = random_actions(one, 80)
     a, b = play(one, actions), play(other, actions)
     assert_same(a, b)
     assert number_of_ends(a) >= 9

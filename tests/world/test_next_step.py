@@ -11,7 +11,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from bidex_meta.worlds.humanoid import HumanoidWorld
 from tests.world.play import suite_world
 
-ROWS, STEPS = 10, 200
+ROWS, STEPS = 6, 160
 Make = Callable[[str], Any]
 
 

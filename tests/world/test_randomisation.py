@@ -156,7 +156,7 @@ def test_neither_threads_nor_rows_nor_the_way_of_resets_change_a_draw(
     worlds = [suite.make_world("train", 8, "cpu", threads=threads) for threads in (1, 2)]
     request.getfixturevalue("masked")
     worlds.append(suite.make_world("train", 8, "cpu"))
-    a, b, c = both(*worlds, steps=60)
+    a, b, c = both(*worlds, steps=40)
     assert number_of_ends(a[1:]) > 4
     assert_same(a, b)
     assert_same(a, c)
@@ -165,7 +165,7 @@ def test_neither_threads_nor_rows_nor_the_way_of_resets_change_a_draw(
 
 def test_replayed_graphs_are_plain_steps(tmp_path: Path, recorded: Callable[..., Any]) -> None:  # noqa: F811
     file = randomised_suite(tmp_path)
-    assert_same(*both(Benchmark(file).make_world("train", 8, "cpu", threads=1), recorded(file, 8)[0], steps=60))
+    assert_same(*both(Benchmark(file).make_world("train", 8, "cpu", threads=1), recorded(file, 8)[0], steps=30))
 
 
 def test_a_saved_state_and_a_copy_continue_bit_for_bit() -> None:

@@ -16,20 +16,7 @@ from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.part import judge
 from tests.data.test_commands import recorded
 from tests.tasks.worlds import MOVING, engine_of, slot
-from tests.world.play import flat, suite_world
-
-
-@pytest.mark.xdist_group("warp")
-def test_the_warp_engine_agrees_with_c() -> None:
-    worlds = [
-        World([slot(registry.get("BottleCap-v2"))], WorldConfig(2, engine=engine, threads=1))
-        for engine in ("c", "warp")
-    ]
-    action = torch.rand(2, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    torch.testing.assert_close(*(world.reset(seed=0)[0] for world in worlds), rtol=0, atol=1e-5)
-    ours, theirs = (flat(world.step(action)) for world in worlds)
-    assert ours.keys() == theirs.keys()
-    torch.testing.assert_close(theirs["reward"], ours["reward"], rtol=0, atol=1e-4)
+from tests.world.play import suite_world
 
 
 def test_points_hide_the_object_and_show_the_goal() -> None:

@@ -1,22 +1,23 @@
-"""A world on mujoco_warp (Warp's CPU device) keeps the contract that worlds on C MuJoCo keep."""
+"""A world on mujoco_warp (Warp's CPU device) against one on C MuJoCo; its contract: tests/test_contract.py."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from bidex_meta import Benchmark
+from bidex_meta.tasks import registry
 from bidex_meta.world import World, WorldConfig
-from tests.world.play import flat, play, random_actions
+from tests.tasks.worlds import slot
+from tests.world.play import flat, random_actions
 from tests.world.test_masked import assert_steps_look_at_nothing
 
 ROWS = 6
-CLASSES = ("CatchUnderarm", "BottleCap")
+CLASSES = ("CatchUnderarm", "BottleCap-v2")
 """A free body between moving bases; an object with joints."""
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
 
 def make(engine: str) -> World:
-    slots = [slot for slot in Benchmark("MT20").make_world(num_envs=20, device="cpu").slots if slot.name in CLASSES]
+    slots = [slot(registry.get(name)) for name in CLASSES]
     return World(slots, WorldConfig(ROWS, engine=engine, observation="one-hot", task_sampling="uniform", threads=1))
 
 
@@ -35,18 +36,6 @@ def close(a: Tensor, b: Tensor, tolerance: float = 1e-5) -> bool:
     return bool((a - b).abs().max() < tolerance)
 
 
-def test_shapes_types_and_spaces(world: World, reference: World) -> None:
-    obs, _ = world.reset(seed=0)
-    assert world.observation_space == reference.observation_space and world.action_space == reference.action_space
-    assert world.observation_space.contains(obs.numpy())
-    expected, _ = reference.reset(seed=0)
-    action = random_actions(world, 1)[0]
-    found, wanted = flat(world.step(action)), flat(reference.step(action))
-    assert found.keys() == wanted.keys() and obs.dtype == expected.dtype
-    for name, value in wanted.items():
-        assert (found[name].shape, found[name].dtype) == (value.shape, value.dtype), name
-
-
 def test_a_seed_means_the_same_starts_and_tasks_as_on_c(world: World, reference: World) -> None:
     for seed in (0, 3):
         obs, expected = world.reset(seed=seed)[0], reference.reset(seed=seed)[0]
@@ -61,6 +50,9 @@ def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -
     ended = torch.zeros(ROWS, dtype=torch.bool)
     for action in random_actions(world, 80):
         found, wanted = flat(world.step(action)), flat(reference.step(action))
+        assert found.keys() == wanted.keys()
+        if not ended.any():
+            assert close(found["reward"], wanted["reward"], 1e-2)
         if not torch.equal(found["info/_final_obs"], wanted["info/_final_obs"]):
             break  # an egg fell a step earlier in single precision
         now = found["info/_final_obs"]
@@ -68,18 +60,6 @@ def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -
         assert close(found["obs"][now], wanted["obs"][now]) if now.any() else True
         assert torch.equal(found["obs"][~now], found["info/final_obs"][~now])
     assert ended[:3].any(), "an egg was dropped"
-
-
-def test_a_broken_row_is_told_and_starts_anew(world: World) -> None:
-    world.reset(seed=0)
-    play(world, random_actions(world, 3))
-    part = world.parts[0]
-    part.group.engine.qpos[1, 30] = torch.nan
-    step = flat(world.step(random_actions(world, 1, seed=1)[0]))
-    broken = int(part.group.env_ids[1])
-    assert step["info/unstable"].tolist() == [row == broken for row in range(ROWS)]
-    assert bool(step["truncated"][broken]) and all(bool(value.isfinite().all()) for value in step.values())
-    assert not flat(world.step(random_actions(world, 1)[0]))["info/unstable"].any()
 
 
 def test_a_step_looks_at_no_number(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

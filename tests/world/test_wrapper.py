@@ -155,27 +155,6 @@ def test_video_of_stable_baselines3(films: dict[str, list[np.ndarray]], tmp_path
     assert set(np.unique(frames[0])) == {0, 1, 2, 3}
 
 
-def test_an_end_is_reported_once_where_nothing_resets_by_itself() -> None:
-    """Of a DISABLED world, whose own flags stay until a reset."""
-    env = wrap.RecordEpisodeStatistics(NumpyWorld(points("DISABLED")), buffer_length=10_000)
-    env.reset(seed=0)
-    action = np.full((ROWS, 2), 0.3, np.float32)
-    ends, told = np.zeros(ROWS, int), 0
-    for _ in range(50):
-        _, reward, terminated, truncated, info = env.step(action)
-        assert not reward[ends > 0].any()
-        ends += terminated | truncated
-        told += int(info["_episode"].sum()) if "episode" in info else 0
-    assert (ends == 1).all() and env.episode_count == told == ROWS
-    first = np.arange(ROWS) < 3
-    env.reset(options={"reset_mask": first.copy()})
-    for _ in range(15):
-        _, _, terminated, truncated, _ = env.step(action)
-        ends += terminated | truncated
-    assert ends.tolist() == [2] * 3 + [1] * (ROWS - 3) and env.episode_count == ROWS + 3
-    assert max(env.length_queue) <= 12
-
-
 def test_other_wrappers_of_the_numpy_form() -> None:
     env = wrap.NormalizeReward(wrap.RescaleAction(suite_world("MT4", 8).to_numpy(), 0.0, 1.0))
     env.reset(seed=0)

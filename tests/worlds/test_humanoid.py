@@ -55,22 +55,3 @@ def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeyp
     flags += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
     assert main(["run", *flags, "--evaluate-every", "1", "--run-dir", str(tmp_path / "run")]) == 0
     assert len(seen) == 1 and len(set(seen[0].tolist())) == 10, "ten starts, not one ten times"
-
-
-@pytest.mark.parametrize(
-    ("flags", "told"),
-    [("--points 8", "--points"), ("--object mug", "--object"), ("--base moving", "--base"), ("--engine warp", "CPU")],
-)
-def test_what_is_of_hands_is_refused(flags: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    known = ["--task", HUMANOID, "--num-envs", "4", "--device", "cpu", "--algo", "ppo"]
-    assert main(["run", *known, *flags.split(), "--run-dir", str(tmp_path / "run")]) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert told in last and HUMANOID in last
-
-
-@pytest.mark.parametrize("more", [["--tiled"], []])
-@pytest.mark.parametrize("named", [["--task", HUMANOID], ["--suite", "metaworld/MT10"]])
-def test_there_are_no_pictures_of_it(named, more, tmp_path, capsys):
-    assert main(["render", *named, *more, "--out", str(tmp_path / "a.png")]) == 2
-    error = capsys.readouterr().err
-    assert f"got {named[1]}. Name another." in error and error.count("\n") == 1

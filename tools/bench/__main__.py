@@ -6,30 +6,24 @@ A kind is a function; the function's arguments are the flags.
 import json
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import tyro
 
 from bidex_meta.cli.tables import plain_table, print_table
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
 from tools.bench.against import against
 from tools.bench.capacity import capacity
 from tools.bench.field import field
 from tools.bench.gpu import gpu
 from tools.bench.stability import stability
 
-KINDS: dict[str, Callable[..., dict[str, Any]]] = {
-    kind.__name__: kind for kind in (against, field, stability, capacity, gpu)
-}
+KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in (against, field, stability, capacity, gpu)}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure and print; ``--json`` may stand anywhere.
-
-    Raises:
-        SystemExit: With a one-line error message, or after tyro's help text.
-    """
+    """Measure and print; ``--json`` may stand anywhere. An error is one line and ends the process."""
     flags = [word for word in arguments if word != "--json"]
     try:
         result = tyro.extras.subcommand_cli_from_dict(KINDS, args=flags, prog="python -m tools.bench")

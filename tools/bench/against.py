@@ -21,7 +21,7 @@ from typing import Any
 import tyro
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import write_json
+from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.versions import git_state
 from bidex_meta.utils.memory import usable_cores
 
@@ -40,7 +40,7 @@ def against(
     threads: int | None = None,
     seed: int = 0,
     out: Path | None = None,
-) -> dict[str, Any]:
+) -> Json:
     """Compare the speed of a suite's world, and of single classes, with other code on the same interpreter.
 
     Args:
@@ -65,9 +65,13 @@ def against(
         CalledProcessError: git does not know the commit.
     """
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or usable_cores(), "steps": steps}
+    if Path(other).is_dir():
+        commit = None
+    else:
+        commit = _git("rev-parse", "--verify", f"{other}^{{commit}}").decode().strip()
     with checkout(other) as folder, _Worker(folder) as old, _Worker(HERE) as new:
-        result: dict[str, Any] = {
-            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(other), "dirty": False},
+        result: Json = {
+            "old": git_state(folder / "bidex_meta") or {"commit": commit, "dirty": False},
             "new": git_state(HERE / "bidex_meta"),
             **setting,
             "table": [],
@@ -83,7 +87,7 @@ def against(
     return result
 
 
-def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, repeats: int) -> dict[str, Any]:
+def _pairs(old: "_Worker", new: "_Worker", world: Json, steps: int, repeats: int) -> Json:
     """Return one row of the table: both sides' speeds of one world, measured in alternating repeats."""
     physics = {worker: worker.ask("build", **world) for worker in (old, new)}
     walls: dict[_Worker, list[float]] = {old: [], new: []}
@@ -118,13 +122,6 @@ def checkout(other: str) -> Iterator[Path]:
             with tarfile.open(fileobj=io.BytesIO(_git("archive", other))) as archive:
                 archive.extractall(folder, filter="data")
         yield folder
-
-
-def commit_name(other: str) -> str | None:
-    """Return the full name of a commit; None for a folder."""
-    if Path(other).is_dir():
-        return None
-    return _git("rev-parse", "--verify", f"{other}^{{commit}}").decode().strip()
 
 
 def _git(*arguments: str) -> bytes:
@@ -162,7 +159,7 @@ class _Worker:
         self._process.kill()
         self._process.communicate()
 
-    def ask(self, name: str, **given: Any) -> Any:
+    def ask(self, name: str, **given: object) -> Any:
         """Call the worker's method of this name and return the method's result."""
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # a dead worker is reported below

@@ -1,13 +1,13 @@
 """Measure how many contacts and constraint rows the classes need, the source of ``TaskClass.needs``."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.runs.atomic import Json
 from bidex_meta.world import World
 from tools.bench.stability import rough_actions, variants
 
@@ -22,7 +22,7 @@ def capacity(
     num_envs: int = 256,
     threads: int | None = None,
     seed: int = 0,
-) -> dict[str, Any]:
+) -> Json:
     """Count the contacts and constraint rows of a simulation under the rough actions of ``stability``.
 
     C MuJoCo counts contacts and constraint rows after every step of every environment. mujoco_warp counts candidate
@@ -48,7 +48,7 @@ def capacity(
     return result
 
 
-def _capacity(made: World, steps: int, seed: int) -> dict[str, Any]:
+def _capacity(made: World, steps: int, seed: int) -> Json:
     from bidex_meta.engine.capacity import Capacity
     from bidex_meta.engine.warp import WarpEngine
 
@@ -75,7 +75,7 @@ def _capacity(made: World, steps: int, seed: int) -> dict[str, Any]:
     return {name: _summary(torch.cat(values)) for name, values in found.items()}
 
 
-def _summary(counts: Tensor) -> dict[str, Any]:
+def _summary(counts: Tensor) -> Json:
     # torch.quantile takes no more than 16 million numbers; sorting does.
     ordered = counts.sort().values
     last = len(ordered) - 1

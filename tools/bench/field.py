@@ -5,6 +5,7 @@ import math
 import statistics
 import time
 from collections.abc import Iterator
+from itertools import chain
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from gymnasium.vector import VectorEnv
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.metaworld.batched import MetaWorldWorld
+from bidex_meta.runs.atomic import Json
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.memory import usable_cores
 
@@ -25,7 +27,7 @@ _SUITES = ("MT4", "MT20")
 _INSTALL = "pip install gymnasium-robotics"
 
 
-def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int = 0) -> dict[str, Any]:
+def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int = 0) -> Json:
     """Measure speed under random actions with resets: Meta-World's MT10, gymnasium-robotics' hand, our MT4 and MT20.
 
     Everything runs in one process on one thread; pin the process to a core (``taskset -c 0``). Tasks and the duration
@@ -43,7 +45,8 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
         same over CPU seconds (which other work on the core sways less), seconds of physics simulated in a second, and
         the ratio of env-steps/s to Meta-World's own vector environment.
     """
-    rng, skipped = np.random.default_rng(seed), {}
+    rng = np.random.default_rng(seed)
+    skipped = {}
     entries = [*_metaworld(seed), *_robot_hands(skipped), *_ours(num_envs, seed)]
     for _, vector, _, _ in entries:
         vector.reset(seed=seed)
@@ -103,22 +106,23 @@ def _mend(utils: Any) -> None:
 def _ours(num_envs: int, seed: int) -> Iterator[Entry]:
     for suite in _SUITES:
         made = Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=1)
-        dofs = [member.scene.model.nv for part in made.parts for member in part.group.members]
-        yield f"bidex-meta {suite}", made, 1.0 / CONTROL_RATE, dofs
+        members = chain.from_iterable(part.group.members for part in made.parts)
+        yield f"bidex-meta {suite}", made, 1.0 / CONTROL_RATE, [member.scene.model.nv for member in members]
 
 
 def _speed(vector: VectorEnv, steps: int, rng: np.random.Generator) -> Speed:
     """Measure how fast a vector environment steps uniform actions."""
     shape = math.ceil(steps / vector.num_envs), vector.num_envs, *(vector.single_action_space.shape or ())
     actions = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     for action in actions:
         vector.step(action)
     done = shape[0] * shape[1]
     return done / (time.perf_counter() - wall), done / (time.process_time() - cpu)
 
 
-def _row(entry: Entry, speeds: list[Speed], first: list[Speed]) -> dict[str, Any]:
+def _row(entry: Entry, speeds: list[Speed], first: list[Speed]) -> Json:
     name, vector, seconds, dofs = entry
     least, most = min(dofs), max(dofs)
     wall, cpu = (statistics.median(column) for column in zip(*speeds, strict=True))

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import psutil
 import torch
@@ -13,7 +12,7 @@ import torch
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.learners import choose_preset, learner_kind
-from bidex_meta.runs.atomic import write_json
+from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.world import World
 
 _SIZES = (1024, 8192, 32768, 131072)
@@ -33,7 +32,7 @@ def gpu(
     seed: int = 0,
     out: Path | None = None,
     learning: bool = False,
-) -> dict[str, Any]:
+) -> Json:
     """Measure the speed of a suite and of single classes over the number of environments.
 
     Args:
@@ -64,7 +63,7 @@ def gpu(
     return {"setting": setting, "rows": rows}
 
 
-def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
+def _known(out: Path | None, setting: Json) -> Json:
     if out is None or not out.exists():
         return {}
     stored = json.loads(out.read_text())
@@ -75,7 +74,7 @@ def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
 
 def _measured(
     subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
-) -> dict[str, Any]:
+) -> Json:
     before = _memory(device)
     if whole:
         made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine)
@@ -84,7 +83,7 @@ def _measured(
     made.reset(seed=seed)
     _random_steps(made, max(steps, _RECORDED))
     seconds = _random_steps(made, steps)
-    row: dict[str, Any] = {
+    row: Json = {
         "env_steps_per_s": round(size * steps / seconds),
         "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
         "stages": _stages(made, steps),

@@ -1,12 +1,12 @@
 """Test if the physics is stable under rough actions."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark, make_task_world
+from bidex_meta.runs.atomic import Json
 from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import replay
@@ -31,7 +31,7 @@ def stability(
     seed: int = 0,
     device: str = "cpu",
     engine: str = "auto",
-) -> dict[str, Any]:
+) -> Json:
     """Test if the physics is stable under rough actions, and under actions that solve the task.
 
     Half the environments draw uniform actions at every step; the other half hold each action at -1 or 1 for 5 to 40
@@ -74,11 +74,15 @@ def variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
         classes = benchmark.task_classes("train") | benchmark.task_classes("test")
         version = {name: "-v2" if task_class.rules == V2 else "" for name, task_class in classes.items()}
         return [(name + version[name], task_class.moving_base) for name, task_class in classes.items()]
-    names = [task] if task else registry.names()
-    return [(n, moving) for n in names for moving in (True, False) if moving or not registry.get(n).moving_base]
+    found = []
+    for name in [task] if task else registry.names():
+        found.append((name, True))
+        if not registry.get(name).moving_base:
+            found.append((name, False))
+    return found
 
 
-def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
+def _stability(made: World, steps: int, seed: int) -> Json:
     generator = torch.Generator().manual_seed(seed)
     made.reset(seed=seed)
     engine = made.parts[0].group.engine

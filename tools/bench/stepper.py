@@ -27,11 +27,10 @@ class Stepper:
             raise RuntimeError(f"expected bidex_meta of {checkout}, but Python imports that of {found}")
         return list(bidex_meta.Benchmark(suite, seed=seed).train_classes)
 
-    def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[Any]:
+    def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[list[float]]:
         """Make and reset the world of a suite, or of one of the suite's classes.
 
-        Returns:
-            Time step (seconds) and substeps of each engine batch; empty if the code stores these values elsewhere.
+        Returns time step (seconds) and substeps of each engine batch; empty if the code stores them elsewhere.
         """
         from bidex_meta import Benchmark
 
@@ -41,7 +40,7 @@ class Stepper:
         if task is None:
             self._world = benchmark.make_world("train", device="cpu", num_envs=num_envs, threads=threads)
         else:
-            self._world = _world_of([_slot(benchmark, task)], num_envs, seed=seed, threads=threads)
+            self._world = _world_of(_slot(benchmark, task), num_envs, seed=seed, threads=threads)
         self._world.reset(seed=seed)
         try:
             parts = [(part.group.members[0].scene.model, part.substeps) for part in self._world.parts]
@@ -50,11 +49,7 @@ class Stepper:
             return []
 
     def step(self, steps: int, seed: int) -> dict[str, float]:
-        """Step all rows under uniform actions, once more than is measured.
-
-        Returns:
-            ``wall`` and ``cpu`` (of all threads), seconds.
-        """
+        """Step all rows under uniform actions, once more than is measured; return ``wall`` and ``cpu`` seconds."""
         import torch
 
         generator = torch.Generator().manual_seed(seed)
@@ -67,13 +62,13 @@ class Stepper:
         return {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
 
 
-def _world_of(slots: list[Any], num_envs: int, **settings: Any) -> Any:
+def _world_of(slot: Any, num_envs: int, **settings: object) -> Any:
     from bidex_meta import world
 
     module: Any = world
     if not hasattr(module, "WorldConfig"):
-        return module.World(slots, num_envs, **settings)  # older code takes the settings themselves
-    return module.World(slots, module.WorldConfig(num_envs, **settings))
+        return module.World([slot], num_envs, **settings)  # older code takes the settings themselves
+    return module.World([slot], module.WorldConfig(num_envs, **settings))
 
 
 def _slot(benchmark: Any, task: str) -> Any:

@@ -1,6 +1,7 @@
 """``python -m tools.pages [--check] [PAGE...]`` (``make results``): fill pages, from the repository's root."""
 
 import sys
+from itertools import chain
 from pathlib import Path
 
 import tyro
@@ -16,7 +17,7 @@ def main(pages: tyro.conf.Positional[tuple[Path, ...]] = (), check: bool = False
         check: Write nothing; exit code 1 if a file is out of date.
     """
     named = pages or (Path("README.md"), *sorted(Path("docs/results").glob("*.md")))
-    changed = [path for page in named for path in fill(page, Path("results/data"), check)]
+    changed = list(chain.from_iterable(fill(page, Path("results/data"), check) for page in named))
     print("\n".join(map(str, changed)) or "nothing changed")
     sys.exit(check and bool(changed))
 

@@ -12,6 +12,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from PIL import Image
@@ -35,6 +36,7 @@ _TABLES = {
     "offline": offline_table,
     "rows": rows_table,
 }
+_WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table}
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "shot-curves": (shots_figure, "Success against exploring episodes"),
@@ -48,28 +50,17 @@ _DIGEST = "Description"
 class Block:
     """The options of a block."""
 
-    study: str = ""
-    """Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``)."""
+    study: str = ""  # Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``).
     show: str = "table"
-    on: str | None = None
-    """Only this suite or class."""
-    split: str | None = None
-    """Only this split of meta-tests."""
+    on: str | None = None  # Only this suite or class.
+    split: str | None = None  # Only this split of meta-tests.
 
 
 def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
-    """Update a page's blocks and pictures from the data.
+    """Update the blocks and pictures of a Markdown page from the studies' files in the folder ``data``.
 
-    Args:
-        page: A file of Markdown.
-        data: Folder of the studies' files.
-        check: Write nothing.
-
-    Returns:
-        The files that are (or, with ``check``, would be) written; none if everything is up to date.
-
-    Raises:
-        BidexError: A block does not end, names an unknown study or table, or a data file cannot be read.
+    Returns the files that are written, or, with ``check``, would be written. Raises BidexError if a block does not end
+    or names an unknown study or table, or if a data file cannot be read.
     """
     text, changed = page.read_text(), []
     if text.count("<!-- results:") != text.count("<!-- end -->"):
@@ -96,16 +87,13 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
     if block.show == "references":
         yield from tables.references_table()
         return
-    if block.show == "validity":
-        yield from validity_table(block.on or "", data)
-        return
-    if block.show == "leaderboard":
-        yield from leaderboard_table(block.on or "", data)
+    if block.show in _WITHOUT_STUDY:
+        yield from _WITHOUT_STUDY[block.show](block.on or "", data)
         return
     if not block.study:
         raise ValueError("expected the name of a study")
     names = block.study.split(",")
-    studies = [study for name in names for study in read_studies(data, name, block.on, block.split)]
+    studies = list(chain.from_iterable(read_studies(data, name, block.on, block.split) for name in names))
     if block.show == "best":
         yield from tables.best_table(studies) if studies else ()
         return

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from math import hypot
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from bidex_meta.utils.files import read_json
 from tools.pages.studies import Study
 from tools.pages.tables import mean_and_range, table
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 CONTROL = "control"
 """The arm that others are compared with: same starting policy and adaptation, no meta-training."""
 _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "return", "gain [95 %]", "over control [95 %]")
@@ -26,13 +30,8 @@ def gains_table(study: Study) -> Iterator[str]:
 
     A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
     the difference to the gain of the control's run of the same seed; half widths add as independent errors (the root
-    of the sum of squares).
-
-    Args:
-        study: Runs with a meta-test; the test split if the study names none.
-
-    Raises:
-        BidexError: A run has no meta-test of the split, or an arm several runs of one seed.
+    of the sum of squares). The split is that of the study, by default ``test``. Raises BidexError if a run has no
+    meta-test of the split, or if an arm has several runs of one seed.
     """
     split = study.split or "test"
     parts: dict[tuple[str, int], tuple[StoredRun, SplitSummary]] = {}
@@ -44,15 +43,18 @@ def gains_table(study: Study) -> Iterator[str]:
         if key in parts:
             raise BidexError(f"{run.path} and {parts[key][0].path.name} are both seed {key[1]} of the arm {key[0]!r}.")
         parts[key] = run, part
-    order, rows = sorted(parts, key=lambda key: (key[0] == CONTROL, *key)), []
-    for name in dict.fromkeys(name for _, part in parts.values() for name in part.after.classes):
-        for arm, seed in order:
+    rows = []
+    for name in dict.fromkeys(chain.from_iterable(part.after.classes for _, part in parts.values())):
+        for arm, seed in sorted(parts, key=lambda key: (key[0] == CONTROL, *key)):
             run, part = parts[arm, seed]  # all runs of a study cover the same classes
-            gain, control = _gain(part, name), None if arm == CONTROL else parts.get((CONTROL, seed))
+            gain = _gain(part, name)
+            over = ""
+            if arm != CONTROL and (CONTROL, seed) in parts:
+                _, control = parts[CONTROL, seed]
+                over = _bold(_over(gain, _gain(control, name)))
             rows.append([
                 name, arm, str(seed), f"{run.content['steps']:,}", f"{part.shots} × {part.rollouts}",
-                _both(part, name, "success", 100.0, " %"), _both(part, name, "mean_return"),
-                _bold(gain), "" if control is None else _bold(_over(gain, _gain(control[1], name))),
+                _both(part, name, "success", 100.0, " %"), _both(part, name, "mean_return"), _bold(gain), over,
             ])  # fmt: skip
     return table(_HEAD, rows)
 
@@ -61,11 +63,8 @@ def shots_table(*studies: Study) -> Iterator[str]:
     """Yield a row per arm and per line of a ladder.
 
     A row has the success after each shot, as mean over seeds (least to most), and the return before the first shot and
-    after the last.
-
-    Args:
-        studies: Runs with a meta-test of ``Study.split`` or of a single split. One study has rows per class. With
-            several studies each has one row per arm, the mean over the study's classes.
+    after the last. The runs need a meta-test of ``Study.split`` or of a single split. One study has rows per class.
+    With several studies each has one row per arm, the mean over the study's classes.
     """
     found = _by_shot(studies)
     most = max(len(seeds.shares[0]) for seeds in found.values())
@@ -80,15 +79,13 @@ def shots_table(*studies: Study) -> Iterator[str]:
     return table([first, "arm", "seeds", "steps", "before", *(f"after {n}" for n in range(1, most)), "return"], rows)
 
 
-def shots_figure(*studies: Study) -> Any:
+def shots_figure(*studies: Study) -> "Figure":
     """Draw success against exploring episodes: a panel per class or suite, a line per arm.
 
-    A policy that knows the goal has one value.
-
-    Args:
-        studies: As in ``shots_table``.
+    A policy that knows the goal has one value. Studies are as in ``shots_table``.
     """
-    found, panels = _by_shot(studies), dict[str, list[plots.Group]]()
+    found = _by_shot(studies)
+    panels: dict[str, list[plots.Group]] = {}
     most = max(len(seeds.shares[0]) for seeds in found.values())
     for (name, arm), seeds in found.items():
         shares = np.array([each * most if len(each) == 1 else each for each in seeds.shares])
@@ -106,11 +103,9 @@ def shots_figure(*studies: Study) -> Any:
 class _Seeds:
     """Results of an arm's seeds, or of a ladder's line, on one class or suite."""
 
-    shares: list[list[float]] = field(default_factory=list)
-    """Success before and after each shot."""
+    shares: list[list[float]] = field(default_factory=list)  # Success before and after each shot.
     steps: list[int] = field(default_factory=list)
-    returns: list[list[float]] = field(default_factory=list)
-    """Before, and after the last shot."""
+    returns: list[list[float]] = field(default_factory=list)  # Before, and after the last shot.
 
 
 def _by_shot(studies: Sequence[Study]) -> dict[tuple[str, str], _Seeds]:
@@ -184,5 +179,4 @@ def _both(part: SplitSummary, name: str, measure: str, factor: float = 1.0, unit
 def _bold(found: Estimate) -> str:
     """Format an estimate, in bold if its interval excludes zero."""
     value, space, ends = found.text(form="+.3g").partition(" ")
-    sure = found.interval is not None and (found.interval[0] > 0 or found.interval[1] < 0)
-    return f"**{value}**{space}{ends}" if sure else value + space + ends
+    return f"**{value}**{space}{ends}" if found.excludes_zero else value + space + ends

@@ -3,16 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from bidex_meta.evaluation.leaderboard import (
-    PROFILE,
-    Entry,
-    check_apart,
-    improvement,
-    profile,
-    read_entry,
-    success_iqm,
-    success_rates,
-)
+from bidex_meta.evaluation import leaderboard as board
+from bidex_meta.evaluation.leaderboard import Entry
 from bidex_meta.evaluation.statistics import iqm
 from bidex_meta.suite import load_suite, suite_names
 from tools.pages.tables import table
@@ -23,28 +15,29 @@ def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
 
     Each row has the probability that its entry is better than the entry of the next row.
     """
-    entries = {path: read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))}
-    check_apart(entries)
+    entries = {path: board.read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))}
+    board.check_apart(entries)
     version = load_suite(suite).version if suite in suite_names() else None
     comparable = [entry for entry in entries.values() if (entry.suite, entry.version) == (suite, version)]
     ranked = sorted(comparable, key=_rank, reverse=True)
     rows = [_row(place, entry, ranked[place:]) for place, entry in enumerate(ranked, 1)]
-    above = [f"> {100 * rate:.0f} %" for rate in PROFILE]
+    above = [f"> {100 * rate:.0f} %" for rate in board.PROFILE]
     head = ["", "entry", "success, IQM", "other tasks, IQM", *above, "above the next", "runs", "steps"]
     yield from table([*head, "stated: hours", "stated: trained on", "stated: commit"], rows) if rows else ()
 
 
 def _rank(entry: Entry) -> float:
-    return float(iqm(success_rates(entry.success(entry.own)).ravel()))
+    return float(iqm(board.success_rates(entry.success(entry.own)).ravel()))
 
 
 def _row(place: int, entry: Entry, below: list[Entry]) -> list[str]:
-    own, others, stated = entry.success(entry.own), entry.success(entry.others), entry.stated
-    better = improvement(own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
+    own = entry.success(entry.own)
+    stated = entry.stated
+    better = board.improvement(own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
     return [
         str(place), f"{entry.name} ({entry.algorithm})" if entry.name != entry.algorithm else entry.name,
-        *(success_iqm(part).text(100.0, " %") for part in (own, others)),
-        *(f"{100 * profile(own, rate):.0f} %" for rate in PROFILE), better,
+        *(board.success_iqm(part).text(100.0, " %") for part in (own, entry.success(entry.others))),
+        *(f"{100 * board.profile(own, rate):.0f} %" for rate in board.PROFILE), better,
         str(len(entry.weights)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
         f"{sum(stated.hours) / len(stated.hours):.2f}", stated.device,
         ", ".join(sorted({commit or "unknown" for commit in stated.commit})),

@@ -5,8 +5,8 @@ evaluations. The expert is the study's online run on the same class. Without one
 evaluations.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -25,11 +25,7 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 def offline_table(study: Study) -> Iterator[str]:
     """Yield a table of data sets by learners: score as mean over seeds (least to most), and mean success.
 
-    Args:
-        study: Runs on data sets; its online runs are the experts.
-
-    Raises:
-        BidexError: Seeds of one cell differ in more than the seed.
+    The study's online runs are the experts. Raises BidexError if seeds of one cell differ in more than the seed.
     """
     cells: dict[str, dict[str, list[StoredRun]]] = {}
     experts = []
@@ -39,17 +35,17 @@ def offline_table(study: Study) -> Iterator[str]:
             cells.setdefault(_kind(config.dataset), {}).setdefault(config.algo, []).append(run)
         else:
             experts.append(run)
-    learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
+    learners = _ordered(set().union(*cells.values()), LEARNERS)
     ends = _ends(study.runs, experts)
-    seeds = sorted({len(runs) for row in cells.values() for runs in row.values()})
-    kinds = _ordered(cells, KINDS)
-    yield from table(
-        ["data", *learners], [[kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)] for kind in kinds]
-    )
+    rows = []
+    for kind in _ordered(cells, KINDS):
+        rows.append([kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)])
+    yield from table(["data", *learners], rows)
+    seeds = sorted(set(map(len, chain.from_iterable(row.values() for row in cells.values()))))
     updates = []
     for algo in learners:
-        found = {run.content["steps"] for row in cells.values() for run in row.get(algo, [])}
-        updates.append(f"{algo} {_listed(sorted(found))}")
+        runs = chain.from_iterable(row.get(algo, []) for row in cells.values())
+        updates.append(f"{algo} {_listed(sorted({run.content['steps'] for run in runs}))}")
     yield ""
     yield f"Seeds: {_listed(seeds)}. Updates: {'; '.join(updates)}."
     if ends is not None:
@@ -91,7 +87,7 @@ def _mean_of(classes: Mapping[str, ClassSummary], name: str) -> float:
     return float(np.mean(np.array([getattr(row, name) for row in classes.values()], dtype=float)))
 
 
-def _ordered(names: Any, known: Sequence[str]) -> list[str]:
+def _ordered(names: Iterable[str], known: Sequence[str]) -> list[str]:
     return sorted(names, key=lambda name: (known.index(name) if name in known else len(known), name))
 
 

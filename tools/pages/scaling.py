@@ -1,7 +1,8 @@
 """Numbers of parallel environments by learners, at equal environment steps (the paper's Figure 6)."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from itertools import chain
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,37 +13,30 @@ from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, random_rows, table
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def rows_table(study: Study) -> Iterator[str]:
     """Yield a table of environments by learners: the evaluation's return, as mean over seeds (least to most).
 
-    Args:
-        study: Runs on one class.
-
-    Raises:
-        BidexError: Seeds of one cell differ in more than the seed, or there are several classes.
+    Raises BidexError if seeds of one cell differ in more than the seed, or if the runs are on several classes.
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))
     counts = sorted({envs for _, envs in cells})
-    yield from table(
-        ["environments", *algos],
-        [[f"{envs:,}", *(_cell(cells.get((algo, envs), [])) for algo in algos)] for envs in counts],
-    )
-    steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
+    rows = [[f"{envs:,}", *(_cell(cells.get((algo, envs), [])) for algo in algos)] for envs in counts]
+    yield from table(["environments", *algos], rows)
+    steps = sorted({run.content["steps"] for run in study.runs})
     seeds = sorted({len(runs) for runs in cells.values()})
     yield ""
-    returns = [row.mean_return for rows in random_rows(study).values() for row in rows]
+    returns = [row.mean_return for row in chain.from_iterable(random_rows(study).values())]
     random = f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
     yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {random}"
 
 
-def rows_figure(study: Study) -> Any:
-    """Draw the return over training: one panel per learner, one line per number of environments.
-
-    Raises:
-        BidexError: As for ``rows_table``, or matplotlib is missing.
-    """
+def rows_figure(study: Study) -> "Figure":
+    """Draw the return over training: one panel per learner, one line per number of environments."""
     panels: dict[str, list[plots.Group]] = {}
     for (algo, envs), runs in sorted(_cells(study).items()):
         panels.setdefault(algo, []).append((f"{envs} envs", curves_of(runs)))
@@ -62,7 +56,7 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
 
 
 def _class(study: Study) -> str:
-    names = {name for run in study.runs for name in run.evaluation().results}
+    names = set[str]().union(*(run.evaluation().results for run in study.runs))
     if len(names) != 1:
         raise BidexError(
             f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}."

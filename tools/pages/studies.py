@@ -5,8 +5,9 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
 from bidex_meta.runs.stored import StoredRun, read_study
 from bidex_meta.utils.plugins import short_name
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
 """Config entries in which seeds of an arm may differ."""
 
@@ -27,10 +31,8 @@ _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", 
 class Arm:
     """One setting of a study, on several seeds."""
 
-    group: Group
-    """Final evaluations of its runs, labelled with its name."""
-    runs: list[StoredRun]
-    """Its runs."""
+    group: Group  # Final evaluations of its runs, labelled with its name.
+    runs: list[StoredRun]  # Its runs.
 
     @cached_property
     def success(self) -> Estimate:
@@ -59,21 +61,16 @@ class Arm:
 class Study:
     """Arms on one suite or class."""
 
-    name: str
-    """Name of its file."""
-    on: str
-    """The suite or class."""
-    runs: list[StoredRun]
-    """Sorted by name."""
-    split: str | None = None
-    """Split of a meta-test to show; None: all."""
+    name: str  # Name of its file.
+    on: str  # The suite or class.
+    runs: list[StoredRun]  # Sorted by name.
+    split: str | None = None  # Split of a meta-test to show; None: all.
 
     @cached_property
     def arms(self) -> list[Arm]:
-        """Arms of the study, the best first.
+        """Return the arms of the study, the best first.
 
-        Raises:
-            BidexError: Runs of an arm differ in more than the seed, or do not cover the same classes.
+        Raises BidexError if runs of an arm differ in more than the seed, or do not cover the same classes.
         """
         by_arm: dict[str, list[StoredRun]] = {}
         for run in self.runs:
@@ -105,23 +102,15 @@ class Study:
     @property
     def classes(self) -> list[str]:
         """All classes of the study's arms."""
-        return list(dict.fromkeys(name for arm in self.arms for name in arm.group.classes))
+        return list(dict.fromkeys(chain.from_iterable(arm.group.classes for arm in self.arms)))
 
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:
     """Return the studies in ``data/name.json``, one for each set of classes; [] if there is no such file.
 
     Suites with the same classes, such as a suite with other discounts, form one study. Runs on single classes join a
-    suite's study if an arm covers all classes of the suite; otherwise they form one study per class.
-
-    Args:
-        data: Folder of the studies' files.
-        name: Name of the study.
-        on: Only this suite or class.
-        split: See :class:`Study`.
-
-    Raises:
-        BidexError: The file cannot be read.
+    suite's study if an arm covers all classes of the suite; otherwise they form one study per class. ``on`` restricts
+    the result to a suite or class. Raises BidexError if the file cannot be read.
     """
     file = data / f"{name}.json"
     runs = read_study(file) if file.exists() else []
@@ -166,7 +155,7 @@ def classes_of_random(run: StoredRun) -> dict[str, ClassSummary]:
     return {}
 
 
-def curves_figure(study: Study) -> Any:
+def curves_figure(study: Study) -> "Figure":
     """Draw learning curves, one line per arm."""
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 

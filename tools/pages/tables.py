@@ -1,6 +1,7 @@
 """Tables of studies in Markdown: arms, classes, the best runs, references."""
 
 from collections.abc import Iterator, Sequence
+from itertools import chain, product
 
 import numpy as np
 
@@ -63,16 +64,16 @@ def arms_table(study: Study) -> Iterator[str]:
     head = ["arm", "seeds", "steps", *measures, *classes, "parameters", "hours"]
     rows = []
     for arm in study.arms:
-        group, scores = arm.group, arm.group.scores
+        group = arm.group
         means = dict(zip(group.classes, group.returns.mean(axis=0), strict=True))
         measured = [_over_seeds(group.success), _over_seeds(arm.others)]
         if not means_only:
-            measured = [arm.success.text(100.0, " %"), "–" if scores is None else iqm_over_seeds(scores).text()]
-        rows.append([
-            group.label, str(len(group.seeds)), group.steps_text(), *measured,
-            *(f"{means[name]:.4g}" if name in means else "–" for name in classes),
-            "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}",
-        ])  # fmt: skip
+            score = "–" if group.scores is None else iqm_over_seeds(group.scores).text()
+            measured = [arm.success.text(100.0, " %"), score]
+        returns = [f"{means[name]:.4g}" if name in means else "–" for name in classes]
+        parameters = "–" if arm.parameters is None else f"{arm.parameters:,}"
+        start = [group.label, str(len(group.seeds)), group.steps_text()]
+        rows.append([*start, *measured, *returns, parameters, f"{group.hours:.2f}"])
     random = random_rows(study)
     if random.keys() == set(study.classes):
         success = np.array([[np.mean([row.success for row in random[name]]) for name in study.classes]])
@@ -107,13 +108,13 @@ def _classes_as_rows(study: Study) -> Iterator[str]:
     """Yield one row per class, then the mean: for each arm success on own and other tasks, return and score."""
     columns: dict[str, list[str]] = {"class": [*study.classes, "mean"]}
     for arm in study.arms:
-        group, before = arm.group, f"{arm.group.label}: " if len(study.arms) > 1 else ""
-        measured = {"success": (group.success, 100.0, " %"), "other tasks": (arm.others, 100.0, " %")}
-        measured |= {"return": (group.returns, 1.0, ""), "score": (group.scores, 1.0, "")}
-        for title, (values, factor, unit) in measured.items():
+        group = arm.group
+        before = f"{group.label}: " if len(study.arms) > 1 else ""
+        measured = {"success": (group.success, 100.0, ".1f", " %"), "other tasks": (arm.others, 100.0, ".1f", " %")}
+        measured |= {"return": (group.returns, 1.0, ".4g", ""), "score": (group.scores, 1.0, ".0f", "")}
+        for title, (values, factor, form, unit) in measured.items():
             if values is None:
                 continue
-            form = ".4g" if title == "return" else ".1f" if unit else ".0f"
             by_class = dict(zip(group.classes, factor * values.T, strict=True))
             cells = [mean_and_range(by_class[name], form, unit) if name in by_class else "–" for name in study.classes]
             mean = "" if title == "return" else mean_and_range(factor * values.mean(axis=1), form, unit)
@@ -127,7 +128,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     If there is only one run, the rows do not name it. Columns without any number are left out.
     """
     found: dict[str, list[tuple[StoredRun, ClassSummary]]] = {}
-    for run in (run for study in studies for run in study.runs):
+    for run in chain.from_iterable(study.runs for study in studies):
         for name, row in scored_classes(run).items():
             found.setdefault(name, []).append((run, row))
     several = sum(len(study.runs) for study in studies) > 1
@@ -139,26 +140,32 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         run, best = max(found[name], key=lambda pair: (pair[1].success, pair[1].mean_return))
         random = classes_of_random(run).get(name)
         others = classes_of_others(run).get(name)
-        content, wide = run.content, str(run.config().suite).endswith("-v2")  # references are of version 1
-        which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
-        cells = [
-            Estimate(best.success, best.success_interval).text(100.0, " %", ".4g"),
-            "–" if others is None else Estimate(others.success, others.success_interval).text(100.0, " %", ".4g"),
-            Estimate(best.mean_return, best.return_interval).text(form=".4g"),
-            "–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}",
-            "–" if random is None else f"{random.mean_return:.4g}",
-            *(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–" for known in references),
-        ]
-        rows.append([name, *which, *cells, str(len(found[name]))] if several else [name, *cells])
+        cells = [_success(best), "–" if others is None else _success(others)]
+        cells.append(Estimate(best.mean_return, best.return_interval).text(form=".4g"))
+        cells.append("–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}")
+        cells.append("–" if random is None else f"{random.mean_return:.4g}")
+        wide = str(run.config().suite).endswith("-v2")  # references are of version 1
+        for known in references:
+            cells.append(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–")
+        if several:
+            content = run.content
+            which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
+            cells = [*which, *cells, str(len(found[name]))]
+        rows.append([name, *cells])
     head = ["class", "arm", "seed", "steps", "hours", *_BEST, "runs"] if several else ["class", *_BEST]
     kept = [i for i in range(len(head)) if any(row[i] != "–" for row in rows)]
     return table([head[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
+def _success(row: ClassSummary) -> str:
+    return Estimate(row.success, row.success_interval).text(100.0, " %", ".4g")
+
+
 def references_table() -> Iterator[str]:
     """Yield one row per class: return and success of untrained policies; the expert and its source."""
-    played, expert = [load(kind) for kind in _PLAYED], load("expert")
-    measures = [f"{who}: {what}" for who in _PLAYED.values() for what in ("return", "success")]
+    played = [load(kind) for kind in _PLAYED]
+    expert = load("expert")
+    measures = [f"{who}: {what}" for who, what in product(_PLAYED.values(), ("return", "success"))]
     rows = []
     for name in registry.names():
         cells = [name]
@@ -166,7 +173,8 @@ def references_table() -> Iterator[str]:
             row = known.get(name)
             cells += ["–", "–"] if row is None else [f"{row['return']:.4g}", f"{100 * row['success']:.1f} %"]
         best = expert.get(name)
-        rows.append([*cells, *(["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]])])
+        cells += ["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]]
+        rows.append(cells)
     return table(["class", *measures, "expert: return", "expert"], rows)
 
 

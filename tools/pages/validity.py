@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.errors import BidexError
 
@@ -23,22 +22,18 @@ def validity_table(suite: str, data: Path) -> list[str]:
     if not file.is_file():
         raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
     classes = json.loads(file.read_text())["classes"]
-    lines = [
-        f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |",
-        "|---|---|" + "---|" * (len(_SHARES) + 2),
-    ]
+    lines = [f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |"]
+    lines.append("|---|---|" + "---|" * (len(_SHARES) + 2))
     for name, row in classes.items():
         cells = [_percent(row[key]) for key in _SHARES]
-        lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join([*cells, *_aligned(row)])} |")
+        if (aligned := row["alignment"]) is None:
+            cells += ["", ""]
+        else:  # the rank correlation, and the mean return of successes versus the most that a failing policy gets
+            cells += [f"{aligned['rank']:.2f}", f"{aligned['solved']:.4g} / {aligned['unsolved']:.4g}"]
+        lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
     means = (_mean([row[key] for row in classes.values()]) for key in _SHARES)
     ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
     return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
-
-
-def _aligned(row: dict[str, Any]) -> tuple[str, str]:
-    """Format the rank correlation, and the mean return of successes versus the most that a failing policy gets."""
-    found = row["alignment"]
-    return ("", "") if found is None else (f"{found['rank']:.2f}", f"{found['solved']:.4g} / {found['unsolved']:.4g}")
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -4,12 +4,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
 
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of
@@ -23,21 +23,16 @@ from tools.witness_search.whole import searched
 class Search:
     """Arguments of every search, and the storage of its episode."""
 
-    task: str
-    """Task class."""
+    task: str  # Task class.
     file: Path | None = None
     """Keep the episode here, even if it does not hold; None: in witnesses/TASK.npz, if it holds, that is if it solves
     the task from its start and from eight of ten shifted ones."""
-    threads: int | None = None
-    """Threads of the physics; None: one per core."""
+    threads: int | None = None  # Threads of the physics; None: one per core.
 
-    def keep(self, actions: np.ndarray, made: dict[str, Any], above: float = -float("inf")) -> Replay:
-        """Replay an episode (T, action_size), print the result, and store the episode.
+    def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
+        """Replay an episode (T, action_size), print the result, and store the episode with facts about its search.
 
-        Args:
-            actions: Actions of the episode.
-            made: Facts about how the episode was found.
-            above: Return that an episode that does not hold must exceed to be stored.
+        An episode that does not hold is stored only if its return is higher than ``above``.
         """
         result = replay(self.task, Witness(actions, {}), self.threads)
         print(
@@ -56,12 +51,9 @@ class Search:
 class Plan(Search):
     """Plan some steps ahead on the printed reward, as the episode goes on."""
 
-    improve: Path | None = None
-    """Start from the episode in this file."""
-    tries: int = 1
-    """Searches with other seeds before giving up."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
-    """The planner."""
+    improve: Path | None = None  # Start from the episode in this file.
+    tries: int = 1  # Searches with other seeds before giving up.
+    planner: PlannerConfig = field(default_factory=PlannerConfig)  # The planner.
 
     def run(self) -> None:
         """Search with one seed after another until an episode holds."""
@@ -84,12 +76,9 @@ class Plan(Search):
 class Improvement(Search):
     """Arguments of a search that begins with an episode."""
 
-    improve: Path
-    """File of the episode to begin with."""
-    rounds: int
-    """Rounds of the search."""
-    seed: int = 0
-    """Of changes and shifted starts."""
+    improve: Path  # File of the episode to begin with.
+    rounds: int  # Rounds of the search.
+    seed: int = 0  # Of changes and shifted starts.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,14 +16,8 @@ def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: t
     on the other hand. Half of the mutants change a few actions anywhere; the other half change one part of the hands,
     so that a grip can be carried somewhere, or a base stays while its fingers close. Half of the mutants change a
     random half of their knots, each independently; the other half change every knot from some time on by the same
-    amount.
-
-    Args:
-        elites: Plans to change, (E, K, a).
-        count: Number of mutants.
-        std: Standard deviation of the coarsest changes.
-        mutated: Share of the actions that change in mutants that do not change one part of the hands.
-        generator: Generator of the draws.
+    amount. ``elites`` is (E, K, a), ``std`` the standard deviation of the coarsest changes, ``mutated`` the share of
+    actions that change in mutants that do not change one part of the hands.
     """
 
     def uniform(*shape: int) -> Tensor:
@@ -50,5 +44,7 @@ def parts_of_the_hands(size: int) -> Tensor:
     hands = (place < one, place >= one)
     parts = [finger & side for side in hands]
     if one > joints:
-        parts += [kind & side for side in hands for kind in (force, ~finger & ~force)] + [force]
+        for side in hands:
+            parts += [force & side, ~finger & ~force & side]
+        parts.append(force)
     return torch.stack(parts)

@@ -25,75 +25,51 @@ RIVALS = 16
 class PlannerConfig:
     """Settings of the planner."""
 
-    samples: int = 128
-    """Action sequences per round."""
+    samples: int = 128  # Action sequences per round.
     copies: int = 1
     """Slightly shifted states that are played side by side, a divisor of ``samples``: each sequence meets one of them,
     the best ones of a plan meet all, and their mean counts: no plan that holds by luck."""
-    rounds: int = 3
-    """Rounds per plan."""
-    first_rounds: int = 10
-    """Rounds of the first plan, which has no predecessor."""
-    rounds_after: int = 1
-    """Rounds per plan once the task has been solved."""
-    elite_share: float = 0.08
-    """Share of the sequences that mean and deviation move towards."""
-    kept_elites: int = 8
-    """Elites that are tried again in the next round, and as parents of mutants."""
+    rounds: int = 3  # Rounds per plan.
+    first_rounds: int = 10  # Rounds of the first plan, which has no predecessor.
+    rounds_after: int = 1  # Rounds per plan once the task has been solved.
+    elite_share: float = 0.08  # Share of the sequences that mean and deviation move towards.
+    kept_elites: int = 8  # Elites that are tried again in the next round, and as parents of mutants.
     mutants: float = 0.5
     """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
-    mutated: float = 0.15
-    """Share of the actions that a mutant changes which does not change one part of the hands."""
-    horizon: int = 41
-    """Control steps a plan looks ahead."""
-    knots: int = 9
-    """Knots of a plan; actions between them are interpolated linearly."""
+    mutated: float = 0.15  # Share of the actions that a mutant changes which does not change one part of the hands.
+    horizon: int = 41  # Control steps a plan looks ahead.
+    knots: int = 9  # Knots of a plan; actions between them are interpolated linearly.
     execute: int = 10
     """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
     std: float = 0.5
     """Deviation of the knots in a first round; a sequence takes a share of it, from all to a twentieth."""
-    min_std: float = 0.12
-    """The deviation never falls below this."""
-    gamma: float = 0.97
-    """Discount per control step."""
+    min_std: float = 0.12  # The deviation never falls below this.
+    gamma: float = 0.97  # Discount per control step.
     effort: float = 0.05
     """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N: for
     free, a hand soon presses on its table so hard that nothing moves it any more."""
-    seed: int = 0
-    """Of the samples."""
+    seed: int = 0  # Of the samples.
 
 
 @dataclass(frozen=True)
 class Plan:
     """Result of a search."""
 
-    actions: np.ndarray
-    """Actions of the whole episode, (T, action_size), multiples of 1/127."""
-    rewards: np.ndarray
-    """Unscaled rewards they gave, (T,)."""
-    first_success: int | None
-    """Index of the first successful step, None if there is none."""
+    actions: np.ndarray  # Actions of the whole episode, (T, action_size), multiples of 1/127.
+    rewards: np.ndarray  # Unscaled rewards they gave, (T,).
+    first_success: int | None  # Index of the first successful step, None if there is none.
     rival: float | None
     """Highest return of the unsuccessful episodes that the search saw: before the first success, the best sequences
     without one, their last action held to the end. None without any. Above ``total``, reward and success disagree."""
 
     @property
     def total(self) -> float:
-        """Sum of the rewards."""
+        """Return the sum of the rewards."""
         return float(self.rewards.sum())
 
 
 class Planner:
-    """The search for one class; see the module.
-
-    Args:
-        name: The class.
-        config: See :class:`PlannerConfig`.
-        threads: Engine threads; None takes all CPUs.
-
-    Raises:
-        BidexError: Copies do not divide samples.
-    """
+    """The search for one class; see the module. Raises BidexError if the number of copies does not divide samples."""
 
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
         if config.samples % config.copies:
@@ -108,8 +84,7 @@ class Planner:
     def search(self, earlier: np.ndarray | None = None) -> Plan:
         """Play one episode with replanning, and print the return so far after every plan.
 
-        Args:
-            earlier: Actions (T, action_size) of an earlier search: every plan also tries these actions at their time.
+        Every plan also tries the actions (T, action_size) of an ``earlier`` search at their time.
         """
         cfg, sim = self.config, self.simulator
         states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
@@ -123,7 +98,10 @@ class Planner:
         rivals: list[float] = []
         solved = torch.zeros(cfg.copies, dtype=torch.bool)
         while len(rewards) < sim.episode_steps:
-            rounds = cfg.first_rounds if not actions else cfg.rounds_after if solved.all() else cfg.rounds
+            if not actions:
+                rounds = cfg.first_rounds
+            else:
+                rounds = cfg.rounds_after if solved.all() else cfg.rounds
             mean, elites, unsuccessful = self._plan(states, mean, elites, rounds)
             if not any(success):
                 rivals += [sum(rewards) + more for more in self._to_the_end(states[0], unsuccessful, len(rewards))]
@@ -216,16 +194,18 @@ class Planner:
 
 def interpolation(horizon: int, knots: int) -> Tensor:
     """Return weights (horizon, knots) of linear interpolation; the first knot is the first step, the last the last."""
-    place = torch.linspace(0.0, knots - 1.0, horizon)
+    return _weights(torch.linspace(0.0, knots - 1.0, horizon), knots)
+
+
+def _weights(place: Tensor, knots: int) -> Tensor:
+    """Return the weights (n, knots) of linear interpolation at places (n,), in spaces between knots."""
     return (1.0 - (place[:, None] - torch.arange(knots)).abs()).clamp(min=0.0)
 
 
 def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
     """Return the knots (K, a) of a plan after ``steps`` steps have been played; the last value is held."""
     place = torch.linspace(0.0, horizon - 1.0, len(knots)) + steps
-    weights = (1.0 - (place[:, None] * (len(knots) - 1) / (horizon - 1) - torch.arange(len(knots))).abs()).clamp(
-        min=0.0
-    )
+    weights = _weights(place * (len(knots) - 1) / (horizon - 1), len(knots))
     weights[place >= horizon - 1] = 0.0
     weights[place >= horizon - 1, -1] = 1.0
     return weights @ knots

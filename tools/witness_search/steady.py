@@ -6,6 +6,8 @@ A change is kept if more of the starts succeed, for longer, at a higher return, 
 starts are not the starts of the replay.
 """
 
+from itertools import product
+
 import numpy as np
 import torch
 
@@ -27,15 +29,10 @@ _BLOW = 3.0
 def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
     """Return the best episode, (T, action_size), in multiples of 1/127; print the result of each round's best episode.
 
-    Args:
-        name: The class.
-        actions: The episode to begin with, (T, action_size).
-        rounds: Rounds of twelve changes, each played from ten shifted starts.
-        seed: Seed of changes and starts.
-        threads: Engine threads; None takes all CPUs.
+    The search begins with ``actions`` (T, action_size). A round plays twelve changes from ten shifted starts.
     """
     simulator = Simulator(name, _STARTS * _CHANGES, threads)
-    states = [s for s in simulator.starts(_STARTS - 1, seed=100 + seed) for _ in range(_CHANGES)]
+    states = [state for state, _ in product(simulator.starts(_STARTS - 1, seed=100 + seed), range(_CHANGES))]
     base, generator = torch.from_numpy(actions), torch.Generator().manual_seed(seed)
     knots = len(base) // _SPACING + 1
     weights = interpolation(len(base), knots)
@@ -50,10 +47,8 @@ def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads
         changes[0] = kept[0]
         simulator.load(states)
         depths.clear()
-        trace = simulator.play(
-            quantised(base[:, None] + torch.einsum("tk,nka->tna", weights, changes)).repeat(1, _STARTS, 1),
-            measure,
-        )
+        played = quantised(base[:, None] + torch.einsum("tk,nka->tna", weights, changes))
+        trace = simulator.play(played.repeat(1, _STARTS, 1), measure)
         solved = trace.success.any(0).view(_STARTS, _CHANGES).double()
         lasting = trace.success.double().mean(0).view(_STARTS, _CHANGES)
         returns = trace.rewards.sum(0).view(_STARTS, _CHANGES)
@@ -61,10 +56,8 @@ def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads
         worth = solved.sum(0) + 4.0 * lasting.mean(0) + 0.01 * returns.mean(0) - _BLOW * deep
         order = worth.argsort(descending=True)
         kept = changes[order[:_KEPT]]
-        solved_starts, total, deep_states = (float(each[order[0]]) for each in (solved.sum(0), returns.mean(0), deep))
-        print(
-            f"{solved_starts:.0f} of 10 shifted starts, mean return {total:.3f}, deep states {deep_states:.1f}",
-            flush=True,
-        )
+        best = order[0]
+        starts = f"{solved.sum(0)[best]:.0f} of 10 shifted starts"
+        print(f"{starts}, mean return {returns.mean(0)[best]:.3f}, deep states {deep[best]:.1f}", flush=True)
     simulator.close()
     return quantised(base + weights @ kept[0]).numpy()

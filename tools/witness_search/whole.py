@@ -24,12 +24,8 @@ _SUCCESS, _LASTING = 5.0, 0.2
 def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
     """Return the last round's best episode, (T, action_size), in multiples of 1/127; print each round's best result.
 
-    Args:
-        name: The class.
-        actions: The episode to begin with, (T, action_size); its last action is held.
-        rounds: Rounds of 256 episodes, in turns from the start and from one that is shifted.
-        seed: Seed of changes and of the shifted start.
-        threads: Engine threads; None takes all CPUs.
+    The search begins with ``actions`` (T, action_size), whose last action is held. A round plays 256 episodes; rounds
+    alternate between the start and a shifted start.
     """
     simulator, generator = Simulator(name, _SAMPLES, threads), torch.Generator().manual_seed(seed)
     steps = simulator.episode_steps

@@ -77,10 +77,12 @@ class DAgger(Learner):
         self.low_precision = self.policy.low_precision
         self.obs = None
         self.teacher_plays = torch.zeros(world.num_envs, dtype=torch.bool, device=self.device)
-        self.lessons = Lessons(world, self.policy, config.learning_rate, config.max_grad_norm)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
         assert sources.teachers is not None
-        self.lessons.begin(sources.teachers, config.samples, config.rollout_steps, config.batch_size)
+        self.lessons = Lessons(
+            world, self.policy, sources.teachers, config.rollout_steps, config.learning_rate, config.max_grad_norm,
+            config.samples, config.batch_size
+        )  # fmt: skip
 
     def _iterate(self) -> dict[str, float]:
         share = self._teachers_share()
@@ -150,13 +152,11 @@ class DAgger(Learner):
 
     def state_dict(self) -> State:
         """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
-        return super().state_dict() | {"data": self.lessons.data and self.lessons.data.state_dict()}
+        return super().state_dict() | {"data": self.lessons.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the data set had another size."""
         super().load_state_dict(state)
-        if self.lessons.data is None:
-            return
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:
             obs, _ = self.world.reset()  # teachers have not seen the first part of a running episode

@@ -89,10 +89,13 @@ class RL2(TrialLearner):
             self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation,
             config.trial_steps
         ).to(self.device)  # fmt: skip
-        self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
+        self.adams = AdaptiveAdams(
+            self.policy.parameters(), self.critic.parameters(), config.learning_rate, config.learning_rate_range,
+            config.followed_kl, config.critic_learning_rate, self.device
+        )  # fmt: skip
         limits = self.limits
-        d, a = (self.shape.observations, self.shape.actions)
-        self.trials = Trials(config.episodes_per_trial, limits, d, a, config.chunk)
+        shape = self.shape
+        self.trials = Trials(config.episodes_per_trial, limits, shape.observations, shape.actions, config.chunk)
         steps = config.episodes_per_trial * float(limits.float().mean()) * world.num_envs * world_size()
         horizon = config.value_horizon * steps / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)

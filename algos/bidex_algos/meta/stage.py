@@ -120,9 +120,8 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
     Returns count to the end of the stage and no further, because a baseline fitted to these returns knows nothing
     beyond that point.
     """
-    rewards, terminated, ended, valid = (
-        torch.stack(each) for each in (stage.rewards, stage.terminated, stage.ended, stage.valid)
-    )
+    recorded = (stage.rewards, stage.terminated, stage.ended, stage.valid)
+    rewards, terminated, ended, valid = (torch.stack(steps) for steps in recorded)
     obs = stage.by_task("obs", rows)
     elapsed = stage.by_task("elapsed", rows)
     nothing = torch.zeros_like(rewards)

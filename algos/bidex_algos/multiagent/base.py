@@ -13,13 +13,14 @@ import tyro
 from torch import Tensor, nn
 
 from bidex_algos.multiagent.team import TeamActor
-from bidex_algos.nets.architecture import ArchitectureConfig, Options
+from bidex_algos.nets.architecture import Networks, Options
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_samples
-from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig
+from bidex_algos.onpolicy.mtppo import Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig, mini_batches
+from bidex_algos.rollout import check_samples
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
 from bidex_meta.training.distributed import sum_gradients
@@ -32,7 +33,7 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 """A partition of the hands' units, with a short alias on the command line."""
 
 
-def keep_partition(config: ArchitectureConfig) -> None:
+def keep_partition(config: Networks) -> None:
     """Replace the path of a partition file by its content, for checkpoints; a BidexError if it is no partition."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
@@ -57,10 +58,8 @@ class MultiAgentConfig(OnPolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         keep_partition(self)
-        if self.popart and not (self.per_task_values and self.value_heads):
-            raise BidexError(
-                f"{self.algo}: popart moves the critic's output of each task; leave per_task_values and value_heads on."
-            )
+        if self.popart and not self.value_heads:
+            raise BidexError(f"{self.algo}: popart moves the critic's output of each task; leave value_heads on.")
 
 
 @dataclass(frozen=True)
@@ -220,7 +219,7 @@ class MultiAgent(OnPolicy):
         old_values = self._old_values(batch)
         losses = list[Tensor]()
         parameters = list(self.critic.parameters())
-        for _, index, count in self._mini_batches(batch.weights, epochs, num_minibatches):
+        for _, index, count in mini_batches(batch.weights, epochs, num_minibatches, self.generator):
             b = batch.select(index)
             loss = self._value_loss(b, old_values.index_select(0, index), b.weights / count)
             self.critic_adam.zero_grad()
@@ -241,7 +240,10 @@ class OwnAdams(MultiAgent):
     def __init__(self, world: VectorWorld, config: MultiAgentPPOConfig, seed: int):
         super().__init__(world, config, seed)
         own = self.policy.actor.parameters_of
-        given = (config, self.device, config.adam_eps, self.kl_share)
+        desired_kl = config.followed_kl
+        if desired_kl is not None:
+            desired_kl = self.kl_share * desired_kl
+        given = config.learning_rate, config.learning_rate_range, desired_kl, self.device, config.adam_eps
         self.adams = [AdaptiveAdam(own(k), *given) for k in range(len(self.policy.actor.nets))]
 
     def _optimisers(self) -> Parts:

@@ -18,8 +18,8 @@ from bidex_algos.multiagent.base import (
     OwnAdams,
     Sequential,
 )
-from bidex_algos.onpolicy.base import Batch
-from bidex_algos.onpolicy.ppo import policy_loss
+from bidex_algos.onpolicy.mtppo import Batch
+from bidex_algos.onpolicy.ppo import mini_batches, policy_loss
 from bidex_meta.training.distributed import sum_gradients
 
 
@@ -63,7 +63,7 @@ class HAPPO(OwnAdams, Sequential):
         adam = self.adams[agent]
         parameters = self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
-        for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):
+        for first, index, count in mini_batches(share.weights, cfg.epochs, cfg.num_minibatches, self.generator):
             part = share.select(index)
             loss = policy_loss(
                 part.actions, *self._distribution(agent, part), part.old_means, part.old_log_std, part.old_log_probs,

@@ -6,6 +6,7 @@ would be equal and there is only one.
 """
 
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -48,7 +49,7 @@ class DeterministicTeam(Team):
         self.heads = heads
         self.one_hot = groups.columns(*["task_id"] * (heads > 1))
         self._order: Tensor
-        order = torch.tensor([action for view in views for action in view.actions]).argsort()
+        order = torch.tensor(list(chain.from_iterable(view.actions for view in views))).argsort()
         self.register_buffer("_order", order, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:

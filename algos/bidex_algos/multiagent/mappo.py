@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgentPPOConfig, OwnAdams
 from bidex_algos.nets.networks import autocast, gaussian_log_prob
-from bidex_algos.onpolicy.base import Batch
-from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, policy_loss
+from bidex_algos.onpolicy.mtppo import Batch
+from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, mini_batches, policy_loss
 from bidex_meta.training.distributed import sum_gradients
 
 
@@ -53,7 +53,7 @@ class MAPPO(OwnAdams):
         given = zip(*(actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)), strict=True)
         old_log_probs = torch.stack([gaussian_log_prob(*each) for each in given], dim=1)  # of each agent
         measured: list[Tensor] = []
-        for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
+        for first, index, count in mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches, self.generator):
             part = batch.select(index)
             part.old_log_probs = old_log_probs.index_select(0, index)
             reported = self._gradients(

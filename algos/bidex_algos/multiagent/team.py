@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 from typing import cast
 
 import torch
@@ -11,7 +12,7 @@ from bidex_algos.nets.architecture import NetworkConfig
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
-from bidex_algos.onpolicy.base import OnPolicyConfig
+from bidex_algos.onpolicy.mtppo import OnPolicyConfig
 from bidex_meta.world.agent_views import AgentView
 
 
@@ -22,13 +23,18 @@ class Team(nn.Module):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig, outputs: Sequence[int], output_gain: float,
-        generator: torch.Generator, share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, outputs: Sequence[int],
+        output_gain: float, generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__()
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
-        self.families = [[i for i, other in enumerate(forms) if other == form] for form in dict.fromkeys(forms)]
-        self.columns = nn.ModuleList(Columns(part for g in view.groups for part in g.where) for view in views)
+        families: dict[object, list[int]] = {}
+        for i, form in enumerate(forms):
+            families.setdefault(form, []).append(i)
+        self.families = list(families.values())
+        self.columns = nn.ModuleList()
+        for view in views:
+            self.columns.append(Columns(chain.from_iterable(group.where for group in view.groups)))
         self.share = share
         made = list[MLP]()
         self.net_of = [0] * len(views)
@@ -40,7 +46,7 @@ class Team(nn.Module):
                 continue
             if share and len(family) > 1:
                 inputs = inputs.extended("agent", len(family))
-            inputs = with_task_embedding(with_point_net(inputs, config), config.task_embedding)
+            inputs = with_task_embedding(with_point_net(inputs, config), vars(config).get("task_embedding", 0))
             self.net_of[i] = len(made)
             made.append(MLP(inputs, config.hidden, outputs[i], output_gain, generator, config.activation))
         self.nets = nn.ModuleList(made)
@@ -95,16 +101,17 @@ class TeamActor(Team):
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
         self.heads = heads
         self.one_hot = groups.columns(*["task_id"] * (heads > 1))
-        order = torch.tensor([action for view in views for action in view.actions])
+        order = torch.tensor(list(chain.from_iterable(view.actions for view in views)))
         self._order: Tensor
         self._taken: Tensor
         self.register_buffer("_order", order.argsort(), persistent=False)
         self.register_buffer("_taken", order, persistent=False)
         self._sizes = [len(view.actions) for view in views]
         sizes = [len(views[self.net_of.index(k)].actions) for k in range(len(self.nets))]
-        self.log_stds = nn.ParameterList(
-            torch.full((n,) if heads == 1 else (heads, n), math.log(config.init_std)) for n in sizes
-        )
+        self.log_stds = nn.ParameterList()
+        for size in sizes:
+            shape = (size,) if heads == 1 else (heads, size)
+            self.log_stds.append(nn.Parameter(torch.full(shape, math.log(config.init_std))))
 
     @property
     def own(self) -> list[Tensor]:
@@ -159,8 +166,8 @@ class TeamCritic(Team):
     """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self, views: Sequence[AgentView], config: NetworkConfig, heads: int, generator: torch.Generator,
-        share: bool = False
+        self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, heads: int,
+        generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, Towers, Transfo
 from bidex_algos.nets.networks import MLP, Activation, Layers, MakeNetwork
 from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
-from bidex_meta.utils.validation import Count, Whole, Widths
+from bidex_meta.utils.validation import Whole, Widths
 
 Options = dict[str, Any]  # fields of a config by name
 Architecture = Literal["shared", "multi_head", "towers", "separate", "soft_modules", "paco", "moore", "transformer"]
@@ -20,74 +20,97 @@ _TRUNKS: dict[str, MakeNetwork] = {
     "soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer,
     "towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0),
 }  # fmt: skip
+_MODULES = 4  # modules of a layer of soft_modules, parameter sets of paco, experts of moore, heads of attention
+
+
+class Networks(Protocol):
+    """The fields of a learner's config that its networks are built from."""
+
+    @property
+    def algo(self) -> str:
+        """The learner's name in messages."""
+        ...
+
+    @property
+    def architecture(self) -> Architecture:
+        """How the networks share weights between tasks."""
+        ...
+
+    @property
+    def hidden(self) -> Layers:
+        """Widths of the hidden layers."""
+        ...
+
+    @property
+    def activation(self) -> Activation:
+        """Non-linearity of the hidden layers."""
+        ...
 
 
 @dataclass(frozen=True)
-class ArchitectureConfig(LearnerConfig):
-    """Layers of actor and critics, and how they share weights between tasks."""
+class NetworkConfig(LearnerConfig):
+    """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     architecture: Architecture = "shared"
     """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
     alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
     heads. All but shared for MT suites, whose observations show the task."""
-    modules: Count = 4  # Modules of a layer of soft_modules, parameter sets of paco, experts of moore, attention heads.
     hidden: Layers = (256, 256)  # Widths of the hidden layers, of actor and critics alike.
     activation: Activation = "relu"  # Non-linearity of the hidden layers.
-
-    @property
-    def shares_a_trunk(self) -> bool:
-        """Return whether the trunk is the plain one."""
-        return self.architecture in ("shared", "multi_head")
-
-
-@dataclass(frozen=True)
-class NetworkConfig(ArchitectureConfig):
-    """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
-
     policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
     task_embedding: Whole = 0
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     point_widths: Widths = (32, 64)
     """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0  # Points of a cloud that they read, evenly out of all; 0: all.
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.architecture in ("multi_head", "towers", "separate"):
-            for heads in ("policy_heads", "value_heads"):
-                object.__setattr__(self, heads, True)  # so that a checkpoint's config has them too
-        if self.shares_a_trunk:
-            return
-        if self.task_embedding:
+        check_networks(self)
+
+
+def check_networks(config: Networks) -> None:
+    """Raise BidexError if the layers do not fit the architecture; switch on the heads that the architecture implies."""
+    architecture = config.architecture
+    if architecture in ("multi_head", "towers", "separate"):
+        for heads in ("policy_heads", "value_heads"):
+            object.__setattr__(config, heads, True)  # so that a checkpoint's config has them too
+    if shares_a_trunk(architecture):
+        return
+    if vars(config).get("task_embedding"):
+        raise BidexError(
+            f"{config.algo}: task_embedding goes with architecture shared or multi_head, got {architecture}, "
+            "which reads the task its own way. Leave task_embedding off."
+        )
+    layers = {name: widths for name, widths in vars(config).items() if name in ("hidden", "critic_hidden")}
+    for name, widths in layers.items():
+        if architecture == "soft_modules" and len(widths) < 2:
             raise BidexError(
-                f"{self.algo}: task_embedding goes with architecture shared or multi_head, got {self.architecture}, "
-                "which reads the task its own way. Leave task_embedding off."
+                f"{config.algo}: soft_modules needs at least two widths in {name}, one of the embedding and one "
+                f"for each layer of modules; got {widths}."
             )
-        layers = {name: widths for name, widths in vars(self).items() if name in ("hidden", "critic_hidden")}
-        for name, widths in layers.items():
-            if self.architecture == "soft_modules" and len(widths) < 2:
-                raise BidexError(
-                    f"{self.algo}: soft_modules needs at least two widths in {name}, one of the embedding and one "
-                    f"for each layer of modules; got {widths}."
-                )
-            if self.architecture == "moore" and not (widths and self.modules <= widths[-1]):
-                raise BidexError(
-                    f"{self.algo}: moore needs no more modules than the last width of {name}, since no more "
-                    f"directions are orthogonal there; got {self.modules} and {widths}."
-                )
-            if self.architecture == "transformer" and (len({*widths}) != 1 or widths[0] % self.modules):
-                raise BidexError(
-                    f"{self.algo}: transformer needs one width for all of {name}, a multiple of modules; got {widths} "
-                    f"and {self.modules}."
-                )
+        if architecture == "moore" and not (widths and widths[-1] >= _MODULES):
+            raise BidexError(
+                f"{config.algo}: moore has {_MODULES} experts, whose outputs are orthogonal; the last width of {name} "
+                f"must be at least {_MODULES}, got {widths}."
+            )
+        if architecture == "transformer" and (len({*widths}) != 1 or widths[0] % _MODULES):
+            raise BidexError(
+                f"{config.algo}: transformer needs one width for all of {name}, a multiple of its {_MODULES} attention "
+                f"heads; got {widths}."
+            )
 
 
-def network_of(config: ArchitectureConfig) -> MakeNetwork:
+def shares_a_trunk(architecture: Architecture) -> bool:
+    """Return whether all tasks share one plain network."""
+    return architecture in ("shared", "multi_head")
+
+
+def network_of(config: Networks) -> MakeNetwork:
     """Return the constructor of a config's networks."""
     trunk = _TRUNKS.get(config.architecture)
     if trunk is None:
         return MLP
-    return partial(trunk, modules=config.modules)
+    return partial(trunk, modules=_MODULES)
 
 
 def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
@@ -104,7 +127,7 @@ class Critics(nn.Module):
     """
 
     def __init__(
-        self, inputs: Inputs, heads: int, config: ArchitectureConfig, layer_norm: bool, generator: torch.Generator,
+        self, inputs: Inputs, heads: int, config: Networks, layer_norm: bool, generator: torch.Generator,
         count: int = 2
     ):  # fmt: skip
         super().__init__()

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ class Columns(nn.Module):
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
-        index = sorted(column for part in ranges for column in range(part.start, part.stop))
+        index = sorted(chain.from_iterable(range(part.start, part.stop) for part in ranges))
         self.size = len(index)
         first = index[0] if index else 0
         # A slice is a view; columns with gaps have to be copied.
@@ -77,7 +78,7 @@ class Inputs:
         ranges = {group.name: group.where for group in self.groups}
         for name in set(names) - ranges.keys():
             raise unknown_name("observation group", name, ranges)
-        return Columns(part for name in names for part in ranges[name])
+        return Columns(chain.from_iterable(ranges[name] for name in names))
 
     def extended(self, name: str, size: int) -> "Inputs":
         """Append a group behind the others, for example the actions that a critic judges."""

@@ -162,9 +162,9 @@ class PaCo(nn.Module):
         self.encoder = GroupEncoder(inputs.without("task_id"), generator)
         self.weights = TaskWeights(inputs, modules, generator)
         widths = [self.encoder.size, *hidden]
-        self.layers = nn.ModuleList(
-            StackedLinear(modules, a, b, math.sqrt(2.0), generator) for a, b in pairwise(widths)
-        )
+        self.layers = nn.ModuleList()
+        for size, width in pairwise(widths):
+            self.layers.append(StackedLinear(modules, size, width, math.sqrt(2.0), generator))
         self.between = nn.Sequential(PlainNorm(layer_norm), ACTIVATIONS[activation]())
         self.head = StackedLinear(modules, widths[-1], outputs, output_gain, generator, bias=False)
         self.output_bias = nn.Parameter(torch.zeros(outputs))
@@ -296,14 +296,14 @@ class Transformer(Headed):
         self.tokens = nn.ModuleList(linear(part.size, width, 1.0, generator) for part in encoders)
         with torch.random.fork_rng(devices=[]):  # PyTorch's layers draw from the global generator
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device="cpu")))
-            self.blocks = nn.Sequential(
-                *(
+            self.blocks = nn.Sequential()
+            for _ in hidden:
+                between = ACTIVATIONS[activation]()
+                self.blocks.append(
                     nn.TransformerEncoderLayer(
-                        width, modules, 2 * width, 0.0, ACTIVATIONS[activation](), batch_first=True, norm_first=True
+                        width, modules, 2 * width, 0.0, between, batch_first=True, norm_first=True
                     )
-                    for _ in hidden
                 )
-            )
         self.norm = nn.LayerNorm(width)
         self.head = linear(width, outputs, output_gain, generator)
 

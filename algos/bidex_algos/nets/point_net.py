@@ -22,20 +22,13 @@ class PointNet(nn.Module):
     """Maps clouds (..., entries) to features (..., size): the maximum of each over all points, and the centre (metres).
 
     Points of ``channels`` numbers, position first, enter relative to the centre of their cloud, so that the first
-    layers see shapes rather than the position of the hands. The network reads all points, or ``read`` of them evenly.
+    layers see shapes rather than the position of the hands.
     """
 
-    def __init__(
-        self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3, read: int = 0
-    ):
+    def __init__(self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3):
         super().__init__()
         self.channels = channels
         self.size = widths[-1] + 3
-        points = entries // channels
-        if read == 0:
-            self.step = 1
-        else:
-            self.step = max(1, points // read)
         layers: list[nn.Module] = []
         for before, after in zip((channels, *widths[:-1]), widths, strict=True):
             layer = Linear(before, after)
@@ -46,7 +39,7 @@ class PointNet(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Encode clouds."""
-        cloud = x.unflatten(-1, (-1, self.channels))[..., :: self.step, :]
+        cloud = x.unflatten(-1, (-1, self.channels))
         place = cloud[..., :3]
         rest = cloud[..., 3:]
         centre = place.mean(dim=-2, keepdim=True)
@@ -94,8 +87,6 @@ def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
                 f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
                 "--points (a suite's table [points]) out."
             )
-        widths = tuple(options["point_widths"])
-        read = options["points_read"]
-        make = partial(PointNet, widths=widths, channels=channels, read=read)
+        make = partial(PointNet, widths=tuple(options["point_widths"]), channels=channels)
         inputs = inputs.encoded(group.name, make, scaled=False)
     return inputs

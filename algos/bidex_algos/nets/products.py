@@ -106,11 +106,10 @@ class _Affine(torch.autograd.Function):
         (grad,) = grads
         x, weight = ctx.saved_tensors
         of_x, of_weight, of_bias = ctx.needs_input_grad
-        return (
-            affine(grad, weight.t()) if of_x else None,
-            affine(grad.t(), x.t()) if of_weight else None,
-            grad.sum(0) if of_bias else None,
-        )
+        grad_x = affine(grad, weight.t()) if of_x else None
+        grad_weight = affine(grad.t(), x.t()) if of_weight else None
+        grad_bias = grad.sum(0) if of_bias else None
+        return grad_x, grad_weight, grad_bias
 
 
 def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:

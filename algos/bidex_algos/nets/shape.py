@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bidex_algos.nets.architecture import ArchitectureConfig
+from bidex_algos.nets.architecture import shares_a_trunk
 from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig, State
 from bidex_meta.world.contract import ObservationGroup, VectorWorld
@@ -70,11 +70,11 @@ def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: S
     """Raise BidexError if an option needs the tasks' one-hot and the world does not show it."""
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
-        wanted = [
-            option for option in wanted if option not in _OF_SEVERAL
-        ]  # one task needs no one-hot, but cannot have heads
-    if isinstance(config, ArchitectureConfig) and not config.shares_a_trunk:
-        wanted.append(f"architecture {config.architecture}")
+        # One task needs no one-hot, but cannot have heads.
+        wanted = [option for option in wanted if option not in _OF_SEVERAL]
+    architecture = vars(config).get("architecture", "shared")
+    if not shares_a_trunk(architecture):
+        wanted.append(f"architecture {architecture}")
     for option in wanted:
         if shape.num_id_columns != world.num_tasks:
             raise BidexError(

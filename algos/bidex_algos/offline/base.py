@@ -8,6 +8,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, ClassVar
 
 import torch
@@ -70,9 +71,11 @@ class Batches:
     def __init__(self, data: Joined, num_tasks: int, per_task: int, device: torch.device):
         self._per_task = per_task
         self._device = device
-        self._observations, self._at, self._actions, self._rewards, self._terminated = (
-            each.to(device) for each in (data.observations, data.at, data.actions, data.rewards, data.terminated)
-        )
+        self._observations = data.observations.to(device)
+        self._at = data.at.to(device)
+        self._actions = data.actions.to(device)
+        self._rewards = data.rewards.to(device)
+        self._terminated = data.terminated.to(device)
         self._of_task = torch.argsort(data.task, stable=True).to(device)
         self._count = torch.bincount(data.task, minlength=num_tasks).to(device)
         self._first = self._count.cumsum(0) - self._count
@@ -210,7 +213,7 @@ class Offline(Learner):
         return {"Loss/critic": loss.detach()} | reported
 
     def _descend(self, loss: Tensor, name: str, *modules: nn.Module) -> None:
-        weights = [weight for module in modules for weight in module.parameters()]
+        weights = list(chain.from_iterable(module.parameters() for module in modules))
         self.adams[name].zero_grad()
         loss.backward(inputs=weights)
         if self.config.max_grad_norm is not None:

@@ -10,6 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import ClassVar
 
 import torch
@@ -254,7 +255,7 @@ class OffPolicy(Learner):
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
         """Take one step of the named optimisers down ``loss`` summed over processes; also sum ``numbers`` (n,)."""
-        weights = [weight for each in parameters.values() for weight in each]
+        weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
             self.adams[name].zero_grad()
         loss.backward(inputs=weights)

@@ -13,7 +13,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import network_bytes, network_of
+from bidex_algos.nets.architecture import network_bytes, network_of, shares_a_trunk
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, Layers, MakeNetwork, autocast
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
@@ -72,7 +72,7 @@ class CategoricalConfig(OffPolicyConfig):
 
 def check_residual(config: CategoricalConfig) -> None:
     """Raise BidexError if residual networks cannot be made of a config's layers."""
-    if not config.shares_a_trunk:
+    if not shares_a_trunk(config.architecture):
         raise BidexError(f"{config.algo}: its networks are residual; architecture must be shared or multi_head.")
     for name, widths in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
         if len(set(widths)) != 1:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -224,7 +225,8 @@ class FlashSAC(Categorical, MTSAC):
         """Average the running statistics over processes, each of which uses its own batch."""
         if world_size() == 1:
             return
-        buffers = [each for net in (self.policy.actor, self.critic, self.target_critic) for each in net.named_buffers()]
+        nets = (self.policy.actor, self.critic, self.target_critic)
+        buffers = chain.from_iterable(net.named_buffers() for net in nets)
         running = [x for name, x in buffers if name.endswith(("running_mean", "running_var"))]
         means = (all_sum(torch.cat(running)) / world_size()).split([len(x) for x in running])
         for x, mean in zip(running, means, strict=True):

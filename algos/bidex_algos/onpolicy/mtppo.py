@@ -1,72 +1,109 @@
 """MT-PPO: proximal policy optimisation (Schulman et al. 2017) on all tasks of a world at once.
 
-One policy reads the task's one-hot in its observation. ``docs/learners/mtppo.md`` lists and explains the differences
-from Bi-DexHands' MTPPO.
+One policy reads the task's one-hot in its observation. The steps of the paper's algorithm 1 are numbered from
+``OnPolicy._iterate``, which all on-policy learners share, to ``MTPPO._descend``. ``docs/learners/mtppo.md`` lists and
+explains the differences from Bi-DexHands' MTPPO.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from abc import abstractmethod
+from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from bidex_algos.balancing import Balance, Balancing, Famo, GradientBalance, conflict_averse, project_conflicting
-from bidex_algos.nets.architecture import Options
-from bidex_algos.nets.networks import autocast
-from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
+from bidex_algos import advantages as estimates
+from bidex_algos.balancing import Balancing, balance_of
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import Architecture, check_networks, network_bytes, network_of
+from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, gaussian_log_prob
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy, of_head
+from bidex_algos.onpolicy.demonstrations import Demonstrations
 from bidex_algos.onpolicy.lessons import Lessons
-from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
-from bidex_meta.data.joined import Joined
-from bidex_meta.errors import BidexError
-from bidex_meta.training.distributed import all_sum, own_seed, sum_gradients, world_size
-from bidex_meta.training.learner import NO_SOURCES, Capability, Parts, Sources, State
-from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
+from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, mini_batches, policy_loss
+from bidex_algos.rollout import EpisodeStatistics, Rollout, check_samples, collect
+from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.training.learner import NO_SOURCES, Capability, LearnerConfig, Parts, Sources, State
+from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.graphs import GraphCache, cuda_graph
 
+_VALUE_HORIZON = 100.0  # iterations after which returns fade from the statistics that define the critic's units
+_VALUE_LOSS_WEIGHT = 2.0  # Adam undoes it, so it matters only for the clipping of the critic's gradients
+_MAX_GRAD_NORM = 1.0  # gradients longer than this are shortened to it, those of actor and critic apart
+
 
 @dataclass(frozen=True)
-class MTPPOConfig(PPOConfig, OnPolicyConfig):
+class OnPolicyConfig(LearnerConfig):
+    """Options of networks, rollouts and statistics; the defaults are the preset ``laptop``."""
+
+    architecture: Architecture = "shared"
+    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
+    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
+    heads. All but shared for MT suites, whose observations show the task."""
+    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, of actor and critic alike.
+    activation: Activation = "elu"  # Non-linearity of the hidden layers.
+    policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
+    value_heads: bool = True  # Give the critic one output per task instead of one for all.
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
+    rollout_steps: Count = 8  # Steps taken in every environment between two updates.
+    gamma: Fraction = 0.93  # Discount per step.
+    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_networks(self)
+        check_rising(self, self.algo, "std_range")
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """Estimate the bytes of memory as in the base class."""
+        return 4 * num_envs * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
+
+
+@dataclass(frozen=True)
+class MTPPOConfig(OnPolicyConfig):
     """All options of MT-PPO; the defaults are the preset ``laptop``."""
 
-    value_loss_weight: Finite = 2.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
-    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
-    clip_apart: bool = True
-    """Shorten the gradients of actor and critic apart, so that a large value error leaves the policy's step alone."""
+    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
+    epochs: Count = 4  # Passes over what was collected, per update.
+    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
+    learning_rate: Positive = 3e-4  # Adam's step size at the start.
+    desired_kl: Positive = 0.03
+    """KL of the sampling policy from the current one: the step size is divided by 1.5 above twice this value, and
+    multiplied by 1.5 below half of it."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
+    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
     gradient_surgery: Balancing = "none"
     """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
     2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
     so that all fall at one rate (Liu et al. 2023)."""
-    cagrad_radius: BelowOne = 0.4  # How far cagrad's direction may leave the mean gradient, in its lengths; 0: not.
-    famo_rate: Positive = 0.025  # Adam's step size of famo's weights.
-    famo_decay: NonNegative = 0.01  # By which these weights are drawn back to even ones.
-    demonstration_weight: NonNegative = 0.1
-    """With --demonstrations: weight at the start of the policy's distance from them; 0: they count nothing."""
-    demonstration_half_life: Positive = 500_000.0  # Environment steps in which that weight falls to half.
-    demonstration_batch: Count = 256  # Transitions of them in each mini-batch, of each process.
-    demonstration_cloning: Whole = 0  # Steps of so many of them in which the policy is cloned before it plays.
+    demonstration_batch: Count = 256  # With --demonstrations: transitions in each mini-batch, of each process.
+    demonstration_cloning: Whole = 0  # Steps on demonstrations in which the policy is cloned before it plays.
     teacher_updates: Whole = 20
     """With --teacher: DAgger's updates after each of PPO's, while a taught class never succeeds; 0: none."""
-    teacher_success: Positive = 0.8
-    """Success of a class's last 100 episodes from which its teacher counts nothing; up to there its weight falls in a
-    line, and it rises again where success falls."""
-    teacher_learning_rate: Positive = 5e-4  # Adam's step size in these updates.
-    teacher_batch: Count = 1024  # Labelled observations of such an update, split evenly over the taught classes.
-    teacher_samples: Count = 500_000  # Labelled observations that each process keeps; the oldest go first.
     critic_first: Whole = 0
     """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
     or of --start-from), which a critic that knows nothing would spoil."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_rising(self, self.algo, "learning_rate_range")
+
 
 PRESETS: dict[str, MTPPOConfig] = {
-    # Table 47 of the Bi-DexHands appendix; the value loss weight is their loader's default.
+    # Table 47 of the Bi-DexHands appendix.
     "paper": MTPPOConfig(
-        **TABLE_47, epochs=5, clip=0.2, learning_rate=3e-4, desired_kl=0.016, critic_learning_rate=None,
-        value_loss_weight=2.0, entropy_weight=0.0,
+        hidden=(2048, 1024, 512), value_heads=False, init_std=0.8, rollout_steps=8, num_minibatches=4, gamma=0.96,
+        lam=0.95, normalise_observations=False, epochs=5, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
+        critic_learning_rate=None,
     ),
     "laptop": MTPPOConfig(),
     # Version 2 of the suites (docs/results/adaptation.md): the goal must be held at the end of longer episodes.
@@ -75,95 +112,165 @@ PRESETS: dict[str, MTPPOConfig] = {
     # Networks are small, and rollouts have 100 steps instead of 10,000. With 250 steps (ELU, 8 mini-batches) success on
     # MT3 was 24 % after 150 k steps instead of 42 %.
     "metaworld": MTPPOConfig(
-        hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
-        clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
+        activation="tanh", rollout_steps=100, epochs=5, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02,
+        std_range=(0.1, 1.5),
     ),
 }  # fmt: skip
 
-# Table 42, column "Other Tasks". Other values are from Table 47.
-_SINGLE = replace(PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
-# Table 50. Other values are from Table 47 (``paper``) or those for hands (``laptop``, with narrower layers).
-_TABLE_50: Options = {
-    "rollout_steps": 32, "epochs": 5, "num_minibatches": 4, "clip": 0.1, "learning_rate": 3e-4, "gamma": 0.99,
-    "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01, "max_grad_norm": 1.0, "entropy_weight": 0.0,
-}  # fmt: skip
-SINGLE_TASK_PRESETS = PRESETS | {"paper": _SINGLE}
-TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
-    # Table 42's own columns.
-    "LiftUnderarm": {"paper": replace(_SINGLE, rollout_steps=20, epochs=10)},
-    "StackBlock": {"paper": replace(_SINGLE, num_minibatches=8, epochs=2, gamma=0.9)},
-    "gymnasium/Humanoid-v5": {
-        "paper": replace(PRESETS["paper"], hidden=(1024, 1024, 1024), **_TABLE_50),
-        "laptop": replace(PRESETS["laptop"], hidden=(256, 256, 256), **_TABLE_50),
-    },
-}
+
+@dataclass
+class Batch:
+    """A rollout prepared for the update, with steps and rows flattened into B samples."""
+
+    obs: Tensor  # normalised observations (B, d), in the precision the hidden layers run in
+    task_id: Tensor  # task of each sample (B,)
+    actions: Tensor  # sampled actions (B, a)
+    old_means: Tensor  # means of the sampling policy (B, a)
+    old_log_probs: Tensor  # log-density of the actions under the sampling policy (B,)
+    advantages: Tensor  # normalised advantages (B,); of several critics (B, critics)
+    targets: Tensor  # what the critic shall predict, in its own units (B,); of several (B, critics)
+    weights: Tensor  # 1, or 0 for a transition where physics broke (B,)
+
+    def select(self, index: Tensor) -> "Batch":
+        """Return the samples at ``index``."""
+        return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 
-# The first few episodes say little: up to this number, the missing episodes count as failures.
-_EPISODES = 20.0
+class OnPolicy(Learner):
+    """A Gaussian policy and a critic (``num_critics`` values of a state) that learn from the latest rollout."""
 
-_DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
+    config: OnPolicyConfig
+    policy: GaussianPolicy
+    capabilities = frozenset({Capability.DISCOUNTS_BY_CLASS})
+    per_process = ("generator", "episodes", "obs")
+    going_on = ("obs", *Learner.going_on)
+    policy_of = staticmethod(gaussian_policy)
+    num_critics = 1
 
+    def __init__(self, world: VectorWorld, config: OnPolicyConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.low_precision = self.policy.low_precision
+        self.obs: Tensor | None = None
+        self.critic = self._make_critic(world.num_tasks if config.value_heads else 1).to(self.device)
+        horizon = _VALUE_HORIZON * config.rollout_steps * world.num_envs * world_size() / world.num_tasks
+        self.return_stats = RunningStats((self.num_critics * world.num_tasks,), max_count=horizon).to(self.device)
+        self.gamma = estimates.discounts(world, config.gamma, world.task_id)
+        sizes = self.shape.observations, self.shape.actions
+        self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device, self.num_critics)
+        self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
-class Demonstrations:
-    """Transitions to be imitated in addition to reinforcement; some tasks may have none.
+    def _make_critic(self, heads: int) -> nn.Module:
+        config = self.config
+        return network_of(config)(self.inputs, config.hidden, heads, 1.0, self.initial, config.activation)
 
-    The loss gets a term of behaviour cloning that fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation
-    6). Normalised advantages replace DAPG's weighting by the largest advantage.
-    """
+    @abstractmethod
+    def _update(self, batch: Batch) -> dict[str, Tensor]:
+        """Learn from a batch; return scalars to be logged."""
 
-    def __init__(self, data: Joined, config: MTPPOConfig, seed: int, device: torch.device):
-        self._config = config
-        self.fingerprint = data.fingerprint()
-        self._obs = data.observations.index_select(0, data.at).to(device)
-        self._actions = data.actions.to(device)
-        counts = torch.bincount(data.task)
-        self._of_task = torch.argsort(data.task, stable=True).to(device)
-        self._first = (counts.cumsum(0) - counts)[counts > 0].to(device)
-        self._count = counts[counts > 0].to(device)
-        self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
+    @abstractmethod
+    def _optimisers(self) -> Parts:
+        """Return the optimisers by their names in a checkpoint."""
 
-    def weight(self, env_steps: int) -> float:
-        """Return the weight of the term after ``env_steps``: it is halved every ``demonstration_half_life``."""
-        return self._config.demonstration_weight * 0.5 ** (env_steps / self._config.demonstration_half_life)
+    def _iterate(self) -> dict[str, float]:
+        # Step 1: collect a rollout with the present policy.
+        with self._collecting():
+            if self.obs is None:
+                self.obs = self._first_observations()
+            self.obs = collect(self.world, self.rollout, self.obs, self._sample, self._final_value, self.episodes)
+        # Step 2: compute advantages and the critic's targets.
+        batch, explained = self._prepare()
+        # Steps 3 to 6: learn from them.
+        losses = self._update(batch)
+        self.policy.observations.update(self.rollout.obs)
+        self.env_steps += self.rollout.rewards.numel() * world_size()
+        return self._metrics(losses, explained)
 
-    def draw(self) -> tuple[Tensor, Tensor]:
-        """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
-        size = (self._config.demonstration_batch,)
-        device = self._obs.device
-        task = torch.randint(len(self._count), size, generator=self.generator, device=device)
-        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
-        place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
-        chosen = self._of_task[self._first[task] + place]
-        return self._obs[chosen], self._actions[chosen]
+    def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = self.policy.distribution(obs)
+        noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
+        # The action is not clamped: the world clamps it, and the density must be of the sampled action.
+        return mean + log_std.exp() * noise, mean
 
-    def loss(self, policy: GaussianPolicy) -> Tensor:
-        """Return the mean of (a - mean)^2 / (2 std^2), summed over actions.
+    def _final_value(self, obs: Tensor, task_id: Tensor) -> Tensor:
+        return self._in_reward_units(self._critic(self.policy.observations(obs), task_id), task_id)
 
-        Standard deviations get no gradient, because only rewards move them.
-        """
-        raw, actions = self.draw()
-        obs = policy.observations(raw)
-        with autocast(raw.device, policy.low_precision):
-            means = policy.actor(obs)
-        return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
+    # The unit of the critic's values is given by its task's running mean and standard deviation of returns.
+    def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
+        with autocast(self.device, self.low_precision):
+            out = self.critic(obs)
+        if self.config.value_heads:
+            return of_head(out, task_id)
+        return out.squeeze(1)
 
-    def clone(self, policy: GaussianPolicy) -> None:
-        """Clone the behaviour before the first rollout: update statistics of observations, then train only the mean."""
-        policy.observations.update(self._obs)
-        weights = list(policy.actor.parameters())
-        adam = torch.optim.Adam(weights, lr=1e-3)
-        for _ in range(self._config.demonstration_cloning):
-            adam.zero_grad()
-            loss = self.loss(policy) / world_size()
-            loss.backward()
-            sum_gradients(weights, loss.detach()[None])
-            adam.step()
+    def _element(self, task_id: Tensor) -> Tensor:
+        if self.num_critics == 1:
+            return task_id
+        return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
 
+    def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
+        return self.return_stats.restore(values, self._element(task_id))
 
-def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-    """Return half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
-    return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()
+    def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
+        return self.return_stats.normalise(returns, self._element(task_id))
+
+    def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        self.return_stats.merge(mean, var, count)
+
+    @torch.no_grad()
+    def _prepare(self) -> tuple[Batch, Tensor]:
+        """Return the batch, and the share of the returns' variance that the critic explains, (num_tasks,)."""
+        r = self.rollout
+        num_tasks = self.world.num_tasks
+        task_id = self.world.task_id
+        flat_task_id = task_id.expand(r.rewards.shape).reshape(-1)
+        obs = self.policy.observations(r.obs).flatten(0, 1)
+        if self.low_precision:
+            obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
+
+        # Several critics make several columns per row, each treated as a separate row.
+        def each(x: Tensor) -> Tensor:
+            return x.repeat_interleave(self.num_critics, 1)
+
+        judged = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id)
+        values = judged.view(len(r.rewards), -1)
+        last_values = self._final_value(r.last_obs, task_id).view(-1)
+        rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
+        element = self._element(task_id).reshape(-1)
+        elements = self.num_critics * num_tasks
+        next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
+        gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
+        advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, self.config.lam, valid)
+        returns = advantages + values
+        explained = estimates.explained_variance(values, returns, element, elements, valid)
+        self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
+        advantages = estimates.normalise_per_task(advantages, element, elements, valid)
+        actions = r.actions.flatten(0, 1)
+        old_means = r.means.flatten(0, 1)
+        batch = Batch(
+            obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
+            old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
+            advantages=advantages.reshape(judged.shape),
+            targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
+            weights=r.valid.flatten().float()
+        )  # fmt: skip
+        return batch, explained.view(-1, num_tasks).mean(0)
+
+    def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
+        tensors = dict(losses)
+        tensors["Policy/std"] = self.policy.actor.log_std.detach().exp().mean()
+        tensors["Train/unstable"] = all_sum((~self.rollout.valid).sum())
+        for name, value in zip(self.world.task_names, explained, strict=True):
+            tensors[f"Value/explained_variance/{name}"] = value
+        return self.episodes.metrics() | as_numbers(tensors)
+
+    def _parts(self) -> Parts:
+        learned = {"critic": self.critic, "return_stats": self.return_stats, **self._optimisers()}
+        return learned | {"generator": self.generator, "episodes": self.episodes}
+
+    def _check_size(self, state: State) -> None:
+        if state["obs"] is not None:
+            here = tuple(self.rollout.last_obs.shape)
+            self._expect("(num_envs, observations) = ", tuple(state["obs"].shape), here)
 
 
 class MTPPO(OnPolicy):
@@ -182,81 +289,44 @@ class MTPPO(OnPolicy):
         sources.check(self.name, "demonstrations", "teachers")
         check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
-        self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
-        balances: dict[Balancing, Callable[[], Balance | None]] = {
-            "none": lambda: None,  # the losses are summed
-            "pcgrad": lambda: GradientBalance(project_conflicting),
-            "cagrad": lambda: GradientBalance(partial(conflict_averse, radius=config.cagrad_radius)),
-            "famo": lambda: Famo(world.num_tasks, config.famo_rate, config.famo_decay, self.device),
-        }
-        self.balance = balances[config.gradient_surgery]()
-        alone = self.device.type == "cuda" and self.balance is None and world_size() == 1
-        if alone:
+        self.adams = AdaptiveAdams(
+            self.policy.actor.parameters(), self.critic.parameters(), config.learning_rate, config.learning_rate_range,
+            config.desired_kl, config.critic_learning_rate, self.device
+        )  # fmt: skip
+        self.balance = balance_of(config.gradient_surgery, world.num_tasks, self.device)
+        self._graphs = None
+        # The weight of demonstrations is no tensor, so that an update with them cannot be recorded.
+        alone = self.balance is None and sources.demonstrations is None and world_size() == 1
+        if alone and self.device.type == "cuda":
             self._graphs = GraphCache(dict, lambda _: None, cuda_graph)
-        else:
-            self._graphs = None
         if sources.demonstrations is not None:
-            self._graphs = None  # the weight of demonstrations is no tensor
-            self.demonstrations = Demonstrations(sources.demonstrations, config, seed, self.device)
+            self.demonstrations = Demonstrations(sources.demonstrations, config.demonstration_batch, seed, self.device)
             self.per_process = (*self.per_process, "demonstrated")
         if sources.teachers is not None:
-            self.lessons = Lessons(world, self.policy, config.teacher_learning_rate, config.max_grad_norm)
-            self.lessons.begin(sources.teachers, config.teacher_samples, config.rollout_steps, config.teacher_batch)
+            self.lessons = Lessons(world, self.policy, sources.teachers, config.rollout_steps)
             self.per_process = (*self.per_process, "data")
             self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
 
-    def start_from(self, policy: State) -> None:
-        """Start as in the base class, with standard deviations clamped to ``std_range``.
-
-        An adaptive step size starts at its minimum, because a KL is known only after a step: the first update of a
-        policy trained by DAgger had a KL of 187 with a step size of 3e-4.
-        """
-        super().start_from(policy)
-        self._forget_graphs()
-        self._bound_std()
-        if self.config.adaptive_learning_rate:
-            self.adams.rate.fill_(self.adams.bounds[0])
-
-    @torch.no_grad()
-    def _bound_std(self) -> None:
-        low, high = (math.log(std) for std in self.config.std_range)
-        self.policy.actor.log_std.clamp_(low, high)
-
-    def _forget_graphs(self) -> None:
-        if self._graphs is not None:
-            self._graphs.forget()
-
     def _iterate(self) -> dict[str, float]:
-        if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
-            self.demonstrations.clone(self.policy)
-        self.policy.observations.settled = self._critic_alone()
+        if self.demonstrations is not None and not self.env_steps:
+            self.demonstrations.clone(self.policy, self.config.demonstration_cloning)
+        self.policy.observations.settled = self.env_steps < self.config.critic_first
         return super()._iterate()
 
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        if self.lessons is not None and self.lessons.data is not None:
+        if self.lessons is not None:
             step = self.lessons.data.added % self.config.rollout_steps
             self.lessons.teachers.reset(self.rollout.ended[step - 1])
             self.lessons.label(obs)
         return super()._sample(obs)
 
-    def _imitated(self) -> float:
-        if self.demonstrations is None:
-            return 0.0
-        return self.demonstrations.weight(self.env_steps)
-
-    def _critic_alone(self) -> bool:
-        return self.env_steps < self.config.critic_first
-
-    def _optimisers(self) -> Parts:
-        return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
-
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg = self.config
-        actor = self.policy.actor
-        critic_alone = self._critic_alone()
-        old_log_std = actor.log_std.detach().clone()
+        critic_alone = self.env_steps < cfg.critic_first
+        old_log_std = self.policy.actor.log_std.detach().clone()
         measured = list[Tensor]()
-        for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
+        # Step 3: several epochs of shuffled mini-batches. On CUDA the steps on them are recorded once and replayed.
+        for first, index, count in mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches, self.generator):
             inputs = *vars(batch.select(index)).values(), count, old_log_std
             work = partial(self._descend, first, critic_alone)
             if self._graphs is None:
@@ -264,61 +334,37 @@ class MTPPO(OnPolicy):
             else:
                 name = f"{len(index)} samples, first {first}, critic alone {critic_alone}"
                 measured.append(self._graphs.run(name, work, *inputs).clone())
-        names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
-        names += ["Loss/demonstrations"] * bool(self._imitated())
+        names = list[str](NAMES)
+        if self.balance is not None:
+            names.append(self.balance.tag)
+        if self.demonstrations is not None:
+            names.append("Loss/demonstrations")
         means = torch.stack(measured).mean(0)
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
-            reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
-        return reported | ({} if self.lessons is None else self._take(self.lessons))
+            reported["Policy/demonstration_weight"] = means.new_tensor(self.demonstrations.weight(self.env_steps))
+        # Beyond the paper: teachers' labels hold each class to what the policy could do, in proportion to its failure.
+        if self.lessons is not None:
+            self.lessons.take_moments(cfg.rollout_steps)
+            updates = 0 if critic_alone else cfg.teacher_updates
+            reported |= self.lessons.learn_by_need(updates, self.generator, self.episodes)
+        return reported
 
     def _descend(self, first: bool, critic_alone: bool, *inputs: Tensor) -> Tensor:
         """Take one step on a mini-batch's fields, the sum of its weights and the old log standard deviations."""
-        *batch, count, old_log_std = inputs
-        part = Batch(*batch)
-        numbers = self._gradients(part, count, old_log_std)
-        cfg = self.config
-        self.adams.descend(None if first else numbers[2], cfg.max_grad_norm, cfg.clip_apart, critic_alone)
-        self._bound_std()
-        if self.balance is not None:
-            with torch.no_grad():
-                self.balance.learn(lambda: self._above_least(part, count, old_log_std))
-        return numbers
-
-    def _take(self, lessons: Lessons) -> dict[str, Tensor]:
-        """Learn from teachers in proportion to the failure of each class; do nothing while only the critic learns."""
-        assert lessons.data is not None
-        lessons.take_moments(self.config.rollout_steps)
-        tasks = lessons.data.tasks
-        needs = self._needs()
-        most = needs[tasks].max()
-        if self._critic_alone():
-            updates = 0
-        else:
-            updates = round(self.config.teacher_updates * float(most))
-        if updates:
-            losses = lessons.learn(updates, self.generator, needs[tasks] / most)
-        else:
-            losses = {}
-        weights = {f"Policy/teacher_weight/{self.world.task_names[task]}": needs[task] for task in tasks.tolist()}
-        return losses | weights
-
-    def _needs(self) -> Tensor:
-        """Return each class's relative distance from ``teacher_success``, from 1 to 0: (num_tasks,)."""
-        _, _, successes, counts = all_sum(self.episodes.sums)
-        return (1.0 - successes / counts.clamp_min(_EPISODES) / self.config.teacher_success).clamp_min(0.0)
-
-    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        cfg = self.config
+        *fields, count, old_log_std = inputs
+        b = Batch(*fields)
         actor = self.policy.actor
+        # Step 4: the clipped surrogate (equation 7) and the critic's squared error, means over the mini-batch.
         loss = self._loss(b, count, old_log_std)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
-        rest = cfg.value_loss_weight * value - cfg.entropy_weight * loss.entropy
+        rest = _VALUE_LOSS_WEIGHT * value
         numbers = loss.numbers(value)
         imitated = None
-        if self.demonstrations is not None and (weight := self._imitated()):
+        if self.demonstrations is not None:
             imitated = self.demonstrations.loss(self.policy) / world_size()
-            rest = rest + weight * imitated
+            rest = rest + self.demonstrations.weight(self.env_steps) * imitated
+        # Step 5: their gradients, summed over processes; the tasks' conflicting gradients may be balanced.
         self.adams.zero_grad()
         if self.balance is not None:
             losses = self._per_task(-loss.earned, b.task_id)
@@ -329,7 +375,13 @@ class MTPPO(OnPolicy):
             (loss.surrogate + rest).backward()
         if imitated is not None:
             numbers.append(imitated.detach())
-        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+        summed = sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+        # Step 6: a step of Adam, whose size follows the KL (element 2) of the mini-batch. The first one's KL is 0.
+        self.adams.descend(None if first else summed[2], _MAX_GRAD_NORM, critic_alone)
+        self._bound_std()
+        if self.balance is not None:
+            self.balance.learn(lambda: self._above_least(b, count, old_log_std))
+        return summed
 
     def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PolicyLoss:
         actor = self.policy.actor
@@ -348,14 +400,36 @@ class MTPPO(OnPolicy):
         loss = self._loss(b, count, old_log_std)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
+    def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
+        return x.new_zeros(self.world.num_tasks).index_add(0, task_id, x)
+
+    @torch.no_grad()
+    def _bound_std(self) -> None:
+        low, high = (math.log(std) for std in self.config.std_range)
+        self.policy.actor.log_std.clamp_(low, high)
+
+    def start_from(self, policy: State) -> None:
+        """Start as in the base class, with standard deviations within ``std_range`` and the smallest step size."""
+        super().start_from(policy)
+        self._forget_graphs()
+        self._bound_std()
+        # A KL is known only after a step: of a policy trained by DAgger the first was 187 with a step size of 3e-4.
+        self.adams.rate.fill_(self.adams.bounds[0])
+
+    def _forget_graphs(self) -> None:
+        if self._graphs is not None:
+            self._graphs.forget()
+
+    def _optimisers(self) -> Parts:
+        return self.adams.parts() | ({} if self.balance is None else self.balance.parts())
+
     def _parts(self) -> Parts:
-        own = self.demonstrations
-        lessons = self.lessons
-        if lessons is None:
-            parts = {}
-        else:
-            parts = {"teacher_adam": lessons.adam, "label_stats": lessons.label_stats}
-        return super()._parts() | parts | ({} if own is None else {"demonstrated": own.generator})
+        parts = super()._parts()
+        if self.lessons is not None:
+            parts |= {"teacher_adam": self.lessons.adam, "label_stats": self.lessons.label_stats}
+        if self.demonstrations is not None:
+            parts |= {"demonstrated": self.demonstrations.generator}
+        return parts
 
     def _place(self) -> State:
         own = self.demonstrations
@@ -363,17 +437,13 @@ class MTPPO(OnPolicy):
 
     def state_dict(self) -> State:
         """Return the state as in the base class; the labels copy themselves, because two copies at once may not fit."""
-        if self.lessons is None:
-            data = None
-        else:
-            data = self.lessons.data
-        return super().state_dict() | ({} if data is None else {"data": data.state_dict()})
+        return super().state_dict() | ({} if self.lessons is None else {"data": self.lessons.data.state_dict()})
 
     def load_state_dict(self, state: State) -> None:
         """Restore the state as in the base class; begin new episodes if teachers follow an episode from its start."""
         super().load_state_dict(state)
         self._forget_graphs()
-        if self.lessons is None or self.lessons.data is None:
+        if self.lessons is None:
             return
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:
@@ -382,23 +452,5 @@ class MTPPO(OnPolicy):
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
-        stored = state.get("demonstrations")
-        own = self.demonstrations
-        if own is not None and stored is not None and stored != own.fingerprint:
-            raise BidexError(
-                f"{self.name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "
-                f"here {own.fingerprint['transitions']:,.0f}). Resume with the run's own data set."
-            )
-
-    def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
-        return x.new_zeros(self.world.num_tasks).index_add(0, task_id, x)
-
-
-class PPO(MTPPO):
-    """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
-
-    The class is MT-PPO with the presets of a single task (the appendix's B.1).
-    """
-
-    presets = SINGLE_TASK_PRESETS
-    task_presets = TASK_PRESETS
+        if self.demonstrations is not None:
+            self.demonstrations.check(self.name, state.get("demonstrations"))

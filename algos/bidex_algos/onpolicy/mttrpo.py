@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.networks import Autocast, autocast, gaussian_kl, gaussian_log_prob
-from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.onpolicy.mtppo import Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.trust_region import trust_region_step
 from bidex_meta.training.distributed import all_sum, sum_gradients
 from bidex_meta.training.learner import Parts
@@ -46,8 +47,9 @@ PRESETS: dict[str, MTTRPOConfig] = {
     # The Bi-DexHands appendix has no table for TRPO. Networks, rollouts and returns are those of the nearest one, Table
     # 47 (MT-PPO); trust region and line search are the defaults of Bi-DexHands' MTTRPO class.
     "paper": MTTRPOConfig(
-        **TABLE_47, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
-        accept_ratio=0.1, critic_learning_rate=3e-4, critic_epochs=5,
+        hidden=(2048, 1024, 512), value_heads=False, init_std=0.8, rollout_steps=8, num_minibatches=4, gamma=0.96,
+        lam=0.95, normalise_observations=False, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1,
+        backtracks=10, backtrack_factor=0.5, accept_ratio=0.1, critic_learning_rate=3e-4, critic_epochs=5,
     ),
     "laptop": MTTRPOConfig(),
 }  # fmt: skip
@@ -142,7 +144,7 @@ class MTTRPO(OnPolicy):
         cfg = self.config
         parameters = list(self.critic.parameters())
         losses: list[Tensor] = []
-        for _, index, count in self._mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches):
+        for _, index, count in mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches, self.generator):
             b = batch.select(index)
             loss = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
             self.critic_adam.zero_grad()

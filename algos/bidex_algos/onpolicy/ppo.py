@@ -27,6 +27,11 @@ class PPOConfig(LearnerConfig):
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
     critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
 
+    @property
+    def followed_kl(self) -> float | None:
+        """Return the KL that the step size follows; None: it stays the same."""
+        return self.desired_kl if self.adaptive_learning_rate else None
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_rising(self, self.algo, "learning_rate_range")
@@ -108,21 +113,17 @@ class _Adam(torch.optim.Adam):
 class AdaptiveAdam:
     """Adam whose step size is divided by 1.5 above twice the desired KL and multiplied by 1.5 below half of it.
 
-    The step size is a tensor, so the host does not wait for the device. ``share`` is these parameters' part of the
-    config's ``desired_kl``.
+    The step size is a tensor, so the host does not wait for the device. It stays the same if ``desired_kl`` is None.
     """
 
     def __init__(
-        self, parameters: Iterable[nn.Parameter], config: PPOConfig, device: torch.device, eps: float = 1e-8,
-        share: float = 1.0
+        self, parameters: Iterable[nn.Parameter], learning_rate: float, bounds: tuple[float, float],
+        desired_kl: float | None, device: torch.device, eps: float = 1e-8
     ):  # fmt: skip
-        if config.adaptive_learning_rate:
-            self.desired_kl = share * config.desired_kl
-        else:
-            self.desired_kl = None
-        self.bounds = config.learning_rate_range
+        self.desired_kl = desired_kl
+        self.bounds = bounds
         self.weights = list(parameters)
-        self.rate = torch.tensor(config.learning_rate, device=device)
+        self.rate = torch.tensor(learning_rate, device=device)
         self.actor = _Adam(self.weights, self.rate, eps)
 
     def zero_grad(self) -> None:
@@ -149,14 +150,14 @@ class AdaptiveAdams(AdaptiveAdam):
     """Adam for the actor and for the critic; ``critic_learning_rate`` is fixed, or None to follow the actor's."""
 
     def __init__(
-        self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: PPOConfig, device: torch.device
-    ):
-        super().__init__(actor, config, device)
-        fixed = config.critic_learning_rate
-        if fixed is None:
+        self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], learning_rate: float,
+        bounds: tuple[float, float], desired_kl: float | None, critic_learning_rate: float | None, device: torch.device
+    ):  # fmt: skip
+        super().__init__(actor, learning_rate, bounds, desired_kl, device)
+        if critic_learning_rate is None:
             self.critic_rate = self.rate
         else:
-            self.critic_rate = torch.tensor(fixed, device=device)
+            self.critic_rate = torch.tensor(critic_learning_rate, device=device)
         self.critic_weights = list(critic)
         self.critic = _Adam(self.critic_weights, self.critic_rate)
 
@@ -165,12 +166,10 @@ class AdaptiveAdams(AdaptiveAdam):
         super().zero_grad()
         self.critic.zero_grad()
 
-    def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
-        """Take one step of both; ``apart``: clip each norm separately; ``critic_alone``: the actor does not change."""
+    def descend(self, kl: Tensor | None, max_grad_norm: float, critic_alone: bool = False) -> None:
+        """Take one step of both, with each norm clipped separately; ``critic_alone``: the actor does not change."""
         self.follow(None if critic_alone else kl)
-        actor = self.weights
-        critic = self.critic_weights
-        for weights in [actor, critic] if apart else [actor + critic]:
+        for weights in (self.weights, self.critic_weights):
             nn.utils.clip_grad_norm_(weights, max_grad_norm)
         if not critic_alone:
             self.actor.step()

@@ -174,7 +174,8 @@ def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.
     # a hand has 5
     mass = float(model.body_mass[1])
     longest = float((high - low).max())
-    least, most = (0.002, 2.0)
+    least = 0.002
+    most = 2.0
     if not least <= mass <= most:
         raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:

@@ -6,6 +6,7 @@ another folder.
 
 import math
 import re
+from itertools import product
 from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat
@@ -152,7 +153,7 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
 _AROUND, _OVER = 12, 128
 """Number of points around a cylinder's rim, placed 3.5 % outside so that they enclose the rim; number of directions in
 which the outermost points of an ellipsoid or a mesh are taken."""
-_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+_SIGNS = np.array(list(product((-1, 1), repeat=3)))
 
 
 def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]:

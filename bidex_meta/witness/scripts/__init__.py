@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import Rules
+from bidex_meta.rules import Rules
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import push_blocks

@@ -62,10 +62,10 @@ class Between:
         self.way = x + take.ahead - self.middle[0], y + aside - self.middle[1]
         self.off = math.hypot(*self.way)
         self.over = self.middle[2] - z - take.above
-        self.firm = min(
-            (float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free)
-            for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True)
-        )
+        shares = []
+        for side, joint, free, firm in zip(SIDES, take.joints, take.free, take.firm, strict=True):
+            shares.append((float(hands.where(f"{side}/{joint}_position")) - free) / (firm - free))
+        self.firm = min(shares)
         near = (
             ramp(self.off, 0.05, 0.03)
             * ramp(abs(self.over), 0.05, 0.035)

@@ -36,8 +36,14 @@ def push_blocks(hands: HandController) -> Actions:
             place = hands.where(f"{blocks[side]}/position")
             way = hands.frozen(goals[side])[:2] - place[:2]
             far = float(way.norm())
-            lead = way * (0.05 / far if far > 0.05 else 0.0 if far < 0.01 else 1.0)
+            if far > 0.05:
+                lead = way * (0.05 / far)
+            elif far < 0.01:
+                lead = way * 0.0
+            else:
+                lead = way * 1.0
             # Where the fork is, if it follows its block; it never runs ahead.
             ahead = float(lead[0])
-            points.append(beside(place, _BEHIND + ahead if ahead < -0.004 else _CLEAR, float(lead[1]), _LOW))
+            behind_block = _BEHIND + ahead if ahead < -0.004 else _CLEAR
+            points.append(beside(place, behind_block, float(lead[1]), _LOW))
         yield from hands.lead_each(points, 0.5)

@@ -1,6 +1,7 @@
 """Scripted policies in which one finger moves a part: a bottle's cap, and a cup by its ear."""
 
 import math
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from bidex_meta.witness.controller import Actions, HandController, Point, beside
 
 _TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
 _HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
-_FIST = {f"{finger}J{joint}": 1.4 for finger in ("FF", "MF", "RF") for joint in (1, 2)}
+_FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"), (1, 2))}
 
 
 def pull_cap(hands: HandController) -> Actions:

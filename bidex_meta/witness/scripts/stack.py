@@ -16,8 +16,12 @@ _EDGE = 0.05
 
 def stack_in_order(hands: HandController) -> Actions:
     """Clamp the lower block with the backs of both hands' fingers, carry it, and stack the other on it."""
-    second_above = hands.wide and float(hands.frozen("upper")) < 0.0
-    upper, lower = ("block2", "block1") if second_above else ("block1", "block2")
+    if hands.wide and float(hands.frozen("upper")) < 0.0:
+        upper = "block2"
+        lower = "block1"
+    else:
+        upper = "block1"
+        lower = "block2"
     goals = {block: hands.frozen(f"goal{block[-1]}") for block in (upper, lower)}
     for side in SIDES:
         hands.hold(side)

@@ -44,10 +44,8 @@ def open_inward(hands: HandController) -> Actions:
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
     ) -> Actions:
         """Lead bent fingers behind the bars of leaves open by these angles, or ``aside`` and ``back`` of that."""
-        at = [
-            leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle)
-            for leaf, angle in zip(_INWARD, angles, strict=True)
-        ]
+        pairs = zip(_INWARD, angles, strict=True)
+        at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle) for leaf, angle in pairs]
         yield from _lead(hands, at, angles, steps, speed)
 
     for side in SIDES:
@@ -57,10 +55,8 @@ def open_inward(hands: HandController) -> Actions:
     yield from go(led, aside=0.11, steps=6, speed=0.5)
     yield from go(led, steps=15, speed=0.5)
     while hands.steps_left:
-        led = [
-            min(angle + 0.0075, now + 0.1, last)
-            for angle, now, last in zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
-        ]
+        triples = zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
+        led = [min(angle + 0.0075, now + 0.1, last) for angle, now, last in triples]
         yield from go(led)
 
 
@@ -89,9 +85,8 @@ def close_outward(hands: HandController) -> Actions:
     led = start
     lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
     while hands.steps_left:
-        led = [
-            max(angle - 0.012, now - 0.22, last) for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
-        ]
+        triples = zip(led, _angles(hands), lasts, strict=True)
+        led = [max(angle - 0.012, now - 0.22, last) for angle, now, last in triples]
         yield from go(led)
 
 
@@ -99,8 +94,15 @@ def push(hands: HandController) -> Actions:
     """Push the leaves away with fists above the bars, each to its angle, and then let go of it."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
-    leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
-    goals = [sign * goal for goal in _goals(hands, -0.1 if inward else 1.35)]  # inward they are shut
+    if inward:
+        leaves = _INWARD
+        sign = 1.0
+        usual = -0.1  # they are shut
+    else:
+        leaves = _OUTWARD
+        sign = -1.0
+        usual = 1.35
+    goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
         """Lead fists to leaves that are open towards the hands by these angles, at distance ``back``."""
@@ -114,10 +116,8 @@ def push(hands: HandController) -> Actions:
     while hands.steps_left:
         now = [sign * angle for angle in _angles(hands)]
         left = [angle - goal for angle, goal in zip(now, goals, strict=True)]
-        led = [
-            max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1
-            for was, angle, more in zip(led, now, left, strict=True)
-        ]
+        triples = zip(led, now, left, strict=True)
+        led = [max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1 for was, angle, more in triples]
         yield from go(led, back=0.0)
 
 

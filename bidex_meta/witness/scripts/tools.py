@@ -38,7 +38,8 @@ def press_switches(hands: HandController) -> Actions:
             above = _tip(hands, side, _button(hands, name), 0.06)
             height = float(hands.at(side)[2])
             down = min(0.008, max(0.002, 0.8 * _LEVER * left))
-            points.append((above[0], above[1], height + 0.01 if done[i] else height - down))
+            target = height + 0.01 if done[i] else height - down
+            points.append((above[0], above[1], target))
         yield from hands.lead_each(points, 0.6)
 
 

@@ -1,4 +1,4 @@
-"""Plan ``bidex-meta transfer``: a suite file per held-out class, the class's demonstrations, and a run per cell."""
+"""Plan a transfer: a suite file per held-out class, the class's demonstrations, and a run per cell."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -9,31 +9,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.spaces import Box
 
-from bidex_meta.cli.run_flags import config_of_words
-from bidex_meta.config import RunConfig
 from bidex_meta.data import Dataset, open_dataset, part_files, writer
 from bidex_meta.data.collect import collect_successes, progress, resumed_writer
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation.transfer_measures import NOTHING
+from bidex_meta.experiments.evaluating import FinalEvaluation
+from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.run_data import dataset_metadata
-from bidex_meta.experiments.sweep_plan import PlannedRun, words_of
+from bidex_meta.experiments.sweep_plan import PlannedRun
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.suite import V1, Suite, SuiteClass, plain_name
 from bidex_meta.training.launch import say
-from bidex_meta.utils.files import absolute, is_file, read_text
+from bidex_meta.utils.files import JsonObject, absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.worlds import Worlds, WorldsConfig
 
-_NETWORK = (
-    "architecture", "modules", "hidden", "activation", "normalise_observations", "point_widths", "points_read",
-)  # fmt: skip
+_NETWORK = ("architecture", "hidden", "activation", "normalise_observations", "point_widths")
 """Fields of a learner's config that a policy to start from must share."""
-_ALGO = "ppo"
-_PRESET = "laptop"
-_USUAL = (f"--preset={_PRESET}", "--logger=none", "--learner.demonstration-cloning=5000")
 _EVALUATIONS = 100  # evaluations of a run by reinforcement, evenly spaced
 _LONG = 10**9  # steps in which only the critic learns, so that a run by demonstrations keeps the cloned policy
 _PATIENCE = 3  # most rounds of a script
@@ -54,16 +51,18 @@ class Arm(NamedTuple):
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy
-    network: list[str]  # words of its network
+    network: JsonObject  # the values of its learner's config that decide the network
 
 
-def arms_of(paths: Sequence[Path]) -> list[Arm]:
+def arms_of(folders: Sequence[RunFolder]) -> list[Arm]:
     """Return the first run, a fresh policy with the first run's network, and the other runs."""
-    folders = [RunFolder.open(absolute(path)) for path in paths]
-    values = [folder.config().learner_values for folder in folders]
-    network = [[w for n in _NETWORK if n in own for w in words_of(f"learner.{n}", own[n])] for own in values]
-    arms = [Arm(folder.path.name, folder.path, words) for folder, words in zip(folders, network, strict=True)]
-    arms.insert(1, Arm(NOTHING, None, network[0]))
+    arms = []
+    for folder in folders:
+        values = folder.config().learner_values
+        network = {name: values[name] for name in _NETWORK if name in values}
+        path = absolute(folder.path)
+        arms.append(Arm(path.name, path, network))
+    arms.insert(1, Arm(NOTHING, None, arms[0].network))
     names = [arm.name for arm in arms]
     for name in names:
         if names.count(name) > 1:
@@ -211,45 +210,42 @@ def _is_complete(folder: Path) -> bool:
     return is_file(inner / part_files.METADATA) and not is_file(inner / part_files.RECORDING)
 
 
-def shared_words(num_envs: int, more: Sequence[str]) -> list[str]:
-    """Return the words of all runs; ``more`` holds the user's words, which override the usual words."""
-    return [*_USUAL, *more, f"--algo={_ALGO}", f"--num-envs={num_envs}"]
-
-
-def reinforced(steps: int, planned: RunConfig[Any]) -> list[str]:
-    """Return the words of a run by reinforcement: evaluate 100 times, or after each iteration; [] for 0 steps."""
-    iteration = planned.num_envs * planned.learner_values["rollout_steps"]
-    if steps:
-        return [f"--steps={steps}", f"--evaluate-every={max(1, steps // (_EVALUATIONS * iteration))}"]
-    return []
+def evaluate_every(steps: int, config: AnyConfig) -> int:
+    """Return the iterations between evaluations: 100 evaluations in all, or one after each iteration."""
+    iteration = config.num_envs * config.learner_values["rollout_steps"]
+    return max(1, steps // (_EVALUATIONS * iteration))
 
 
 def cells_of(
-    file: Path, name: str, arms: Sequence[Arm], seed: int, words: Sequence[str], out: Path, steps: list[str],
+    config: AnyConfig, final: FinalEvaluation, file: Path, name: str, arms: Sequence[Arm], out: Path, steps: int,
     counts: Sequence[int], dataset: Dataset | None
 ) -> Iterator[Cell]:  # fmt: skip
-    """Yield the cells of a class and seed: for each arm one per count of demonstrations, then by reinforcement.
+    """Yield the cells of a class and of a config's seed.
 
-    Without a data set only the cells without demonstrations are yielded, without ``steps`` none by reinforcement.
+    For each arm there is a cell per count of demonstrations, then one by reinforcement. Without a data set there are
+    only the cells without demonstrations; with 0 steps there are none by reinforcement.
     """
-    for count in (count for count in counts if not count or dataset is not None):
-        track = ["--steps=1", f"--learner.critic-first={_LONG}"]  # one iteration
+    preset = replace(config, learner=learner_kind(config.algo).presets[config.preset]).learner_values
+    changed = {key: value for key, value in config.learner_values.items() if value != preset[key]}
+    base = replace(config, suite=str(file))
+    tracks: list[tuple[int | None, AnyConfig]] = []
+    for count in counts:
+        if count and dataset is None:
+            continue
+        data = config.demonstrations
         if count and dataset is not None:
-            track.append(f"--demonstrations={absolute(some_of(dataset, name, count, seed, out / 'data'))}")
-        yield from (_cell(file, name, arm, seed, [*words, *track], out, count) for arm in arms)
+            data = (str(absolute(some_of(dataset, name, count, config.seed, out / "data"))),)
+        once = changed | {"critic_first": _LONG}
+        tracks.append((count, replace(base, steps=1, demonstrations=data, learner=once)))  # one iteration
     if steps:
-        yield from (_cell(file, name, arm, seed, [*words, *steps], out, None) for arm in arms)
-
-
-def _cell(file: Path, name: str, arm: Arm, seed: int, words: list[str], out: Path, count: int | None) -> Cell:
-    if arm.path is None:
-        start = []
-    else:
-        start = [f"--start-from={arm.path}"]
-    if count is None:
-        how = _ALGO
-    else:
-        how = f"{count}-demonstrations"
-    path = out / "runs" / f"{short_name(name)}-{arm.name}-{how}-seed{seed}".replace(" ", "-")
-    run = PlannedRun(path, arm.name, name, seed, (f"--suite={file}", *words, *arm.network, *start))
-    return Cell(replace(run, config=config_of_words(run.begin[1:])), name, arm.name, count)
+        every = evaluate_every(steps, config)
+        tracks.append((None, replace(base, steps=steps, evaluate_every=every, learner=changed)))
+    for count, track in tracks:
+        how = config.algo if count is None else f"{count}-demonstrations"
+        for arm in arms:
+            start = None if arm.path is None else str(arm.path)
+            given = replace(track, start_from=start, learner=track.learner | arm.network)
+            path = out / "runs" / f"{short_name(name)}-{arm.name}-{how}-seed{config.seed}".replace(" ", "-")
+            resolved = resolve(given)
+            check(resolved)
+            yield Cell(PlannedRun(path, given, arm.name, final, resolved), name, arm.name, count)

@@ -1,0 +1,86 @@
+"""Demonstrations beside reinforcement: a term of behaviour cloning in PPO's loss, and cloning before the training."""
+
+import torch
+from torch import Tensor
+
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import GaussianPolicy
+from bidex_meta.data.joined import Joined
+from bidex_meta.errors import BidexError
+from bidex_meta.training.distributed import own_seed, sum_gradients, world_size
+
+WEIGHT = 0.1  # of the term at the start
+HALF_LIFE = 500_000.0  # environment steps in which the weight falls to half
+
+_DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
+
+
+class Demonstrations:
+    """Transitions to be imitated in addition to reinforcement; some tasks may have none.
+
+    The loss gets a term of behaviour cloning that fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation
+    6). Normalised advantages replace DAPG's weighting by the largest advantage.
+    """
+
+    def __init__(self, data: Joined, batch_size: int, seed: int, device: torch.device):
+        self.batch_size = batch_size
+        self.fingerprint = data.fingerprint()
+        self._obs = data.observations.index_select(0, data.at).to(device)
+        self._actions = data.actions.to(device)
+        counts = torch.bincount(data.task)
+        self._of_task = torch.argsort(data.task, stable=True).to(device)
+        self._first = (counts.cumsum(0) - counts)[counts > 0].to(device)
+        self._count = counts[counts > 0].to(device)
+        self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
+
+    def weight(self, env_steps: int) -> float:
+        """Return the weight of the term after ``env_steps``: it is halved every ``HALF_LIFE``."""
+        return WEIGHT * 0.5 ** (env_steps / HALF_LIFE)
+
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
+        size = (self.batch_size,)
+        device = self._obs.device
+        task = torch.randint(len(self._count), size, generator=self.generator, device=device)
+        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
+        place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
+        chosen = self._of_task[self._first[task] + place]
+        return self._obs[chosen], self._actions[chosen]
+
+    def loss(self, policy: GaussianPolicy) -> Tensor:
+        """Return the mean of (a - mean)^2 / (2 std^2), summed over actions.
+
+        Standard deviations get no gradient, because only rewards move them.
+        """
+        raw, actions = self.draw()
+        obs = policy.observations(raw)
+        with autocast(raw.device, policy.low_precision):
+            means = policy.actor(obs)
+        return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
+
+    def clone(self, policy: GaussianPolicy, steps: int) -> None:
+        """Clone the behaviour in ``steps`` steps: update statistics of observations, then train only the mean."""
+        if not steps:
+            return
+        policy.observations.update(self._obs)
+        weights = list(policy.actor.parameters())
+        adam = torch.optim.Adam(weights, lr=1e-3)
+        for _ in range(steps):
+            adam.zero_grad()
+            loss = self.loss(policy) / world_size()
+            loss.backward()
+            sum_gradients(weights, loss.detach()[None])
+            adam.step()
+
+    def check(self, learner: str, stored: dict[str, float] | None) -> None:
+        """Raise BidexError if a checkpoint's ``stored`` fingerprint, if any, is that of other data."""
+        if stored is not None and stored != self.fingerprint:
+            raise BidexError(
+                f"{learner}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "
+                f"here {self.fingerprint['transitions']:,.0f}). Resume with the run's own data set."
+            )
+
+
+def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
+    """Return half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
+    return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()

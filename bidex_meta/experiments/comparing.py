@@ -1,0 +1,62 @@
+"""Tables of groups of runs that differ in the seed alone."""
+
+from collections.abc import Sequence
+from itertools import chain
+
+import numpy as np
+
+from bidex_meta.evaluation.comparison import Group, score_over, success_over
+from bidex_meta.evaluation.statistics import NONE, iqm_over_seeds
+from bidex_meta.runs.atomic import Json
+
+
+def group_row(group: Group, first: Group) -> Json:
+    """Return the measures of a group of runs, each compared with the first group, ready for JSON."""
+    row: Json = {
+        "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
+        "hours": round(group.hours, 3),
+    }  # fmt: skip
+    measures = ("success", group.success, success_over(group, first)), ("score", group.scores, score_over(group, first))
+    for name, own, over in measures:
+        row[f"{name}_iqm"] = None if own is None else vars(iqm_over_seeds(own))
+        row[f"{name}_over_first"] = None if over is None else vars(over)
+    row["classes"] = {}
+    for i, name in enumerate(group.classes):
+        row["classes"][name] = {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
+    return row
+
+
+def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Return columns and rows of a table with one row per group of runs, each compared with the first group."""
+    columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
+    rows = []
+    for group in groups:
+        if group.scores is None:
+            score = None
+        else:
+            score = iqm_over_seeds(group.scores)
+        measures = (iqm_over_seeds(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
+        over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
+        cells = [NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]
+        seeds = f"{len(group.seeds)} ({', '.join(map(str, group.seeds))})"
+        rows.append([group.label, seeds, group.steps_text(), f"{group.hours:.2f}", *cells])
+    return [*columns, "success over the first", "score over the first"], rows
+
+
+def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Return columns and rows of a table with one row per class and group: mean over seeds, and range of seeds."""
+    rows = []
+    for name in dict.fromkeys(chain.from_iterable(group.classes for group in groups)):
+        for group in groups:
+            if name not in group.classes:
+                continue
+            place = list(group.classes).index(name)
+            success = 100.0 * group.success[:, place]
+            returns = group.returns[:, place]
+            rows.append([name, group.label, _spread(success, ".1f"), _spread(returns, ".4g")])
+    return ["class", "group", "success, mean (%) [seeds]", "return, mean [seeds]"], rows
+
+
+def _spread(values: np.ndarray, form: str) -> str:
+    """Format the mean, the least and the largest of values."""
+    return f"{values.mean():{form}} [{values.min():{form}} to {values.max():{form}}]"

@@ -1,0 +1,82 @@
+"""A control of adaptation: held-out tasks, adapted to their own data and to data of other tasks."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import run_kind
+from bidex_meta.evaluation.control_arms import Control, control
+from bidex_meta.evaluation.eval_protocol import Protocol
+from bidex_meta.experiments import metatest
+from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.policies import policy_loader
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.provenance import check_alike
+from bidex_meta.training.launch import say
+from bidex_meta.training.learner import Capability
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+
+def control_runs(
+    folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
+    seed: int, device: str, engine: str
+) -> list[Control]:  # fmt: skip
+    """Play all arms of runs that differ in the seed alone, and return the results of each run.
+
+    Args:
+        folders: Runs of a learner that adapts, on a suite whose classes stand in both splits.
+        shots: Adaptation rounds, one after the other.
+        rollouts: Episodes of each task in a shot; None: as in training, 40 at most.
+        episodes: Evaluation episodes after each adaptation.
+        trials: Adaptations of each task, each from the start and to other episodes.
+        num_envs: Most environments stepped together.
+        seed: Seed of the episodes' starts.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        engine: ``auto``, ``c`` or ``warp``.
+
+    Raises BidexError for runs that do not go together.
+    """
+    _check(folders)
+    results = []
+    for folder in folders:
+        stored = folder.config()
+        here = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
+        config = replace(stored, device=here, engine=engine)
+        worlds = Worlds.open(config.to_json())
+        set_up_torch(config.threads)
+        counts = [len(pool) for pool in worlds.tasks("test").values()]
+        of_shot = metatest.rollouts_of(worlds, config, rollouts, max(1, num_envs // len(counts)))
+        size = metatest.environments_for(len(counts), max(counts) * trials, of_shot, num_envs)
+        say(f"{folder.path}: {trials} adaptations of each held-out task, {size} environments.")
+        test = worlds.world("test", size)
+        train = worlds.world("train", size)
+        protocol = Protocol(
+            "test", seed, shots=shots, rollouts=of_shot, episodes_per_task=episodes, trials=trials,
+            max_adapt_steps=metatest.adapt_steps_of(config),
+        )  # fmt: skip
+        load = policy_loader(folder, here)[0]
+        results.append(control(load, test, train, say=say, protocol=protocol, references=worlds.references()))
+        test.close()
+        train.close()
+    return results
+
+
+def _check(folders: Sequence[RunFolder]) -> None:
+    """Raise BidexError unless all runs adapt, have the same classes in both splits, and differ only in the seed."""
+    check_alike(folders)
+    first = run_kind(folders[0].config())
+    seeds: dict[int, Path] = {}
+    for folder in folders:
+        config = folder.config()
+        if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
+            raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
+        metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
+        if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
+            raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
+        if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
+            raise BidexError(
+                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
+                f"{', '.join(differing)}. Name them in separate calls."
+            )

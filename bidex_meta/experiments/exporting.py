@@ -1,0 +1,149 @@
+"""A run's policy as one ONNX file, checked against torch."""
+
+import json
+import logging
+import warnings
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.experiments.policies import checkpoint as load_checkpoint
+from bidex_meta.experiments.policies import policy_of
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json, check_writable, write_atomic
+from bidex_meta.training.learner import Capability
+from bidex_meta.utils.files import portable
+from bidex_meta.utils.validation import parse as parse_content
+from bidex_meta.worlds import Worlds
+
+TOLERANCE = 1e-5
+"""Largest allowed difference of an action from torch's."""
+ROWS = 256
+"""Random observations of the check; the export itself uses another number."""
+_SHAPE = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Export:
+    """The result of :func:`export`."""
+
+    path: Path
+    size: int
+    """Bytes of the file."""
+    gap: float
+    """Largest difference of an action from torch's in float32."""
+    gap_as_played: float
+    """Largest difference from the policy as it computes on this machine, which may be in bfloat16."""
+
+
+def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last") -> Export:
+    """Write a run's policy as an ONNX file: raw observations in, mean actions out, float32.
+
+    ``out`` is the file; None: ``policy.onnx`` in the run's folder. Raises BidexError for policies that remember or
+    adapt, and if the file's actions differ from torch's.
+    """
+    if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
+        raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")
+    folder = RunFolder.open(run)
+    config = replace(folder.config(), device="cpu")
+    if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
+        raise BidexError(
+            f"{config.algo} adapts to tasks or remembers, and an ONNX file maps one observation to one action. "
+            "Export a policy that does not adapt, such as one of mtppo, mtsac, td3, mappo, dagger or bc."
+        )
+    path = out or folder.path / "policy.onnx"
+    check_writable(path)
+    state, steps = load_checkpoint(folder, checkpoint)
+    policy = policy_of(folder, state, "cpu")
+    shape = parse_content(state["learner"]["policy"].get("shape"), _SHAPE, f"{folder.path}: the policy's shape")
+    content, gap, gap_as_played = exported(policy, shape, _metadata(folder, config, steps, shape))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, lambda file: file.write(content))
+    return Export(path, len(content), gap, gap_as_played)
+
+
+def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float, float]:
+    """Return a policy as the bytes of an ONNX file, which computes in float32, and two largest differences of actions.
+
+    The first difference is to torch's actions in float32. The second difference is to the actions of the policy as it
+    was given, which may compute in bfloat16. ``shape`` is as in a checkpoint. BidexError is raised if torch cannot
+    export the policy or the first difference is larger than TOLERANCE.
+    """
+    import onnxruntime
+
+    network: Any = policy
+    if not isinstance(policy, torch.nn.Module):
+        raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
+    obs = _observations(ROWS, shape)
+    as_played = network.eval_action(obs).numpy()
+    low_precision = getattr(network, "low_precision", False)
+    network.low_precision = False
+    # mkldnn would choose a matrix product by the size of a batch, which the export leaves open.
+    with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
+        try:
+            content = _onnx(network, _observations(2, shape), metadata)
+        except Exception as error:  # the exporter raises many kinds
+            raise BidexError(
+                f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
+                "look at numbers; --debug shows where."
+            ) from error
+        wanted = network.eval_action(obs).numpy()
+    network.low_precision = low_precision
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    actions = session.run(None, {"observations": obs.numpy()})[0]
+    gap = float(abs(actions - wanted).max())
+    if not gap <= TOLERANCE:
+        raise BidexError(f"The exported actions differ by {gap:.2g} from torch's, more than {TOLERANCE:g}: none kept.")
+    return content, gap, float(abs(actions - as_played).max())
+
+
+def _onnx(policy: Any, obs: torch.Tensor, metadata: dict[str, str]) -> bytes:
+    class MeanAction(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, observations: torch.Tensor) -> torch.Tensor:
+            # Some products of zero rows crash onnxruntime's process by SIGFPE, so one row is always added.
+            padded = torch.cat([observations, observations.new_zeros(1, observations.shape[1])])
+            return self.policy.eval_action(padded)[:-1]
+
+    for name in ("torch.onnx", "onnxscript", "onnx_ir"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    program = torch.onnx.export(
+        MeanAction(), (obs,), input_names=["observations"], output_names=["actions"],
+        dynamic_shapes={"observations": {0: torch.export.Dim("rows")}}, dynamo=True, verbose=False,
+    )  # fmt: skip
+    if program is None:
+        raise TypeError("torch.onnx.export returned no program")
+    program.model.metadata_props.update(metadata)
+    for node in program.model.graph.all_nodes():
+        node.metadata_props.clear()  # the metadata quote lines of code, with paths of this machine
+    return program.model_proto.SerializeToString()
+
+
+def _observations(rows: int, shape: Json) -> torch.Tensor:
+    """Draw random raw observations (rows, d), float32, with a task's one-hot if the policy reads one."""
+    obs = torch.randn(rows, shape["observations"], generator=torch.Generator().manual_seed(0))
+    for start, stop in shape.get("groups", {}).get("task_id", []):
+        obs[:, start:stop] = torch.eye(stop - start)[torch.arange(rows) % (stop - start)]
+    return obs
+
+
+def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
+    """Return the file's metadata: texts by name, lists and tables as JSON."""
+    worlds = Worlds.open(config.to_json())
+    versions = folder.versions()
+    facts = {
+        "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,
+        "classes": list(worlds.tasks("train")), "seed": config.seed, "steps": steps,
+        "commit": (versions.get("git") or {}).get("commit"), "versions": versions.get("packages"),
+        "observation_groups": shape.get("groups"),
+    }  # fmt: skip
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}

@@ -1,0 +1,124 @@
+"""Measures of a suite: if there is something to learn about its tasks."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.results import ClassResult
+from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability
+from bidex_meta.experiments.policies import load_policy, say_other_rules
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json
+from bidex_meta.suite import plain_name
+from bidex_meta.training.launch import say
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
+from bidex_meta.witness.scripts import scripts_of
+from bidex_meta.witness.store import load_witness, witness_path
+from bidex_meta.world import Slot, World, WorldConfig
+from bidex_meta.worlds import Worlds, WorldsConfig
+
+_NOTHING = ("uniform", "zero", "held")  # policies that have learned nothing
+
+
+def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
+    """Measure if there is something to learn about the tasks of worlds; return a row per class.
+
+    ``runs`` are folders of runs whose policies know the tasks. Raises BidexError for worlds without hands.
+    """
+    rows: dict[str, Json] = {}
+    for split in worlds.splits:
+        rows |= _of_split(worlds, split, runs)
+    return rows
+
+
+def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Json]:
+    """Return the row of each class of a split."""
+    world = worlds.world(split)
+    if not isinstance(world, World):
+        raise BidexError(f"Expected a suite of hands, got {worlds.name}.")
+    results = _results(worlds, world, runs)
+    rows: dict[str, Json] = {}
+    for slot in world.slots:
+        found = results[slot.name]
+        hidden = list(chain.from_iterable(part.names for part in slot.task_class.hides()))
+        known = {name: result.success for name, result in found.items() if name not in (*_NOTHING, "witness", "misled")}
+        aligned = alignment(found)
+        identified = _identified(slot, worlds) if hidden else {"identified": None}
+        untrained = {name: found[name].success if name in found else None for name in (*_NOTHING, "witness")}
+        rows[slot.name] = {
+            "hidden": hidden,
+            "blind": blind_ceiling(slot.task_class, seed=worlds.seed),
+            **identified,
+            **untrained,
+            "solved": max(known.values(), default=None),
+            "alignment": aligned and asdict(aligned),
+            "policies": {name: [each.success, each.mean_return] for name, each in found.items()},
+        }
+    world.close()
+    return rows
+
+
+def _witnesses(world: World) -> OpenLoopReplay:
+    """Return an agent that replays, in all tasks, the witnesses of version 1's task 0 of a world's classes."""
+    known = {name: load_witness(plain_name(name)) for name in _with_witness(world)}
+    return OpenLoopReplay(known, list(world.task_names), world.task_id, world.action_size)
+
+
+def _with_witness(world: World) -> list[str]:
+    names = [slot.name for slot in world.slots if slot.task_class.moving_base]
+    return [name for name in names if witness_path(plain_name(name)).is_file()]
+
+
+def _scripted(world: World) -> list[str]:
+    moving = [slot for slot in world.slots if slot.task_class.moving_base]
+    return [slot.name for slot in moving if slot.task_class.name in scripts_of(slot.task_class.rules)]
+
+
+def _identified(slot: Slot, worlds: Worlds) -> Json:
+    """Measure how well the best exploring episode identifies the hidden parts of a class."""
+    say(f"{slot.name}: what rewards tell")
+    world = World([slot], WorldConfig(len(slot.tasks), engine="c", threads=worlds.threads, autoreset_mode="DISABLED"))
+    explorers: list[Agent | None] = [None]
+    explorers += [_witnesses(world)] if _with_witness(world) else []
+    explorers += [Scripted(world, misled=True)] if _scripted(world) else []
+    found = max((identifiability(world, each, worlds.seed) for each in explorers), key=lambda each: each.share)
+    world.close()
+    return {"identified": found.share, "error_90": float(np.quantile(found.errors, 0.9))}
+
+
+def _results(worlds: Worlds, world: World, runs: Sequence[Path]) -> dict[str, dict[str, ClassResult]]:
+    """Return the results by class and policy, for each class that a policy plays."""
+    scripted = _scripted(world)
+    agents: dict[str, tuple[Agent, Collection[str]]] = {
+        "uniform": (RandomAgent(world.action_space, worlds.seed), world.task_names),
+        "zero": (ZeroAgent(world.action_space), world.task_names),
+        "held": (HeldAgent(world.action_space, worlds.seed), world.task_names),
+        "witness": (_witnesses(world), _with_witness(world)),
+        "script": (Scripted(world, names=scripted), scripted),
+        "misled": (Scripted(world, names=scripted, misled=True), scripted),
+    }
+    results: dict[str, dict[str, ClassResult]] = {name: {} for name in world.task_names}
+    for name, (agent, classes) in agents.items():
+        if classes:
+            say(f"{name} actions in all tasks")
+            found = evaluate(agent, world, 1, references={}).classes
+            for each in classes:
+                results[each][name] = found[each]
+    rules = {slot.name: slot.task_class.rules for slot in world.slots}
+    for path in runs:
+        say(f"the policy of {path}")
+        folder = RunFolder.open(path)
+        config = replace(WorldsConfig.of(folder.config().to_json()), task_seed=worlds.seed, threads=worlds.threads)
+        own = Worlds.open(config)
+        say_other_rules(folder, worlds)
+        agent, _ = load_policy(folder, "cpu")
+        for name, result in own.judge(agent, own.world(), own.protocol("train", 1)).classes.items():
+            if rules.get(plain_name(name)) == own.task_classes()[name].rules:
+                results[plain_name(name)][folder.path.name] = result
+    return results

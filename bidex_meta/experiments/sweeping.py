@@ -1,0 +1,412 @@
+"""Train the runs of a plan, several at a time, and resume stopped runs.
+
+On this machine a pool of threads, each bound to a core, calls the runs; on a cluster submitit (extra ``slurm``) calls
+the runs. Both call the same ``Job``, which begins or resumes a run, and waits for the run's process.
+"""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from statistics import mean
+from types import FrameType
+from typing import Any, Literal, NamedTuple
+
+from bidex_meta.errors import BidexError, one_line, shortened
+from bidex_meta.experiments.run_config import check, resolve
+from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.folder import AnyConfig
+from bidex_meta.runs.metrics import last_rows
+from bidex_meta.training.launch import BATCH_SIGNALS, say
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.files import JsonObject, absolute, exists, is_file, read_text
+from bidex_meta.utils.validation import Few
+from bidex_meta.utils.waiting import note
+
+COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # a run's words are appended
+_STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
+"""Signal that makes a run save and end. A batch system may send it too; a second SIGTERM would kill the run."""
+
+
+class State(NamedTuple):
+    """Progress of a run."""
+
+    run: PlannedRun
+    state: Literal["done", "runs", "failed", "left"]
+    step: int
+    """Environment steps that were logged."""
+    goal: int
+    """Environment steps to train for; the steps of the run if time, a return or a score ended the run."""
+    seconds: float
+    """Seconds of training so far."""
+    why: str
+    """The last line of the run's log if its last start failed."""
+
+    @property
+    def speed(self) -> float:
+        """Return the measured steps per second; 0 before the first line of metrics."""
+        if self.seconds:
+            return self.step / self.seconds
+        return 0.0
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """The result of :func:`sweep`."""
+
+    folder: Path
+    states: tuple[State, ...]
+    """The progress of each run, in the order of the plan."""
+    failures: int
+    """Runs that failed or were stopped in this call."""
+
+
+@checked_arguments
+def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = None) -> SweepResult:
+    """Train the runs of a plan that are not done, each in a process of its own, and evaluate each at its end.
+
+    A call after an interruption goes on where the last call stopped. After Ctrl-C each run saves and stops.
+
+    Args:
+        plan: ``SweepPlan.of(folder, configs)``, or ``SweepPlan.read(file)`` for a study file.
+        workers: Runs at a time, each on its own core; None: 1, or one for each of ``cores``.
+        cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
+
+    Raises BidexError for bad values in any run, before the first one begins, and if another sweep works in the folder.
+    A run that fails is logged and counted in the result.
+    """
+    chosen = choose_cores(cores, workers)
+    states = states_of(plan)
+    left = [state.run for state in states if state.state != "done"]
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    with _alone_in(plan):
+        say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(chosen)} at a time.")
+        failures = work(left, chosen)
+    return SweepResult(plan.folder, tuple(state_of(state.run) for state in states), failures)
+
+
+def submit_plan(plan: SweepPlan, executor: Literal["slurm", "local"]) -> dict[str, str]:
+    """Submit the runs that can begin to submitit's executor; return the jobs' ids by the runs' names."""
+    states = states_of(plan)
+    unfinished = {state.run.path for state in states if state.state != "done"}
+    idle = [state.run for state in states if state.state in ("left", "failed")]
+    ready = [run for run in idle if run.after not in unfinished]
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    with _alone_in(plan):
+        jobs = submit(ready, plan.folder, executor, plan.slurm)
+    if len(ready) < len(idle):
+        say(f"{len(idle) - len(ready)} start from runs that have not ended: submit again when those have.")
+    return {name: job.job_id for name, job in jobs.items()}
+
+
+def _alone_in(plan: SweepPlan) -> contextlib.AbstractContextManager[None]:
+    """Keep other sweeps out of a plan's folder; raise BidexError if another one works there."""
+    return RunFolder(plan.folder).locked(f"Another sweep works in {plan.folder}. Wait for its end, or stop it.")
+
+
+def states_of(plan: SweepPlan) -> list[State]:
+    """Resolve and check the configs of all runs, and return the runs' progress.
+
+    Raises BidexError for bad values, and if a run's folder holds a run of another config.
+    """
+    configs: dict[str, AnyConfig] = {}  # seeds share a config
+    runs = []
+    for run in plan.runs:
+        kind = str(replace(run.given, seed=0, start_from=None))
+        if kind not in configs:
+            try:
+                configs[kind] = _resolved(run)
+            except BidexError as error:
+                raise BidexError(f"{plan.source}: {run.arm} on {run.subject}: {error}") from None
+        start = None if run.after is None else str(absolute(run.after))
+        runs.append(replace(run, config=replace(configs[kind], seed=run.seed, start_from=start)))
+    return [state_of(run) for run in runs]
+
+
+def _resolved(run: PlannedRun) -> AnyConfig:
+    config = resolve(run.given)
+    check(config)
+    run.final.check(config)
+    return config
+
+
+def state_of(run: PlannedRun) -> State:
+    """Return the progress of a run whose config is known; raise BidexError if its folder holds another config's run."""
+    last: JsonObject = {"step": 0}
+    evaluated = False
+    if exists(run.folder.config_path):
+        # The machine may have changed, so threads and device are ignored.
+        for name, there, here in run.folder.config().differences(run.config, ignored=("threads", "device")):
+            raise BidexError(
+                f"{run.path} is a run of another config: {name} is {there} there, not {here}. Give the arm another "
+                "name, or move the folder away."
+            )
+        if is_file(run.folder.metrics_path):
+            last = (last_rows(run.folder.metrics_path) or [last])[-1]
+        evaluated = run.folder.evaluated
+    why = _last_line(_beside(run, "failed"))
+    steps = run.config.goal(last)
+    if _locked(run):
+        state = "runs"
+    elif evaluated and (run.folder.evaluation().steps or steps) >= steps:
+        state = "done"
+    elif why:
+        state = "failed"
+    else:
+        state = "left"
+    return State(run, state, last["step"], steps, last.get("Perf/training_time") or 0.0, why)
+
+
+def hours_left(states: Sequence[State]) -> list[float]:
+    """Return the hours that each run still trains, NaN where no run tells a speed.
+
+    The speed is the run's own, else the mean over the runs on its suite, else the mean over all runs.
+    """
+    speeds = [(state.run.subject, state.speed) for state in states if state.speed]
+    hours = []
+    for state in states:
+        minutes = state.run.config.minutes
+        alike = [speed for subject, speed in speeds if subject == state.run.subject] or [speed for _, speed in speeds]
+        if state.state == "done":
+            seconds = 0.0
+        elif minutes is not None:
+            seconds = max(60 * minutes - state.seconds, 0.0)
+        elif alike:
+            seconds = max((state.goal - state.step) / (state.speed or mean(alike)), 0.0)
+        else:
+            seconds = math.nan
+        hours.append(seconds / 3600)
+    return hours
+
+
+class Job:
+    """A run as a callable, for a thread or for submitit."""
+
+    def __init__(self, run: PlannedRun, command: Sequence[str]) -> None:
+        self.run = run
+        self.command = command
+        self.stopped = False
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def __call__(self) -> bool:
+        """Begin or resume the run and wait for its end; return False if a signal stopped the run before.
+
+        If the run failed, BidexError is raised with the last line of the run's log.
+        """
+        run = self.run
+        while _locked(run) and not self.stopped:  # a process that a killed sweep has left still trains the run
+            time.sleep(1.0)
+        if state_of(run).state == "done":
+            return True
+        if self.stopped:
+            return False
+        if exists(run.folder.config_path):
+            words = run.resume
+        else:
+            words = run.begin
+        with _beside(run, "log").open("ab") as log:
+            one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
+            self.process = subprocess.Popen(  # Ctrl-C reaches only the sweep, which then stops its runs
+                [*self.command, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=one_thread,
+                start_new_session=True,
+            )  # fmt: skip
+        if self.stopped:
+            self.process.send_signal(_STOP)
+        code = self.process.wait()
+        done = code == 0 and state_of(run).state == "done"
+        if not done and not self.stopped and _signal_of(code) is None:
+            why = _last_line(_beside(run, "log")) or f"ended with exit code {code}"
+            _beside(run, "failed").write_text(f"{why}\n", encoding="utf-8")
+            raise BidexError(why)
+        _beside(run, "failed").unlink(missing_ok=True)
+        return done
+
+    def stop(self) -> None:
+        """Tell the run to save and end, without waiting for its end."""
+        self.stopped = True
+        if self.process is not None:
+            self.process.send_signal(_STOP)
+
+
+class QueuedJob(Job):
+    """A job of a batch system, which is queued again if its time is up before the run's end.
+
+    The batch system's signal arrives while this job waits for the run's process. A handler that waited for the same
+    process would block forever. Our handler therefore only tells the run to save and end; submitit's handler is called
+    after the run has ended.
+    """
+
+    def __call__(self) -> bool:
+        """Begin or resume the run, as ``Job`` does; if a batch system stops it, queue the job again and exit."""
+        asked: list[int] = []
+
+        def remember(number: int, frame: FrameType | None) -> None:
+            asked.append(number)
+            self.stop()
+
+        requeueing = signal.Signals[f"SIG{os.environ.get('SUBMITIT_PREEMPT_SIGNAL', 'USR2')}"]  # read by submitit too
+        numbers = {*BATCH_SIGNALS, signal.SIGTERM, requeueing}
+        handlers = {number: signal.signal(number, remember) for number in numbers}
+        try:
+            done = super().__call__()
+            if not asked and self.process is not None:  # only the run received the signal, or received it before us
+                asked.append(_signal_of(self.process.returncode) or 0)
+            requeue = handlers[requeueing]
+            # SIGTERM does not request requeueing: the batch system sends it when somebody cancels the job.
+            if not done and callable(requeue) and {*BATCH_SIGNALS, requeueing}.intersection(asked):
+                requeue(requeueing, None)
+            return done
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def checkpoint(self) -> Any:
+        """Return the job that submitit queues again, after the run's process has ended."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(QueuedJob(self.run, self.command))
+
+
+def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
+    """Run all runs in order, one at a time on each core; return the number of failed runs.
+
+    A failed run stops only the runs that start from it. A run that a signal stopped counts as failed. After Ctrl-C or
+    SIGTERM of the sweep each run saves and stops.
+    """
+    waiting = list(runs)
+    failed = dict[Path | None, str]()
+    free = list(cores)
+    note("")  # runs take hours; a line is printed at the start and end of each run
+    own: dict[Future[bool], Job] = {}
+    jobs: list[Job] = []
+
+    def bind() -> None:
+        if (core := free.pop(0)) is not None:
+            os.sched_setaffinity(0, {core})  # binds this thread, and the processes that it starts
+
+    with ThreadPoolExecutor(len(cores), initializer=bind) as pool:
+        try:
+            while waiting or own:
+                unfinished = {run.path for run in (*waiting, *(job.run for job in own.values()))}
+                ready = [run for run in waiting if run.after not in unfinished]
+                for run in ready[: len(cores) - len(own)]:
+                    waiting.remove(run)
+                    if run.after is not None and run.after in failed:
+                        failed[run.path] = "has failed"
+                        say(f"{run.name} failed: it starts from {run.after.name}, which {failed[run.after]}")
+                        continue
+                    say(f"{run.name} {'is waited for: another process trains it' if _locked(run) else 'begins'}")
+                    jobs.append(Job(run, COMMAND))
+                    own[pool.submit(jobs[-1])] = jobs[-1]
+                for future in wait(own, return_when=FIRST_COMPLETED).done:
+                    run = own.pop(future).run
+                    error = future.exception()
+                    end = "done"
+                    if error is not None:
+                        failed[run.path] = "has failed"
+                        end = f"failed: {one_line(error)}"
+                    elif not future.result():
+                        failed[run.path] = "was stopped"
+                        end = "was stopped by a signal"
+                    say(f"{run.name} {end} ({len(waiting) + len(own)} to go)")
+        except BaseException:
+            for job in jobs:
+                job.stop()
+            say(f"{len(own)} running: each saves and stops.")
+            raise
+    return len(failed)
+
+
+def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonObject) -> dict[str, Any]:
+    """Submit runs to submitit's executor ``slurm``, or ``local``: processes of this machine, all at once.
+
+    ``parameters`` are the executor's; the defaults are a time of one day and one processor. Jobs print into
+    ``out/jobs/``. Returns submitit's jobs by name, without the runs whose job of an earlier start waits or runs.
+    """
+    try:
+        import submitit
+    except ImportError:
+        raise BidexError("--submit needs submitit: pip install 'bidex-meta[slurm]'.") from None
+    folder = (out / "jobs").resolve()
+    jobs = {}
+    try:
+        executor = submitit.AutoExecutor(folder=folder, cluster=where)
+        executor.update_parameters(**{"timeout_min": 24 * 60, "cpus_per_task": 1, **parameters})
+        for run in runs:
+            number = _beside(run, "job")  # local jobs need no number: the lock of the run's folder is enough
+            if where == "slurm" and is_file(number):
+                job = submitit.SlurmJob(folder=folder, job_id=read_text(number, "a job's number").strip())
+                if not job.done(force_check=True):
+                    continue
+            executor.update_parameters(name=run.name)
+            if run.after is None:
+                given = run.given
+            else:
+                given = replace(run.given, start_from=str(run.after.resolve()))
+            jobs[run.name] = executor.submit(QueuedJob(replace(run, path=run.path.resolve(), given=given), COMMAND))
+            number.write_text(f"{jobs[run.name].job_id}\n")
+    except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
+        raise BidexError(f"submitit: {one_line(error)[:300].rstrip('.')}. Mend [slurm], or --submit.") from None
+    return jobs
+
+
+def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
+    """Return a core per worker, from those requested (``1``, ``0,2-3``); None if the system cannot bind processes."""
+    linux = sys.platform == "linux"
+    usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
+    chosen = usable
+    if asked is not None:
+        try:
+            parts = [[usable.index(int(end)) for end in part.split("-")] for part in asked.split(",")]
+        except ValueError:
+            message = f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
+            raise BidexError(message) from None
+        ranges = [usable[min(ends) : max(ends) + 1] for ends in parts]
+        chosen = list(dict.fromkeys(chain.from_iterable(ranges)))
+    count = workers or (1 if asked is None else len(chosen))
+    if count > len(chosen):
+        raise BidexError(f"--workers: expected at most {len(chosen)}, one for each core, got {count}.")
+    return chosen[:count]
+
+
+def _signal_of(code: int) -> int | None:
+    """Return the batch system's signal that ended a run, which may have saved; None after any other end."""
+    if code == 0:  # an unfinished run that exits with 0 has saved at SIGTERM
+        return signal.SIGTERM
+    number = -code if code < 0 else code - 128
+    if number in (*BATCH_SIGNALS, signal.SIGTERM):
+        return number
+    return None
+
+
+def _locked(run: PlannedRun) -> bool:
+    """Return whether a process trains in a run's folder."""
+    try:
+        with run.folder.locked():
+            return False
+    except FileNotFoundError:
+        return False
+    except BidexError:
+        return True
+
+
+def _beside(run: PlannedRun, kind: str) -> Path:
+    """Return the path of a file next to a run's folder: ``log`` (output), ``failed`` (last error) or ``job`` (id)."""
+    return run.path.with_name(f"{run.name}.{kind}")
+
+
+def _last_line(path: Path) -> str:
+    if is_file(path):
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    else:
+        lines = []
+    return next((one_line(line) for line in reversed(lines) if line.strip()), "")

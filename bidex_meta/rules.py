@@ -1,0 +1,118 @@
+"""The choices of a suite that hold for all its classes: the rules of versions 1 and 2, and randomisation."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from bidex_meta.errors import one_line
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import check_fields, check_rising
+
+HELD_STEPS = 15
+"""Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
+
+
+@checked_arguments
+@dataclass(frozen=True)
+class Rules:
+    """Four independent choices; the defaults are version 1, and ``V2`` has all of version 2."""
+
+    reward: Literal["paper", "v2"] = "paper"
+    """The printed formula of each class, or ``aligned_terms``."""
+    variation: Literal["narrow", "wide"] = "narrow"
+    """Narrow goals vary about as much as success tolerates; wide goals vary several times as much, with a hidden
+    quantity in every class. Wide observations also give objects' and goals' quaternions with w >= 0."""
+    success: Literal["once", "at-end"] = "once"
+    """The condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
+    starts: Literal["plain", "jittered"] = "plain"
+    """If jittered, every episode of every class draws joint noise and shifts fixtures and objects."""
+
+    @property
+    def wide(self) -> bool:
+        """Return whether the variation is wide."""
+        return self.variation == "wide"
+
+    @property
+    def as_printed(self) -> bool:
+        """Return whether returns can be compared with those of version 1: the same tasks and reward."""
+        return self.reward == "paper" and not self.wide
+
+    @property
+    def jittered(self) -> bool:
+        """Return whether starts are jittered."""
+        return self.starts == "jittered"
+
+
+V1 = Rules()
+V2 = Rules("v2", "wide", "at-end", "jittered")
+_VERSIONED = re.compile(r"([^-/]+)-v2(?![^-/])", re.IGNORECASE)
+
+
+def plain_name(name: str) -> str:
+    """Return a class's name without the ``-v2`` that gives the class the rules of version 2."""
+    found = _VERSIONED.match(name)
+    if found is None:
+        return name
+    return found[1] + name[found.end() :]
+
+
+def versioned_name(name: str, rules: Rules) -> str:
+    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
+    task_class, dash, thing = plain_name(name).partition("-")
+    if rules == V2:
+        return f"{task_class}-v2{dash}{thing}"
+    return name
+
+
+def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
+    """Return in words how other rules, by name, differ from ``rules``; empty if they are equal."""
+    pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
+    return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
+
+
+_Factor = Annotated[float, Meta(ge=0.01, le=100.0)]
+_Size = Annotated[float, Meta(ge=0.8, le=1.25)]
+_Steps = Annotated[int, Meta(ge=0, le=60)]
+_Range = tuple[_Factor, _Factor]
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Factors drawn for an environment, uniformly from ranges, and added noise; nothing by default.
+
+    Raises BidexError for values out of bounds or ranges that fall.
+    """
+
+    friction: _Range = (1.0, 1.0)
+    """Factor of the friction of all contacts."""
+    object_mass: _Range = (1.0, 1.0)
+    object_size: tuple[_Size, _Size] = (1.0, 1.0)
+    """Factor of the lengths of free objects without joints; their masses stay."""
+    actuator_gain: _Range = (1.0, 1.0)
+    """Factor of the fingers' actuator forces, before their limits."""
+    joint_damping: _Range = (1.0, 1.0)
+    """Factor of the damping of the fingers' joints."""
+    gravity: _Range = (1.0, 1.0)
+    observation_noise: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    """Standard deviation in an observation's units, of what sensors show of hands and objects."""
+    action_noise: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
+    """Standard deviation; actions are clipped afterwards."""
+    action_delay: tuple[_Steps, _Steps] = (0, 0)
+    """Control steps, a whole number of the range."""
+    push_speed: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    """Most that a push adds to the velocity of all objects along each axis, m/s."""
+    push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
+    """Mean time between pushes, s."""
+    draw: Literal["episode", "environment"] = "episode"
+    """Factors and the delay are drawn for every episode, or once per environment."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "randomisation")
+        check_rising(self, "randomisation", *FACTORS, "action_delay")
+
+
+FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_damping", "gravity")
+"""Of a randomisation, those that are factors of the model's numbers."""

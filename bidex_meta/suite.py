@@ -1,0 +1,398 @@
+"""Reads and checks `suites/*.toml` into frozen dataclasses; `suites/README.md` explains the files field by field.
+
+Names of task classes and of their variations are checked where the classes are known, in `bidex_meta.benchmark`.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from bidex_meta import ladder
+from bidex_meta.errors import BidexError, known_name, nearest, shortened, unknown_name
+from bidex_meta.rules import (  # noqa: F401 (names of a suite, imported from here too)
+    FACTORS,
+    HELD_STEPS,
+    V1,
+    V2,
+    Randomisation,
+    Rules,
+    plain_name,
+    rules_apart,
+    versioned_name,
+)
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.files import Json, absolute, expanded, portable, read_toml
+from bidex_meta.utils.paths import suites_dir
+from bidex_meta.utils.plugins import name_with_object
+from bidex_meta.utils.validation import parse
+
+Split = Literal["train", "test"]
+SPLITS: tuple[Split, Split] = ("train", "test")
+OTHERS, OTHER_SEED = "others", 500_000
+"""Name of the tasks of train classes that no run trained on, and what is added to a run's seed to draw them."""
+MOST_POINTS = 16_384
+"""Of a cloud: more than a coarse image has pixels are no finer."""
+METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
+    "metaworld/MT10": (
+        "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3", "drawer-close-v3",
+        "button-press-topdown-v3", "peg-insert-side-v3", "window-open-v3", "window-close-v3",
+    ),
+    # No suite of Meta-World's: three of its classes that are learned within minutes.
+    "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
+}  # fmt: skip
+"""Suites of Meta-World's own environments, and their classes in its order."""
+
+
+@checked_arguments
+@dataclass(frozen=True)
+class ListedTask:
+    """One task that a suite file writes out, in place of drawing it."""
+
+    name: str
+    """Unique within its class, e.g. `"left"`."""
+    split: Split | Literal["both"]
+    fixed: Mapping[str, float]
+    """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
+
+    def of(self, split: Split) -> bool:
+        """Return whether the task is one of a split."""
+        return self.split in (split, "both")
+
+
+@checked_arguments
+@dataclass(frozen=True)
+class SuiteClass:
+    """One task class of a suite."""
+
+    name: str
+    """Name in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
+    class_name: str
+    splits: tuple[Split, ...]
+    reward_scale: float
+    gamma: float | None
+    """Discount per step of this class; None: the learner's own."""
+    tasks: tuple[ListedTask, ...]
+    """Listed tasks; empty where the tasks are drawn."""
+    options: Mapping[str, float | str]
+    """Further options of the class, by the names of its constructor's arguments."""
+
+
+@checked_arguments
+@dataclass(frozen=True)
+class Suite:
+    """A suite file, checked."""
+
+    name: str
+    version: int
+    """The `-vN` of the Gymnasium id; goes up when results change."""
+    kind: Literal["multi-task", "meta"]
+    """Multi-task suites have a train split only; meta suites both, without a task in common."""
+    description: str
+    observation: Literal["plain", "one-hot", "masked"]
+    """Change of the padded observation: none, task id appended, goal entries zeroed."""
+    task_id: Literal["class", "task"]
+    """Meaning of one entry of the one-hot: a class or a listed task."""
+    rules: Rules
+    base: Literal["moving", "alone"]
+    """Moving bases for every class, or for each class the base that it has alone."""
+    tasks_per_class: int | None
+    """Tasks drawn per class and split; None when every class lists its tasks."""
+    classes: tuple[SuiteClass, ...]
+    file: Path
+    points: int = 0
+    """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
+    point_kinds: bool = False
+    """True if each point has its kind as a fourth entry."""
+    randomisation: Randomisation | None = None
+    """Randomisation of training worlds."""
+
+    def __post_init__(self) -> None:
+        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
+        object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
+
+    @property
+    def digest(self) -> str:
+        """Return twelve hexadecimal digits of everything that decides tasks, rewards and observations.
+
+        The file's version does not enter. Entries with their default value do not enter either, so that a new kind of
+        entry leaves old digests as they are.
+        """
+        content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
+        if self.rules.wide:
+            content["placements"] = "episode"  # tasks fixed them before 0.3.0
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
+    def splits(self) -> tuple[Split, ...]:
+        """Return the splits that hold at least one class."""
+        return tuple(split for split in SPLITS if self.split_classes(split))
+
+    def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
+        """Return the classes of one split, in file order."""
+        return tuple(entry for entry in self.classes if split in entry.splits)
+
+
+_OF_THE_FILE = ("name", "version", "description", "file")
+
+
+def _chosen(value: object) -> Json:
+    """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
+    if is_dataclass(value):
+        given = ((entry, getattr(value, entry.name)) for entry in fields(value))
+        return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
+    if isinstance(value, Mapping):
+        return {name: _chosen(each) for name, each in value.items()}
+    if isinstance(value, tuple):
+        return [_chosen(each) for each in value]
+    if isinstance(value, Path | str):
+        return portable(str(value))
+    return value
+
+
+def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
+    plain = plain_name(entry.class_name)
+    if plain == entry.class_name:
+        return entry
+    if suite.rules != V2:
+        rules = ", ".join(f'{name} = "{value}"' for name, value in vars(V2).items())
+        mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
+        raise _error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
+    return replace(entry, name=plain_name(entry.name), class_name=plain)
+
+
+def suite_names() -> list[str]:
+    """Return the names of the suites that this installation ships: sorted, then those of a single class."""
+    classes = [entry.name for entry in _shipped("MT20-v2").classes]
+    return [*file_names(), *ladder.names_of(classes)]
+
+
+def file_names() -> list[str]:
+    """Return the names of the shipped suites that have a file of their own, sorted."""
+    return sorted(path.stem for path in suites_dir().glob("*.toml"))
+
+
+@checked_arguments
+def metaworld_classes(suite: str) -> tuple[str, ...]:
+    """Return the classes of one of Meta-World's suites; raises BidexError for another, with the nearest name."""
+    if suite not in METAWORLD_SUITES:
+        raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
+    return METAWORLD_SUITES[suite]
+
+
+@checked_arguments
+def load_suite(name_or_path: str | Path) -> Suite:
+    """Read a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
+
+    Raises BidexError for a missing suite or file, or a file that is not as `suites/README.md` describes.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or text.endswith(".toml"):
+        return _parse(expanded(name_or_path))
+    names = suite_names()
+    if text.casefold() not in {name.casefold() for name in names}:
+        meant = {text.casefold(): nearest(text, names) or "MT4"}
+        raise unknown_name("suite", text, [*file_names(), *ladder.names_of([ladder.ANY_CLASS])], meant)
+    name = known_name("suite", text, names)
+    parts = ladder.parts_of(name)
+    if parts is None:
+        return _shipped(name)
+    return _of_one_class(name, parts)
+
+
+@cache
+def _shipped(name: str) -> Suite:
+    """Return the suite of a file."""
+    return _parse(suites_dir() / f"{name}.toml")
+
+
+def _of_one_class(name: str, parts: ladder.OfOneClass) -> Suite:
+    template = _shipped(parts.template)
+    tasks = tuple(ListedTask(task, "both", fixed) for task, fixed in parts.tasks().items())
+    entry = replace(template.classes[0], name=parts.class_name, class_name=parts.class_name, tasks=tasks)
+    suite = replace(template, name=name, description=parts.description, classes=(entry,))
+    if tasks:
+        return replace(suite, tasks_per_class=None)
+    return suite
+
+
+@checked_arguments
+def load_randomisation(path: str | Path) -> Randomisation:
+    """Read the table ``[randomisation]`` of a TOML file: a suite's, or a file that holds nothing else.
+
+    Raises BidexError if the file has no such table, or a faulty one.
+    """
+    content = read_toml(expanded(path), "a file with a table [randomisation]")
+    if "randomisation" not in content:
+        raise BidexError(f"{path}: expected a table [randomisation], found none. See docs/randomisation.md.")
+    return parse(content["randomisation"], Randomisation, f"{path}: randomisation", exact=True)
+
+
+# What stands in a file, as msgspec checks it. No number is larger than a million: beyond it nothing is meant.
+_Text = Annotated[str, Meta(min_length=1, max_length=500)]
+_Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+_Number = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
+_Tables = Meta(min_length=1, max_length=1000)
+
+
+@dataclass
+class _TaskEntry:
+    name: _Text
+    fixed: dict[str, _Number]
+    split: Split | Literal["both"] = "train"
+
+
+@dataclass
+class _ClassEntry:
+    name: _Text
+    split: Literal["train", "test", "both"] = "train"
+    reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
+    gamma: Annotated[float, Meta(ge=0.0, lt=1.0)] | None = None
+    tasks: Annotated[list[_TaskEntry], _Tables] = field(default_factory=list)
+    options: dict[str, _Count | _Number | _Text] = field(default_factory=dict)  # a whole number may count something
+    objects: Annotated[list[_Text], _Tables] = field(default_factory=list)
+
+
+@dataclass
+class _PointsEntry:
+    count: Annotated[int, Meta(ge=1, le=MOST_POINTS)] = 768
+    kinds: bool = False
+
+
+@dataclass
+class _File:
+    name: _Text
+    version: _Count
+    kind: Literal["multi-task", "meta"]
+    description: _Text
+    observation: Literal["plain", "one-hot", "masked"]
+    task_id: Literal["class", "task"]
+    reward: Literal["paper", "v2"]
+    base: Literal["moving", "alone"]
+    classes: Annotated[list[_ClassEntry], _Tables]
+    tasks_per_class: _Count | None = None
+    points: _PointsEntry | None = None
+    randomisation: Randomisation | None = None
+    variation: Literal["narrow", "wide"] = "narrow"
+    success: Literal["once", "at-end"] = "once"
+    starts: Literal["plain", "jittered"] = "plain"
+
+    def texts(self) -> Iterator[tuple[str, object]]:
+        """Yield every text that may be printed on a terminal, with its location in the file."""
+        yield from (("name", self.name), ("description", self.description))
+        for i, entry in enumerate(self.classes):
+            yield f"classes[{i}].name", entry.name
+            yield from ((f"classes[{i}].tasks[{j}].name", task.name) for j, task in enumerate(entry.tasks))
+            yield from ((f"classes[{i}].objects", name) for name in entry.objects)
+            yield f"classes[{i}].options.object", entry.options.get("object", "egg")
+
+
+def _parse(file: Path) -> Suite:
+    content = parse(read_toml(file, "a suite file"), _File, str(file), exact=True)
+    for place, text in content.texts():
+        # Terminals obey what is not printable.
+        if not isinstance(text, str) or not text.strip() or not text.isprintable():
+            raise _error(file, place, "printable text", shortened(text))
+    points = content.points or _PointsEntry(0)
+    rules = Rules(content.reward, content.variation, content.success, content.starts)
+    names = {entry.name for entry in fields(Suite)} & {entry.name for entry in fields(content)}
+    given = {name: getattr(content, name) for name in names}
+    classes: list[SuiteClass] = []
+    for i, entry in enumerate(content.classes):
+        classes += _classes(file, i, entry)
+    given |= {"classes": tuple(classes), "file": file, "rules": rules}
+    suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
+    _check(suite)
+    return suite
+
+
+def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]:
+    """Yield the class of an entry, or with `objects` one class per object."""
+    options: dict[str, float | str] = dict(entry.options)
+    for name, value in options.items():
+        if isinstance(value, str) != (name == "object"):
+            raise _error(file, f"classes[{index}].options.{name}", "a number", shortened(value))
+    given = options.pop("object", None)
+    if entry.objects and given is not None:
+        mend = "Leave one of them out."
+        raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
+    if entry.split == "both":
+        splits = SPLITS
+    else:
+        splits = (entry.split,)
+    for name in entry.objects or [given]:
+        if name is None:
+            chosen = None
+        else:
+            chosen = options["object"] = _object(file, str(name))
+        yield SuiteClass(
+            name=name_with_object(entry.name, chosen),
+            class_name=entry.name,
+            splits=splits,
+            reward_scale=entry.reward_scale,
+            gamma=entry.gamma,
+            tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
+            options=dict(options),
+        )
+
+
+def _object(file: Path, name: str) -> str:
+    """Return an object's name; for a file its path, which is relative to the suite file's folder."""
+    if name.endswith(".xml"):
+        return str(absolute(file.parent / expanded(name)))
+    return name
+
+
+def _check(suite: Suite) -> None:
+    _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
+    if suite.kind == "meta":
+        expected = SPLITS
+        mend = "Give each class a split."
+    else:
+        expected = ("train",)
+        mend = 'Leave split out, or write kind = "meta".'
+    if suite.splits != expected:
+        wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
+        raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
+    all_listed = all(entry.tasks for entry in suite.classes)
+    if all_listed and suite.tasks_per_class is not None:
+        mend = "Leave it out: every class lists its tasks."
+        raise _error(suite.file, "tasks_per_class", "nothing", suite.tasks_per_class, mend)
+    if not all_listed and suite.tasks_per_class is None:
+        mend = "Add it, or list every task."
+        raise _error(suite.file, "tasks_per_class", "a whole number from 1 on", "nothing", mend)
+    if suite.task_id == "task" and not all_listed:
+        raise _error(suite.file, "task_id", '"class", since not every class lists its tasks', suite.task_id)
+    for index, entry in enumerate(suite.classes):
+        if entry.tasks:
+            _check_listed(suite.file, f"classes[{index}].tasks", entry)
+
+
+def _check_listed(file: Path, place: str, entry: SuiteClass) -> None:
+    _check_unique(file, place, [task.name for task in entry.tasks])
+    splits = tuple(split for split in SPLITS if any(task.of(split) for task in entry.tasks))
+    if splits != entry.splits:
+        mend = f"Make split of {entry.name} and of its tasks agree."
+        raise _error(file, place, f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(splits)}", mend)
+    train, test = ([task for task in entry.tasks if task.split == split] for split in SPLITS)
+    for held_out, other in product(test, train):
+        if held_out.fixed == other.fixed:
+            got = f"{other.name!r} and {held_out.name!r} with the same fixed values"
+            raise _error(file, place, "train and test tasks that differ", got, "Change one of them.")
+
+
+def _check_unique(file: Path, place: str, names: list[str]) -> None:
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise _error(file, f"{place}.name", "each name once", f"{name!r} {times} times", "Remove one.")
+
+
+def _error(file: Path, place: str, expected: str, got: object, mend: str = "See suites/README.md.") -> BidexError:
+    return BidexError(f"{file}: {place}: expected {expected}, got {got}. {mend}")
