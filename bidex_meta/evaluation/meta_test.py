@@ -65,11 +65,14 @@ class MetaEvaluation:
     def summary(self) -> SplitSummary:
         """Return the results without the single episodes."""
         by_shot = [evaluation.summary() for evaluation in self.by_shot]
+        hidden = None
+        if self.hidden_by_shot is not None:
+            hidden = [evaluation.summary() for evaluation in self.hidden_by_shot]
         return SplitSummary(
             split=self.protocol.split, shots=len(self.adapt_steps), rollouts=self.rollouts,
             trials=self.protocol.trials, max_adapt_steps=self.protocol.max_adapt_steps,
             adapt_steps=self.adapt_steps, before=by_shot[0], after=by_shot[-1], gain=self.gains(), by_shot=by_shot,
-            hidden_by_shot=self.hidden_by_shot and [each.summary() for each in self.hidden_by_shot],
+            rewards_shown=True, hidden_by_shot=hidden,
         )  # fmt: skip
 
     def to_json(self) -> Json:

@@ -179,6 +179,11 @@ def _again(
     for split, part in recorded.splits.items():
         if split not in (*worlds.splits, OTHERS):
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
+        if not part.rewards_shown:
+            raise BidexError(
+                f"{folder.path}: the evaluation hid the rewards of its episodes, as before version 0.3.0. Evaluate "
+                f"anew: bidex-meta evaluate {folder.path} --json"
+            )
         options = Options(
             shots=part.shots, rollouts=part.rollouts, trials=part.trials, episodes=part.before.episodes_per_task,
             tasks=max(row.tasks or TASKS for row in part.before.classes.values()), num_envs=num_envs, seed=seed,

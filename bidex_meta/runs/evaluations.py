@@ -108,6 +108,7 @@ class SplitSummary:
     after: Summary
     gain: Gains | None = None
     by_shot: Annotated[list[Summary], Meta(min_length=1)]  # after 0, 1, ..., ``shots`` shots
+    rewards_shown: bool = False  # agents saw the rewards of these episodes; before 0.3.0 they did not
     hidden_by_shot: list[Summary] | None = None  # the same episodes played with their rewards hidden
 
 

@@ -52,8 +52,9 @@ class OwnSuite(Worlds):
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the names that the file lists, else numbers; see ``Worlds``."""
         drawn = list(map(str, range(self.suite.tasks_per_class or 0)))
-        classes = self.suite.split_classes(cast(Split, split))
-        pools = {c.name: [task.name for task in c.tasks if task.of(split)] or [*drawn] for c in classes}
+        of_split = cast(Split, split)
+        classes = self.suite.split_classes(of_split)
+        pools = {c.name: [task.name for task in c.tasks if task.of(of_split)] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
         listed: dict[str, list[str]] = {}
