@@ -87,9 +87,8 @@ class MADDPG(DDPG):
         actions = torch.tanh(raw)
         losses = []
         for agent, view in enumerate(self.views):
-            value = self._climbed(
-                self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
-            )
+            mine = torch.where(self.owner == agent, actions, draw.actions)
+            value = self._values(self.critic, obs, mine)[0]
             # The price is relative to all actions, not the agent's own, so that it does not depend on the partition.
             price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())

@@ -8,7 +8,6 @@ Horgan et al. 2018).
 
 import copy
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -60,14 +59,10 @@ class DDPG(OffPolicy):
     policy: DeterministicPolicy
     policy_of = staticmethod(deterministic_policy)
     num_critics = 1
-    delayed_targets: ClassVar[bool] = True
-    """True: targets use the actions of a target actor, and all target networks move only when the actor learns. False:
-    targets use the present actor's actions, and the target critics move in each update."""
 
     def __init__(self, world: VectorWorld, config: DDPGConfig, seed: int):
         super().__init__(world, config, seed)
-        if self.delayed_targets:
-            self.target_actor = copy.deepcopy(self.policy.actor)
+        self.target_actor = copy.deepcopy(self.policy.actor)
         self.noise_std = spread(*config.exploration_std, world.task_id, world.num_tasks)[:, None]
         self.actor_loss = torch.zeros((), device=self.device)
 
@@ -82,11 +77,9 @@ class DDPG(OffPolicy):
         obs = self.policy.observations(draw.obs)
         next_obs = self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        if due := self._actor_is_due():
+        if self._actor_is_due():
             self._policy_step(obs, draw, weights, counts)
-            if self.delayed_targets:
-                follow(self.target_actor, self.policy.actor, self.config.tau)
-        if due or not self.delayed_targets:
+            follow(self.target_actor, self.policy.actor, self.config.tau)
             follow(self.target_critic, self.critic, self.config.tau)
         return reported
 
@@ -99,33 +92,22 @@ class DDPG(OffPolicy):
         return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        if self.delayed_targets:
-            actor = self.target_actor
-        else:
-            actor = self.policy.actor
         with autocast(self.device, self.low_precision):
-            return actor(next_obs)
+            return self.target_actor(next_obs)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
         raw = self.policy.raw(obs)
-        value = self._climbed(self._values(self.critic, obs, torch.tanh(raw)))
+        value = self._values(self.critic, obs, torch.tanh(raw))[0]
         price = self.config.squash_price * raw.square().mean(1)
         loss = (weights / counts.sum().clamp_min(1.0) * (price - value)).sum()
         actor = list(self.policy.actor.parameters())
         self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
 
-    def _climbed(self, values: Tensor) -> Tensor:
-        return values[0]
-
     def _reported(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}
 
     def _own_parts(self) -> Parts:
-        if self.delayed_targets:
-            follows = {"target_actor": self.target_actor}
-        else:
-            follows = {}
-        return {**follows, "actor_loss": self.actor_loss}
+        return {"target_actor": self.target_actor, "actor_loss": self.actor_loss}
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:

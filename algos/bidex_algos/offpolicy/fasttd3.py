@@ -2,8 +2,8 @@
 
 Few updates of many transitions follow each vector step. Targets use the present actor's actions, and target networks
 follow fast. mu climbs min_i E Z_i, returns may span several steps, and weights decay. Rewards are divided by
-max(standard deviation, largest / bound) of their task's returns. The rest is described in ``td3.py`` and
-``categorical.py``; see ``docs/learners/fasttd3.md``.
+max(standard deviation, largest / bound) of their task's returns. The distributions are described in ``categorical.py``;
+see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass
@@ -11,20 +11,35 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.architecture import follow
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
 from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
-from bidex_algos.offpolicy.td3 import TD3, TD3Config
+from bidex_algos.offpolicy.ddpg import spread
 from bidex_algos.replay import Transitions
-from bidex_meta.utils.validation import Count, NonNegative, Share
+from bidex_meta.training.learner import Parts
+from bidex_meta.utils.validation import Count, NonNegative, Share, check_rising
+from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class FastTD3Config(CategoricalConfig, TD3Config):
+class FastTD3Config(CategoricalConfig):
     """All options of FastTD3; the defaults are the preset ``laptop``."""
 
+    exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
+    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
+    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
+    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
+    policy_delay: Count = 2  # Updates of the critics and of their targets for each update of the actor.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
     weight_decay: NonNegative = 0.1  # Share of its step size by which a step shortens all weights (AdamW).
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_rising(self, self.algo, "exploration_std")
 
 
 PRESETS: dict[str, FastTD3Config] = {
@@ -51,19 +66,65 @@ PRESETS: dict[str, FastTD3Config] = {
 }  # fmt: skip
 
 
-class FastTD3(Categorical, TD3):
+class FastTD3(Categorical):
     """Multi-task FastTD3 (Seo et al. 2025, arXiv 2505.22642) on a batched world."""
 
     name = "fasttd3"
+    remedy = "lower critic_learning_rate"
     config_type = FastTD3Config
     presets = PRESETS
     config: FastTD3Config
-    delayed_targets = False
+    policy: DeterministicPolicy
+    policy_of = staticmethod(deterministic_policy)
+    going_on = ("updates", *Categorical.going_on)
+
+    def __init__(self, world: VectorWorld, config: FastTD3Config, seed: int):
+        super().__init__(world, config, seed)
+        self.noise_std = spread(*config.exploration_std, world.task_id, world.num_tasks)[:, None]
+        self.actor_loss = torch.zeros((), device=self.device)
+        self.updates = 0
+
+    def _explore(self, obs: Tensor) -> Tensor:
+        action = self.policy.eval_action(obs)
+        return (action + self.noise_std * self._normal(action)).clamp(-1.0, 1.0)
+
+    def _normal(self, like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=self.generator, device=self.device)
+
+    def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        obs = self.policy.observations(draw.obs)
+        next_obs = self.policy.observations(draw.next_obs)
+        # Step 1: the critics' distributions move towards the projected targets, by cross-entropy.
+        reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
+        # Step 2: the actor learns at every policy_delay-th update.
+        self.updates += 1
+        if self.updates % self.config.policy_delay == 0:
+            self._climb(obs, weights, counts)
+        # Step 3: the target critics follow in each update; there is no target actor.
+        follow(self.target_critic, self.critic, self.config.tau)
+        return reported
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        following = self._following(next_obs, self._target_action(next_obs))
-        return self._projected(draw, following, torch.zeros_like(draw.rewards))
+        """Return the critics' targets (B, atoms), for the present actor's actions with clipped noise."""
+        with autocast(self.device, self.low_precision):
+            action = self.policy.actor(next_obs)
+        bound = self.config.target_bound
+        noise = self.config.target_std * self._normal(action)
+        action = (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
+        return self._projected(draw, self._following(next_obs, action), torch.zeros_like(draw.rewards))
 
-    def _climbed(self, values: Tensor) -> Tensor:
-        return self._pooled(values)
+    def _climb(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
+        """Move the actor up its value, at a price on what tanh is taken of."""
+        raw = self.policy.raw(obs)
+        value = self._pooled(self._values(self.critic, obs, torch.tanh(raw)))
+        price = self.config.squash_price * raw.square().mean(1)
+        loss = (weights / counts.sum().clamp_min(1.0) * (price - value)).sum()
+        actor = list(self.policy.actor.parameters())
+        self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
+
+    def _reported(self) -> dict[str, Tensor]:
+        return {"Loss/actor": self.actor_loss}
+
+    def _own_parts(self) -> Parts:
+        return {"actor_loss": self.actor_loss}

@@ -19,8 +19,7 @@ class TD3Config(DDPGConfig):
 
     target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
     target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
-    policy_delay: Count = 2
-    """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
+    policy_delay: Count = 2  # Updates of the critics for each update of the actor and of all target networks.
 
 
 # Smoothing and delay of "paper", like the defaults, are from Fujimoto et al. (2018, section 6.1).
