@@ -210,9 +210,6 @@ class OnPolicy(Learner):
     def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
         return self.return_stats.restore(values, self._element(task_id))
 
-    def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
-        return self.return_stats.normalise(returns, self._element(task_id))
-
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         self.return_stats.merge(mean, var, count)
 
@@ -250,7 +247,7 @@ class OnPolicy(Learner):
             obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
             advantages=advantages.reshape(judged.shape),
-            targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
+            targets=self.return_stats.normalise(returns.reshape(judged.shape), self._element(flat_task_id)),
             weights=r.valid.flatten().float()
         )  # fmt: skip
         return batch, explained.view(-1, num_tasks).mean(0)
@@ -334,9 +331,7 @@ class MTPPO(OnPolicy):
             else:
                 name = f"{len(index)} samples, first {first}, critic alone {critic_alone}"
                 measured.append(self._graphs.run(name, work, *inputs).clone())
-        names = list[str](NAMES)
-        if self.balance is not None:
-            names.append(self.balance.tag)
+        names = [*NAMES, self.balance.tag] if self.balance is not None else [*NAMES]
         if self.demonstrations is not None:
             names.append("Loss/demonstrations")
         means = torch.stack(measured).mean(0)
@@ -411,14 +406,11 @@ class MTPPO(OnPolicy):
     def start_from(self, policy: State) -> None:
         """Start as in the base class, with standard deviations within ``std_range`` and the smallest step size."""
         super().start_from(policy)
-        self._forget_graphs()
+        if self._graphs is not None:
+            self._graphs.forget()
         self._bound_std()
         # A KL is known only after a step: of a policy trained by DAgger the first was 187 with a step size of 3e-4.
         self.adams.rate.fill_(self.adams.bounds[0])
-
-    def _forget_graphs(self) -> None:
-        if self._graphs is not None:
-            self._graphs.forget()
 
     def _optimisers(self) -> Parts:
         return self.adams.parts() | ({} if self.balance is None else self.balance.parts())
@@ -442,7 +434,8 @@ class MTPPO(OnPolicy):
     def load_state_dict(self, state: State) -> None:
         """Restore the state as in the base class; begin new episodes if teachers follow an episode from its start."""
         super().load_state_dict(state)
-        self._forget_graphs()
+        if self._graphs is not None:
+            self._graphs.forget()
         if self.lessons is None:
             return
         self.lessons.data.load_state_dict(state["data"])
