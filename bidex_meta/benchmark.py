@@ -122,7 +122,8 @@ class Benchmark:
         for split in SPLITS:
             self._tasks[split] = {entry.name: self._draw(entry, split) for entry in self.suite.split_classes(split)}
         overlap = set(self.train_tasks) & set(self.test_tasks)
-        choices = any(task.split == "both" for entry in self.suite.classes for task in entry.tasks)
+        listed = chain.from_iterable(entry.tasks for entry in self.suite.classes)
+        choices = any(task.split == "both" for task in listed)
         if overlap and not choices:
             raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
         actions = {name: task_class.action_size for name, task_class in self._classes.items()}

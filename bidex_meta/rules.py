@@ -11,6 +11,8 @@ from bidex_meta.errors import one_line
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import check_fields, check_rising
 
+CONTROL_RATE = 60
+"""Control steps per second of every class (docs/figures.md, control)."""
 HELD_STEPS = 15
 """Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
 

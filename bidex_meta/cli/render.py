@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.cli.parsing import LookFlags, Switch, parse
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError
+from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable, refuse_links
 from bidex_meta.runs.progress import counted
@@ -65,15 +65,14 @@ def main(arguments: Sequence[str]) -> None:
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
     from bidex_meta.cli.looking import acting, looked_at
-    from bidex_meta.evaluation.filming import film_row, film_tiles
-    from bidex_meta.tasks.base import CONTROL_RATE
+    from bidex_meta.evaluation.filming import film_row, film_tiles, with_clouds
 
     source, slots, task = looked_at(flags, all_slots=flags.tiled)
     # One environment per slot is enough, because each slot is shown once.
     world = source.world("train", len(slots))
     agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     if flags.points:
-        world = _with_clouds(world)
+        world = with_clouds(world)
     if flags.tiled:
         rows = list(range(len(slots)))
     else:
@@ -105,14 +104,3 @@ def main(arguments: Sequence[str]) -> None:
             video.write_image(out, frame)
     world.close()
     print(out)
-
-
-def _with_clouds(world: Any) -> Any:
-    """Wrap the world so that its pictures show point clouds."""
-    from bidex_meta.evaluation.filming import CloudView
-    from bidex_meta.world import PointsRule, World
-
-    if not isinstance(world, World):
-        raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
-    count = (world.points or PointsRule()).count
-    return CloudView(world, count)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all

@@ -7,6 +7,7 @@ from pathlib import Path
 from bidex_meta.cli.parsing import JsonSwitch, Switch, parse
 from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.tasks import registry
@@ -46,7 +47,6 @@ def main(arguments: Sequence[str]) -> None:
         check_writable(flags.out)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
-        from bidex_meta.tasks.base import CONTROL_RATE
         from bidex_meta.witness.replay import frames
 
         pictures = frames(names[0], load_witness(names[0], flags.file), camera=flags.camera)

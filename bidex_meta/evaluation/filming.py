@@ -8,10 +8,11 @@ import torch
 from typing_extensions import Unpack
 
 from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError
 from bidex_meta.runs.video import LABEL, tiled
 from bidex_meta.world.cloud import Camera, Cloud, beside, camera_of, draw
 from bidex_meta.world.contract import PooledWorld
-from bidex_meta.world.depth_sensor import CANDIDATES
+from bidex_meta.world.depth_sensor import CANDIDATES, PointsRule
 from bidex_meta.world.surfaces import sample
 from bidex_meta.world.world import World
 from bidex_meta.world.wrapper import PooledWorldWrapper
@@ -101,6 +102,14 @@ def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, l
     width = 2 * round(inner * look.get("width", 640) / look.get("height", 480) / 2)
     picture = world.render(row, width, inner, look.get("camera"))
     return tiled([picture], [name], [done])
+
+
+def with_clouds(world: PooledWorld) -> PooledWorld:
+    """Return a world of hands whose pictures also show point clouds; raise BidexError for another world."""
+    if not isinstance(world, World):
+        raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
+    count = (world.points or PointsRule()).count
+    return CloudView(world, count)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
 
 
 class CloudView(PooledWorldWrapper):

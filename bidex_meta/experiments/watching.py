@@ -17,11 +17,11 @@ from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.learners import LearnerKind
 from bidex_meta.experiments.policies import slots_of
+from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.runs import Recorder, RunFolder
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.video import check_films
 from bidex_meta.runs.writers import check_logger
-from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability, Learner
 from bidex_meta.utils import gl_backend

@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import meets_box, noisy_joints
-from bidex_meta.rules import V1, Rules
+from bidex_meta.rules import CONTROL_RATE, V1, Rules
 from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.goals import Ghost
 from bidex_meta.tasks.layout import Block, Layout, both_hands
@@ -25,9 +25,6 @@ from bidex_meta.tasks.variation import NO_COMPONENTS, VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import constant
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Positive, Text, Whole, true_or_false
-
-CONTROL_RATE = 60
-"""Control steps per second of every class (docs/figures.md, control)."""
 
 
 @checked_arguments
@@ -174,7 +171,7 @@ class TaskClass(ABC):
         """
         if self.wide_space is None:
             raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
-        hidden = [name for part in self.hides() for name in part.names] or self.wide_space.names
+        hidden = list(chain.from_iterable(part.names for part in self.hides())) or self.wide_space.names
         self.variation_space = self.wide_space.only(hidden)
         self.episode_space = self.wide_space.only([name for name in self.wide_space.names if name not in hidden])
         drawn = (*self.variation_space.names, *self.episode_space.names)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
-from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.rules import CONTROL_RATE
 from bidex_meta.world import World
 from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
-from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.rules import CONTROL_RATE
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import multiply, roll_pitch_yaw, xyzw

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.rules import FACTORS, Randomisation
-from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.rules import CONTROL_RATE, FACTORS, Randomisation
 from bidex_meta.tasks.layout import CLIP, Layout
 from bidex_meta.world.model_factors import exponents, heights, object_bodies
 from bidex_meta.world.part import Part

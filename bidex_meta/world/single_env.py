@@ -15,9 +15,9 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.rules import V1, Rules, versioned_name
+from bidex_meta.rules import CONTROL_RATE, V1, Rules, versioned_name
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Pixels, Whole, true_or_false, whole_number
 from bidex_meta.world.checked import one_row

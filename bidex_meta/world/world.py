@@ -19,8 +19,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.rules import Randomisation
-from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.rules import CONTROL_RATE, Randomisation
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
