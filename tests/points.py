@@ -121,6 +121,30 @@ class Still:
         self._called("adapt")
 
 
+class Climber:
+    """Keeps its direction while its reward rises, and turns when the reward falls: it learns while it acts."""
+
+    def __init__(self) -> None:
+        self.observed = 0
+        self.angle, self._last = torch.zeros(0), torch.zeros(0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        if len(self.angle) != len(env_mask):
+            self.angle, self._last = torch.zeros(2, len(env_mask)).unbind()
+        self.angle = self.angle.masked_fill(env_mask, 0.0)
+        self._last = self._last.masked_fill(env_mask, -torch.inf)
+
+    def act(self, obs: Tensor) -> Tensor:
+        return torch.stack([self.angle.cos(), self.angle.sin()], 1)
+
+    def observe(self, timestep: Timestep) -> None:
+        assert timestep.valid is not None
+        self.observed += 1
+        falls = timestep.valid & (timestep.reward < self._last)
+        self.angle = self.angle + 2.0 * falls
+        self._last = torch.where(timestep.valid, timestep.reward, self._last)
+
+
 class Finder(Still):
     """Remembers of each task the place with the best reward, and goes there."""
 

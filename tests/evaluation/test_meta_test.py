@@ -13,10 +13,11 @@ from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
+from bidex_meta.evaluation.trial_agents import AdaptingTrialAgent
 from bidex_meta.metaworld.adapters import FromMetaWorld
 from bidex_meta.worlds import Worlds
 from tests.fakes import ToyWorld
-from tests.points import Finder, PointWorld, Still, ring
+from tests.points import Climber, Finder, PointWorld, Still, ring
 
 
 def world(rows=12, near=3, far=2, **keywords):
@@ -266,6 +267,25 @@ def test_exploring_episodes_are_whole_by_default():
     assert found.to_json()["max_adapt_steps"] == found.protocol.max_adapt_steps == 200
     cut = meta_evaluate(agent, place, 1, rollouts=1, episodes_per_task=1, max_adapt_steps=150)
     assert cut.adapt_steps == [5 * 150]
+
+
+def test_an_agent_of_ones_own_sees_rewards_while_it_is_judged_unless_they_are_hidden():
+    agent = Climber()
+    place = world(10, steps=(20, 20))
+    found = meta_evaluate(
+        AdaptingTrialAgent(agent), place, 2, rollouts=1, episodes_per_task=1, seed=3, hidden_rewards=True
+    )
+    assert agent.observed == 2 * 20, "two exploring episodes; evaluations are played by copies"
+    assert found.hidden_by_shot is not None and len(found.by_shot) == len(found.hidden_by_shot) == 3
+    for name in ("Near", "Far"):
+        shown, hidden = (each[0].classes[name] for each in (found.by_shot, found.hidden_by_shot))
+        assert shown.mean_return > hidden.mean_return + 1.0
+        assert np.array_equal(shown.tasks, hidden.tasks)
+    written = found.to_json()
+    assert written["rewards_shown"] and len(written["hidden_by_shot"]) == 3
+    plain = meta_evaluate(AdaptingTrialAgent(Climber()), place, 2, rollouts=1, episodes_per_task=1, seed=3)
+    assert plain.hidden_by_shot is None
+    assert [each.to_json() for each in plain.by_shot] == [each.to_json() for each in found.by_shot]
 
 
 def test_one_protocol_says_what_is_played():
