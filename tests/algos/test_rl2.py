@@ -177,6 +177,28 @@ def test_evaluation_episodes_start_from_what_adaptation_left():
     assert not state_of(agent).any()
 
 
+def test_the_reward_of_an_evaluation_step_is_seen_where_it_is_shown():
+    world = PointGoals(4, classes=TEN)
+    agent = agent_on(world)
+    shot(agent, world)
+    left = state_of(agent)
+    obs, no = torch.zeros(4, 4), torch.zeros(4, dtype=torch.bool)
+    valid = torch.tensor([True, True, True, False])
+
+    def second(reward: float | None) -> Tensor:
+        """The second action of an episode, after a first step with this reward; None: it is hidden."""
+        agent.reset(everyone(world))
+        action = agent.eval_action(obs)
+        if reward is not None:
+            agent.observe(Timestep(obs, action, torch.full((4,), reward), no, no, {}, obs, valid))
+        return agent.eval_action(obs)
+
+    hidden, low, high = second(None), second(-1.0), second(1.0)
+    assert (low[:3] != high[:3]).any(dim=1).all() and (low[:3] != hidden[:3]).any(dim=1).all()
+    assert torch.equal(low[3], hidden[3]), "a step whose physics broke shows nothing"
+    assert torch.equal(state_of(agent), left)
+
+
 def test_the_agent_waits_with_rows_whose_episode_is_over():
     world = PointGoals(6, classes=UNEVEN)
     agent = agent_on(world)
