@@ -91,6 +91,12 @@ class Evaluation:
     classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
     episodes_per_task: int  # episodes of every task
 
+    @property
+    def success(self) -> float:
+        """Return the mean over classes of the success rate, in [0, 1]."""
+        rates = [result.success for result in self.classes.values()]
+        return sum(rates) / len(rates)
+
     def summary(self) -> Summary:
         """Return the results without the single episodes."""
         results = self.classes.values()

@@ -53,8 +53,7 @@ class PlayedTasks:
     @property
     def success(self) -> float:
         """Return the mean over classes of the success rate, in [0, 1]."""
-        rates = [result.success for result in self.policy.classes.values()]
-        return sum(rates) / len(rates)
+        return self.policy.success
 
     def entries(self) -> dict[str, Any]:
         """Return the entries that :class:`PolicyEvaluation` and :class:`OtherTasks` have in common."""
