@@ -6,7 +6,7 @@ Names of task classes and of their variations are checked where the classes are 
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from itertools import product
@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from bidex_meta import ladder
-from bidex_meta.errors import BidexError, known_name, nearest, shortened, unknown_name
+from bidex_meta.errors import BidexError, nearest, shortened, unknown_name
 from bidex_meta.rules import (  # noqa: F401 (names of a suite, imported from here too)
     FACTORS,
     HELD_STEPS,
@@ -196,15 +196,25 @@ def load_suite(name_or_path: str | Path) -> Suite:
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
         return _parse(expanded(name_or_path))
-    names = suite_names()
-    if text.casefold() not in {name.casefold() for name in names}:
-        meant = {text.casefold(): nearest(text, names) or "MT4"}
-        raise unknown_name("suite", text, [*file_names(), *ladder.names_of([ladder.ANY_CLASS])], meant)
-    name = known_name("suite", text, names)
+    name = known_suite(text)
     parts = ladder.parts_of(name)
     if parts is None:
         return _shipped(name)
     return _of_one_class(name, parts)
+
+
+def known_suite(name: str, more: Iterable[str] = (), kind: str = "suite") -> str:
+    """Return the suite, or the one of ``more`` names, that a name given in any case means.
+
+    Raises BidexError if there is none, with the nearest name and a list in which suites of one class stand once.
+    """
+    names = [*suite_names(), *more]
+    folded = {known.casefold(): known for known in names}
+    if name.casefold() not in folded:
+        near = nearest(name, names)
+        listed = [*file_names(), *ladder.names_of([ladder.ANY_CLASS]), *more]
+        raise unknown_name(kind, name, listed, {name.casefold(): near} if near else {})
+    return folded[name.casefold()]
 
 
 @cache

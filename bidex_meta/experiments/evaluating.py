@@ -32,7 +32,7 @@ from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import portable
-from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots
+from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots, check_fields
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
@@ -145,7 +145,8 @@ class FinalEvaluation:
     tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
 
     def check(self, config: AnyConfig) -> None:
-        """Raise BidexError if an option does not go with the learner of a resolved config."""
+        """Raise BidexError for a bad value, and if an option does not go with the learner of a resolved config."""
+        check_fields(self, "run", as_flags=True)
         adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
         if adapts:
             if self.other_tasks:

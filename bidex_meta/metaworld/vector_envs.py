@@ -16,7 +16,7 @@ from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
-from bidex_meta.suite import V1, load_suite, plain_name, suite_names, versioned_name
+from bidex_meta.suite import V1, known_suite, load_suite, plain_name, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Few, true_or_false
@@ -259,5 +259,5 @@ def _is_class(name: str) -> bool:
     folded = {known.casefold() for known in registry.names()}
     is_class = plain_name(name).casefold() in folded
     if not is_class and not name.endswith(".toml"):
-        known_name("class or suite", name, [*registry.names(), *suite_names()])
+        known_suite(name, registry.names(), "class or suite")
     return is_class

@@ -71,7 +71,7 @@ class OpenScissors(ReachTask):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: rotation (n, 4); ``ghost``: (n, 7)."""
-        root = variation.new_tensor((*_SCISSORS.position, *_SCISSORS.quaternion)).repeat(len(variation), 1)
+        root = constant((*_SCISSORS.position, *_SCISSORS.quaternion), variation).repeat(len(variation), 1)
         place(root, variation[:, :3])
         turn = yaw_quaternion(variation[:, 3])
         ghost = _opened(root[:, :3], xyzw(root[:, 3:]), turn)
@@ -163,7 +163,7 @@ class OpenPenCap(ReachTask):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
-        pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
+        pen = constant((*_PEN.position, *_PEN.quaternion), variation).repeat(len(variation), 1)
         place(pen, variation[:, :3])
         rotation = xyzw(pen[:, 3:])
         if self.rules.wide:
@@ -262,10 +262,10 @@ class Switch(ReachTask):
         """Return base positions, the button points' targets ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
         frozen = {}
         for i, switch in enumerate(self.objects, start=1):
-            position = variation.new_tensor(switch.position).repeat(len(variation), 1)
+            position = constant(switch.position, variation).repeat(len(variation), 1)
             position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
-            frozen |= {switch.name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
-        turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
+            frozen |= {switch.name: position, f"goal{i}": position + constant(_PRESSED, variation)}
+        turn = xyzw(constant(_PRESSED_QUATERNION, variation)).expand(len(variation), 4)
         if self.rules.wide:
             angles = {"angles": variation[:, 4:]}
         else:

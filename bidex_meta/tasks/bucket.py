@@ -125,8 +125,8 @@ def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
     """Return ``goal``: the bucket's nominal place shifted (n, 2), metres, upright; nothing without a shift (n, 0)."""
     if not shift.shape[1]:
         return {}
-    position = pad(shift, (0, 1)) + shift.new_tensor(bucket.position)
-    return frozen_goal(torch.cat((position, shift.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(shift), 4)), dim=1))
+    position = pad(shift, (0, 1)) + constant(bucket.position, shift)
+    return frozen_goal(torch.cat((position, constant((0.0, 0.0, 0.0, 1.0), shift).expand(len(shift), 4)), dim=1))
 
 
 def _bucket_error(state: TaskState) -> list[Error]:
@@ -226,8 +226,8 @@ class PourWater(ReachTask):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``kettle``, ``bucket``: shifts, turns (n, 3); ``goal_rotation``: (x, y, z, w), and inverse (n, 4)."""
-        nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
-        tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0))))
+        nominal = xyzw(constant(_KETTLE.quaternion, variation))
+        tilt = xyzw(constant(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0)), variation))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
         frozen = {"goal_rotation": goal, "goal_rotation_inverse": conjugate(goal)}
         return super().freeze(variation) | frozen | _bucket_goal(variation[:, 6:], _BUCKET)

@@ -78,7 +78,7 @@ class _TwoBlocks(ReachTask):
 
 def _unturned(position: Tensor) -> Tensor:
     """Return poses (n, 7) with the world's axes at positions (n, 3)."""
-    return posed(position, position.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(position), 4))
+    return posed(position, constant((0.0, 0.0, 0.0, 1.0), position).expand(len(position), 4))
 
 
 class PushBlock(_TwoBlocks):
@@ -117,7 +117,7 @@ class PushBlock(_TwoBlocks):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
         goals = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
-        first, second = (variation.new_tensor(goal).expand(len(variation), 3) for goal in goals)
+        first, second = (constant(goal, variation).expand(len(variation), 3) for goal in goals)
         if self.rules.wide:
             first = first + pad(variation[:, 6:8], (0, 1))
             second = second + pad(variation[:, 8:], (0, 1))
@@ -199,8 +199,8 @@ class StackBlock(_TwoBlocks):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``block1``, ``block2``: shifts, turns (n, 3); targets (n, 3); ``goal``: top block's pose (n, 7)."""
         shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
-        bottom = shift + shift.new_tensor((0.0, 0.0, 0.625))
-        top = bottom + shift.new_tensor((0.0, 0.0, _EDGE))
+        bottom = shift + constant((0.0, 0.0, 0.625), shift)
+        top = bottom + constant((0.0, 0.0, _EDGE), shift)
         frozen = super().freeze(variation)
         if not self.rules.wide:
             return frozen | {"goal1": top, "goal2": bottom, "goal": _unturned(top)}
@@ -276,7 +276,7 @@ class ReOrientation(TaskClass):
         """Return ``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
         frozen = {}
         for i, centre in enumerate(((0.0, -0.76, 0.56), (0.0, -0.39, 0.56)), start=1):
-            position = variation.new_tensor(centre).expand(len(variation), 3)
+            position = constant(centre, variation).expand(len(variation), 3)
             frozen |= frozen_goal(eggs.goal_pose(position, variation), f"goal{i}")
         return frozen
 

@@ -89,9 +89,9 @@ class _Door(ReachTask):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: of leaves (n, 1)."""
-        position = variation.new_tensor(_BASE).repeat(len(variation), 1)
+        position = constant(_BASE, variation).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
-        turn = xyzw(variation.new_tensor(quaternion_from_rpy(self.objects[0].rpy))).expand(len(variation), 4)
+        turn = xyzw(constant(quaternion_from_rpy(self.objects[0].rpy), variation)).expand(len(variation), 4)
         frozen = {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:2]}
         return frozen | ({"leaves": variation[:, 2:4]} if self.rules.wide else {})
 

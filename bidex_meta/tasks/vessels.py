@@ -75,7 +75,7 @@ class LiftUnderarm(OwnObjectClass):
         placement = variation[:, :3]
         if self.rules.wide:
             placement = torch.zeros_like(placement)  # episodes draw it, so a goal may not depend on it
-        start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + placement.new_tensor(_START)
+        start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + constant(_START, placement)
         goal = torch.cat((start + variation[:, 3:], yaw_quaternion(placement[:, 2])), dim=1)
         return {"object": variation[:, :3], **frozen_goal(goal)}
 
@@ -253,10 +253,10 @@ class SwingCup(OwnObjectClass):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
-        position = variation.new_tensor(_CUP.position).repeat(len(variation), 1)
+        position = constant(_CUP.position, variation).repeat(len(variation), 1)
         if not self.rules.wide:
             position[:, :2] += variation[:, :2]
-        rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))
+        rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(constant(_CUP.quaternion, variation)))
         return super().freeze(variation) | frozen_goal(torch.cat((position, rotation), dim=1))
 
     def target(self, state: TaskState) -> Tensor:

@@ -5,12 +5,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from bidex_meta.errors import BidexError, known_name
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.rules import Rules, plain_name
-from bidex_meta.suite import METAWORLD_SUITES, OTHER_SEED, SPLITS, Suite, load_randomisation, load_suite, suite_names
+from bidex_meta.suite import (
+    METAWORLD_SUITES,
+    OTHER_SEED,
+    SPLITS,
+    Suite,
+    known_suite,
+    load_randomisation,
+    load_suite,
+    suite_names,
+)
 from bidex_meta.tasks import registry
 from bidex_meta.utils.files import Json
 
@@ -103,7 +112,7 @@ class Worlds(ABC):
         if not suite.endswith(".toml"):
             if plain_name(suite) in registry.names():
                 raise BidexError(f"{suite} is a class, not a suite: name it by task (--task {suite}).")
-            suite = known_name("suite", suite, suites_to_run())
+            suite = known_suite(suite, METAWORLD_SUITES)
         return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
 
     @abstractmethod

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import record
 from bidex_meta.data import collect, open_dataset, writer
+from bidex_meta.experiments import recording
 from bidex_meta.runs import RunFolder
 from bidex_meta.witness.demonstrators import ShiftedStarts
 from bidex_meta.witness.replay import Simulator
@@ -88,7 +88,7 @@ def test_on_all_tasks_they_show_more(
     played = load_witness("CatchAbreast")
     words = ["record", "demonstrations", "--task", "Switch", "--threads", "1", "--starts", "tasks"]
     with monkeypatch.context() as patch:
-        patch.setattr(record, "load_witness", lambda name: played)
+        patch.setattr(recording, "load_witness", lambda name: played)
         assert "None of 12 replays" in printed(capsys, *words, "--num-envs", "4", "--size", "10", code=2)
     printed(capsys, *words, "--num-envs", "8", "--size", "1", "--out", sets / "sets" / "own-v0")
     kept = open_dataset("own-v0")

@@ -90,9 +90,9 @@ def test_evaluations_report_both(scripts: list[list[int]], fails: list, breaks: 
         row = Reference()
         told = [row.step(solved[step, i], failed[step, i], (step, i) in breaks) for step in range(LIMIT)][-1]
         assert {key: found[key][i] for key in told} == told and found["success"][i] == told["at_end"]
-    result = results_by_class(["A"], found)["A"].to_json()
-    assert result["success_once"] == (found["once"] & ~found["unstable"]).mean()
-    assert result["success_at_end"] == result["success"]
+    result = results_by_class(["A"], found)["A"].summary()
+    assert result.success_once == (found["once"] & ~found["unstable"]).mean()
+    assert result.success_at_end == result.success
 
 
 def test_a_checkpoint_within_a_held_stretch_continues_bit_for_bit() -> None:
