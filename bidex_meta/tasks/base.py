@@ -23,7 +23,7 @@ from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import NO_COMPONENTS, VariationSpace
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.maths import constant
+from bidex_meta.utils.maths import constant, indices
 from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Positive, Text, Whole, true_or_false
 
 
@@ -191,7 +191,8 @@ class TaskClass(ABC):
         placement = (0.5 * (low + high)).expand(len(variation), space.size)
         if draws is not None:
             placement = placement + 0.5 * (high - low) * draws[:, : space.size].to(variation)
-        return self.freeze(torch.cat((variation, placement), dim=1)[:, self._order])
+        drawn = torch.cat((variation, placement), dim=1)
+        return self.freeze(drawn[:, indices(self._order, drawn)])
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:

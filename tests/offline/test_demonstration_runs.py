@@ -66,7 +66,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
         rounds.append(play(*given))
 
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "collect_successes", once)
+        patch.setattr(recording, "collect_successes", once)
         printed(capsys, *torn, code=130)
     asked, room = [], writer.check_room
     with monkeypatch.context() as patch:
