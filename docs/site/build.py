@@ -16,7 +16,7 @@ LINK = re.compile(r"(\]\()(?!https?://|mailto:|#)([^)#\s]+)(#[^)\s]*)?\)")
 
 
 def stage() -> list[Path]:
-    """Copies README.md, every page under docs/ and, again and again, what pages link to; returns the pages."""
+    """Copy README.md, every page under docs/ and, repeatedly, the files that pages link to; return the pages."""
     shutil.rmtree(STAGE, ignore_errors=True)
     waiting = [
         ROOT / "README.md",
@@ -48,7 +48,7 @@ def _page_of(path: Path) -> Path:
 
 
 def _for_the_site(source: Path, found: re.Match[str]) -> str:
-    """A link as the site needs it: to a folder's README."""
+    """Return a link as the site needs it: to a folder's README."""
     path = (source.parent / found[2]).resolve()
     if not path.is_dir():
         return found[0]
