@@ -75,7 +75,9 @@ def test_advantages_and_targets_are_those_by_hand(kind: str, terminal: bool):
         scaled = (expected[:, rows] - mine.mean()) / (mine.std(correction=0) + 1e-8) * r.valid[:, rows]
         assert_close(batch.advantages.view(8, -1)[:, rows], scaled, rtol=1e-3, atol=1e-3)
     returns = (expected + values).flatten()
-    assert_close(batch.targets, learner._in_critic_units(returns, batch.task_id), rtol=1e-3, atol=1e-3)
+    assert_close(
+        batch.targets, learner.return_stats.normalise(returns, learner._element(batch.task_id)), rtol=1e-3, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("kind", REPLAYING)
