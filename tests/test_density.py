@@ -1,4 +1,4 @@
-"""How much a line of the source may hold: one assignment, one loop, one condition."""
+"""Check that a line of the source holds one assignment, one loop and one condition at most."""
 
 import ast
 from collections.abc import Iterator

@@ -68,7 +68,7 @@ def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
     if flags.random:
         raise BidexError(f"{algo} is compared with itself before adaptation. Leave --random out.")
     if flags.other_tasks:
-        raise BidexError(f"{algo} adapts: --split others plays other tasks of its train classes.")
+        raise BidexError(f"{algo} adapts: --split others plays unseen tasks of its train classes.")
 
 
 def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:

@@ -151,7 +151,7 @@ def _play(
         if observe is not None:
             valid = running & ~info["unstable"]
             action = torch.as_tensor(action, device=obs.device)
-            observe(Timestep(obs, action, reward, terminated, truncated, {}, info["final_obs"], valid))
+            observe(Timestep(obs, action, reward, terminated, truncated, {}, new, valid))
         obs = new
         gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))

@@ -150,7 +150,7 @@ class FinalEvaluation:
         adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
         if adapts:
             if self.other_tasks:
-                raise BidexError(f"{config.algo} adapts: --split others plays other tasks of its train classes.")
+                raise BidexError(f"{config.algo} adapts: --split others plays unseen tasks of its train classes.")
             metatest.splits_of(Worlds.open(config.to_json()), self.split)
             return
         for name in ("split", "shots", "rollouts", "tasks"):

@@ -65,7 +65,7 @@ class RecordConfig:
     the transitions that `bidex-meta run --record N` stored; demonstrations: successful replays of the class's witness,
     a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
-    """Run folders, as many as the kind takes."""
+    """Run folders. The kind decides how many."""
     suite: str | None = None  # random: suite to play, a name or path of a TOML file; otherwise the run's own is played.
     task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
     base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
@@ -80,7 +80,7 @@ class RecordConfig:
     """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
     class, from their starts, where it succeeds less often but shows more."""
     script: Switch = False
-    """demonstrations, --starts tasks: play a scripted policy in place of the witness, computed anew from each start
+    """demonstrations, --starts tasks: play a scripted policy instead of the witness, computed from each start
     (about a second for 500 steps): eight classes have one, and it succeeds more often."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""

@@ -26,7 +26,7 @@ from bidex_meta.worlds import Worlds
 
 
 def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episodes: int, device: str) -> Path:
-    """Play runs of a suite, on its own tasks and on as many others, write the leaderboard's entry, and return its path.
+    """Play runs on their own and on unseen tasks, write the leaderboard's entry, and return its path.
 
     Args:
         folders: Runs that differ in the seed alone.

@@ -96,7 +96,7 @@ class Learner(ABC):
     task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Presets where it learns a single task class, by that class; they go before those of the same name."""
     capabilities: ClassVar[frozenset[Capability]] = frozenset()
-    """What the commands and the training may ask of the learner."""
+    """Capabilities that commands and training rely on."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int

@@ -73,7 +73,7 @@ def run(trained_once, toy_worlds, tmp_path) -> Path:
 
 @pytest.fixture
 def noted(monkeypatch) -> list[str]:
-    """What a command says it is at, in order."""
+    """The activities that a command reports, in order."""
     told: list[str] = []
     monkeypatch.setattr(waiting._Watch, "what", property(lambda self: "x", lambda self, what: told.append(what)), False)
     return told

@@ -222,7 +222,7 @@ def test_starts_differ_and_depend_on_the_seed_alone(qpos: np.ndarray, name: str,
 
 @worlds.each_moving
 def test_episodes_of_one_task_draw_placements_and_are_jittered(name: str) -> None:
-    """What stands or lies is placed anew and jittered by up to 5 mm, joints by a tenth of their ranges, or as in
+    """Objects and fixtures get a new place and a jitter of up to 5 mm, joints by a tenth of their ranges, or as in
     version 1."""
     world = worlds.world_of(f"{name}-v2", True, 200, tasks=1)
     drawn = world.slots[0].task_class.episode_space

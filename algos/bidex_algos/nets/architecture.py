@@ -33,7 +33,7 @@ class Networks(Protocol):
 
     @property
     def architecture(self) -> Architecture:
-        """How the networks share weights between tasks."""
+        """Return the form of weight sharing between tasks."""
         ...
 
     @property
