@@ -1,13 +1,15 @@
-"""Suites of a single class: ``MT1-Switch-v2``, ``ML1-Switch-v2``, ``ML1-Switch-choice2`` and ``-choice4``.
+"""Suites of a single class: ``MT1-Switch-v2``, ``ML1-Switch-v2``, and with fewer hidden numbers ``ML1-Switch-choice2``.
 
 ``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. In a choice suite a task is one of two or
-of four, the same in both splits: both hidden numbers are small or large, alike (two) or each for itself (four).
+of four, the same in both splits: both numbers of the goal are small or large, alike (two) or each for itself (four).
+In a ``-shared`` suite both numbers are one, anywhere between small and large. ``MT1-Switch-choice2`` shows the goal
+that ``ML1-Switch-choice2`` hides: a policy that is trained on it tells what adaptation can reach.
 """
 
 import re
 from collections.abc import Iterable
 from itertools import product
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 _OPENING = ("right_angle", "left_angle", 0.5, 1.2)
 _CLOSING = ("right_angle", "left_angle", 0.18, 0.82)
@@ -18,10 +20,14 @@ CHOICES: dict[str, tuple[str, str, float, float]] = {
     "DoorCloseInward": _CLOSING,
     "Switch": ("switch1_angle", "switch2_angle", 0.18, 0.48),
 }
-"""Classes with choice suites: the two hidden components, and their small and large value, rad."""
+"""Classes with choice and shared suites: the two hidden components, and their small and large value, rad."""
 ANY_CLASS = "CLASS"
 """The name of any class in messages."""
-_NAME = re.compile(r"(MT1|ML1)-([^-]+)-(v2|choice2|choice4)")
+_VARIANTS = ("choice2", "choice4", "shared")
+_NAME = re.compile(rf"(MT1|ML1)-([^-]+)-(v2|{'|'.join(_VARIANTS)})")
+_Task = tuple[str, Literal["train", "test", "both"], dict[str, float]]
+_SHARED_TASKS = 50
+"""Tasks of each split of a shared suite, those of the test split midway between those of the train split."""
 
 
 class OfOneClass(NamedTuple):
@@ -30,28 +36,52 @@ class OfOneClass(NamedTuple):
     template: str
     """Name of the suite that it is made from."""
     class_name: str
-    choices: int
-    """Number of its tasks; 0: as many as the template has."""
+    variant: str
+    """What goals there are: ``v2`` (as in the template), ``choice2``, ``choice4`` or ``shared``."""
+
+    @property
+    def shows_goals(self) -> bool:
+        """Return whether observations show the goal; then there is a train split alone."""
+        return self.template.startswith("MT1")
 
     @property
     def description(self) -> str:
         """Return the suite's description."""
-        if self.choices:
-            return f"{self.class_name} with one of {self.choices} hidden goals; placements differ between episodes"
-        if self.template.startswith("MT1"):
+        sight = "visible" if self.shows_goals else "hidden"
+        if self.variant.startswith("choice"):
+            number = self.variant.removeprefix("choice")
+            return f"{self.class_name} with one of {number} {sight} goals; placements differ between episodes"
+        if self.variant == "shared":
+            return f"{self.class_name} with one {sight} angle that both parts share"
+        if self.shows_goals:
             return f"{self.class_name} with fifty goals, visible"
         return f"{self.class_name} with hidden goals: train on fifty, adapt to fifty others"
 
-    def tasks(self) -> dict[str, dict[str, float]]:
-        """Return the fixed components of each listed task by the task's name; none if tasks are drawn."""
-        if not self.choices:
-            return {}
+    def tasks(self) -> list[_Task]:
+        """Return name, split and fixed components of each listed task; none if tasks are drawn."""
+        if self.variant == "v2":
+            return []
         first, second, small, large = CHOICES[self.class_name]
+        if self.variant == "shared":
+            return self._shared_tasks()
         values = {"small": small, "large": large}
-        tasks = {}
+        tasks = []
         for of_first, of_second in product(values, values):
-            if of_first == of_second or self.choices == 4:
-                tasks[f"{of_first}-{of_second}"] = {first: values[of_first], second: values[of_second]}
+            if of_first == of_second or self.variant == "choice4":
+                fixed = {first: values[of_first], second: values[of_second]}
+                tasks.append((f"{of_first}-{of_second}", "both", fixed))
+        return tasks
+
+    def _shared_tasks(self) -> list[_Task]:
+        """Return tasks evenly spaced between the small and the large value, by turns for training and for the test."""
+        first, second, small, large = CHOICES[self.class_name]
+        splits = ("train",) if self.shows_goals else ("train", "test")
+        tasks = []
+        for number in range(_SHARED_TASKS):
+            for split in splits:
+                share = (number + 0.25 + 0.5 * (split == "test")) / _SHARED_TASKS
+                angle = small + share * (large - small)
+                tasks.append((f"{split}-{number:02}", split, {first: angle, second: angle}))
         return tasks
 
 
@@ -59,9 +89,10 @@ def names_of(classes: Iterable[str]) -> list[str]:
     """Return the names of all suites of a single class, for the given classes."""
     names = []
     for name in classes:
-        names += [f"MT1-{name}-v2", f"ML1-{name}-v2"]
-        if name in CHOICES or name == ANY_CLASS:
-            names += [f"ML1-{name}-choice2", f"ML1-{name}-choice4"]
+        for kind in ("MT1", "ML1"):
+            names.append(f"{kind}-{name}-v2")
+            if name in CHOICES or name == ANY_CLASS:
+                names += [f"{kind}-{name}-{variant}" for variant in _VARIANTS]
     return names
 
 
@@ -71,8 +102,4 @@ def parts_of(name: str) -> OfOneClass | None:
     if match is None:
         return None
     kind, class_name, variant = match.groups()
-    if variant == "v2":
-        choices = 0
-    else:
-        choices = int(variant.removeprefix("choice"))
-    return OfOneClass(f"{kind}-v2", class_name, choices)
+    return OfOneClass(f"{kind}-v2", class_name, variant)

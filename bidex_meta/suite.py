@@ -225,7 +225,7 @@ def _shipped(name: str) -> Suite:
 
 def _of_one_class(name: str, parts: ladder.OfOneClass) -> Suite:
     template = _shipped(parts.template)
-    tasks = tuple(ListedTask(task, "both", fixed) for task, fixed in parts.tasks().items())
+    tasks = tuple(ListedTask(*task) for task in parts.tasks())
     entry = replace(template.classes[0], name=parts.class_name, class_name=parts.class_name, tasks=tasks)
     suite = replace(template, name=name, description=parts.description, classes=(entry,))
     if tasks:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import bidex_meta.benchmark
 from bidex_meta.benchmark import Benchmark, Task, make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.ladder import parts_of
 from bidex_meta.metaworld import CustomML
 from bidex_meta.suite import V1, V2, suite_names
 from bidex_meta.tasks import registry
@@ -99,8 +100,10 @@ def test_tasks_are_distinct_and_disjoint(name: str) -> None:
     assert len({(task.env_name, task.data) for task in tasks}) == len(tasks)
     classes = benchmark.task_classes("train") | benchmark.task_classes("test")
     if "-choice" in name:
-        assert benchmark.train_tasks == benchmark.test_tasks and len(tasks) == int(name[-1])
-    if not benchmark.suite.classes[0].tasks or "-choice" in name:
+        assert len(tasks) == int(name[-1]) and benchmark.test_tasks in ([], benchmark.train_tasks)
+    if "-shared" in name:
+        assert all(len(set(task.variation)) == 1 for task in tasks)
+    if not benchmark.suite.classes[0].tasks or parts_of(name) is not None:
         assert all(classes[task.env_name].variation_space.contains(task.variation) for task in tasks)
 
 

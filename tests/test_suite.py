@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
+from bidex_meta.ladder import parts_of
 from bidex_meta.suite import V1, V2, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -59,7 +60,7 @@ def test_shipped_suite_is_sound(name: str) -> None:
     suite = load_suite(name)
     assert suite.name == name
     assert {entry.class_name for entry in suite.classes} <= set(registry.names())
-    v2 = name.endswith("-v2") or "-choice" in name
+    v2 = name.endswith("-v2") or parts_of(name) is not None
     shown = "plain" if v2 and name.startswith("MT1-") else "one-hot"  # there is one class, and no list of tasks
     assert suite.observation == ("masked" if suite.kind == "meta" else shown)
     assert suite.rules == (V2 if v2 else V1) and suite.version == 1 + v2
@@ -102,8 +103,8 @@ def test_names_and_paths(tmp_path: Path) -> None:
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
     with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
         load_suite(tmp_path / "absent.toml")
-    choices = "ML1-CLASS-choice2, ML1-CLASS-choice4, ML1-CLASS-v2"
-    known = f"ML1, {choices}, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, ML5-v2, MT1, MT1-CLASS-v2"
+    choices = "ML1-CLASS-choice2, ML1-CLASS-choice4, ML1-CLASS-shared, ML1-CLASS-v2"
+    known = f"ML1, {choices}, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, ML5-v2, MT1, MT1-CLASS-choice2"
     with pytest.raises(BidexError, match=rf"Did you mean 'MT4'\? Known: {known}"):
         load_suite("MT44")
     with pytest.raises(BidexError, match=r"Did you mean 'ML1-Switch-choice\d'\?"):
