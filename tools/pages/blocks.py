@@ -21,6 +21,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table, shots_figure, shots_table
+from tools.pages.ladder import ladder_figure, ladder_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
@@ -33,6 +34,7 @@ _TABLES = {
     "classes": tables.classes_table,
     "gains": gains_table,
     "shots": shots_table,
+    "ladder": ladder_table,
     "offline": offline_table,
     "rows": rows_table,
 }
@@ -40,8 +42,11 @@ _WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table}
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "shot-curves": (shots_figure, "Success against exploring episodes"),
+    "ladder-curves": (ladder_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
+_JOINED = ("ladder", "ladder-curves")
+"""Tables and pictures of all suites of a study, which others show one by one."""
 _DIGEST = "Description"
 """Entry of a picture's PNG metadata: the digest of its data."""
 
@@ -97,7 +102,10 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
     if block.show == "best":
         yield from tables.best_table(studies) if studies else ()
         return
-    parts = [[study] for study in studies] if len(names) == 1 or not studies else [studies]
+    if studies and (len(names) > 1 or block.show in _JOINED):
+        parts = [studies]
+    else:
+        parts = [[study] for study in studies]
     several = len(parts) > 1
     for number, part in enumerate(parts):
         on = ", ".join(study.on for study in part)

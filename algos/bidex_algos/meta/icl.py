@@ -48,7 +48,7 @@ class ICLConfig(LearnerConfig):
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
-    blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
+    still_share: Fraction = 0.3  # Share of the episodes in which the policy tries nothing, as in one that is judged.
     try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
@@ -262,7 +262,7 @@ class ICL(TrialLearner):
 class _Pupil:
     """Plays a trial: the teachers act in some environments, the policy in the others; all steps are labelled.
 
-    The policy explores in episodes whose rewards it is shown; the other episodes are played as in an evaluation.
+    In a ``still_share`` of the episodes the policy does not explore, as in an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
@@ -273,9 +273,9 @@ class _Pupil:
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Store which episodes explore and reset the teachers."""
+        """Draw which episodes explore and reset the teachers."""
         learner = self._learner
-        self._shown = shown[:, None]
+        self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
         learner.teachers.reset(torch.ones_like(shown))
         if self._tried is None and learner.teachers.privileged is not None:
             self._draw_goals(learner.teachers.privileged)
@@ -316,7 +316,7 @@ class _Pupil:
         labels = learner.teachers.eval_action(obs)
         data.labels[slot, self._rows] = labels
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
-        tried = self._tried.masked_fill(~self._shown, -1.0)
+        tried = self._tried.masked_fill(~self._exploring, -1.0)
         mean, self._state = learner.policy.step(obs, memory, tried)
-        action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._shown
+        action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._exploring
         return torch.where(data.taught[:, None], labels, action), self._state

@@ -55,7 +55,7 @@ class PEARLConfig(MTSACConfig):
 
 
 # v2: MT-PPO's discount.
-PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.96)}
+PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.99)}
 
 
 class PEARL(MTSAC):

@@ -55,14 +55,17 @@ class TrialLearner(Learner):
         """Return DISABLED, because the episodes of a trial begin together."""
         return "DISABLED"
 
-    def _play(self, trials: Trials, player: Player) -> None:
-        """Play the next trial in all environments and record it in ``trials``."""
+    def _play(self, trials: Trials, player: Player, blind_share: float = 0.0) -> None:
+        """Play the next trial in all environments and record it in ``trials``.
+
+        In a ``blind_share`` of the episodes the policy is not shown rewards.
+        """
         counts = [[self.episodes] for _ in range(trials.episodes)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
         with self._collecting():
             obs = self._begin()
-            play(self.world, self.policy, player, trials, obs, self.config.blind_share, self.generator, counts)
+            play(self.world, self.policy, player, trials, obs, blind_share, self.generator, counts)
 
     def _begin(self) -> Tensor:
         if self.pools:

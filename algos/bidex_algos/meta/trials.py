@@ -34,7 +34,8 @@ class TrialConfig(LearnerConfig):
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
-    blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
+    blind_share: Fraction = 0.0
+    """Share of the episodes whose rewards the policy is not shown, as in a meta-test with hidden rewards."""
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.

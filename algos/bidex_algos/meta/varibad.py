@@ -51,8 +51,11 @@ class VariBADConfig(RL2Config):
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-# v2: RL²'s discount.
-PRESETS: dict[str, VariBADConfig] = {"laptop": VariBADConfig(), "v2": VariBADConfig(gamma=0.96)}
+# v2: as RL²'s (rl2.py), with whole trials, which beliefs are learned from.
+PRESETS: dict[str, VariBADConfig] = {
+    "laptop": VariBADConfig(),
+    "v2": VariBADConfig(gamma=0.99, init_std=0.3, hidden=(128, 128), num_minibatches=8, epochs=3),
+}
 
 
 class BeliefActor(RecurrentNet):

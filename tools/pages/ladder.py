@@ -1,0 +1,189 @@
+"""The ladder: meta-learners between a policy that sees neither goal nor rewards and one that sees the goal."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bidex_meta.evaluation.statistics import crossed_estimate, probability_of_improvement
+from bidex_meta.runs import plots
+from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation
+from bidex_meta.runs.stored import StoredRun
+from tools.pages.studies import Study
+from tools.pages.tables import mean_and_range, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BLIND = "blind PPO"
+"""The line of MT-PPO on the suite itself, which hides goals and shows no rewards."""
+SHOWN = "goal-shown PPO"
+"""The line of MT-PPO on the multi-task twin of the suite, which shows goals."""
+_GIVEN = {"icl": "teachers, rewards of other goals"}
+"""What learners see in training beyond the rewards of their own episodes, by the learner's name."""
+_OWN = "own rewards"
+_HEAD = ("learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "gap closed")
+_GOAL_SHOWN_AT_LEAST = 0.6
+_BLIND_AT_MOST = 0.15
+_PAIRS_AT_LEAST = 3
+
+
+@dataclass
+class Line:
+    """The seeds of one learner on one suite."""
+
+    given: str
+    shares: list[list[float]] = field(default_factory=list)
+    """Per seed the success after 0, 1, ... exploring episodes, mean over classes; of PPO one number."""
+    steps: list[int] = field(default_factory=list)
+    minutes: list[float] = field(default_factory=list)
+
+    @property
+    def last(self) -> np.ndarray:
+        """Return the success after all exploring episodes, (seeds, 1)."""
+        return np.array([[each[-1]] for each in self.shares])
+
+
+def ladder_table(*studies: Study) -> Iterator[str]:
+    """Yield for each suite a table of learners, a sentence on whether it separates them, and a table of pairs.
+
+    The gap is the one between blind and goal-shown PPO; a learner closes it by its success after the last exploring
+    episode. Studies with a ``split`` other than the test tasks show that one.
+    """
+    for number, (suite, lines) in enumerate(_suites(studies).items()):
+        if number:
+            yield ""
+        yield from (f"**{suite}**", "")
+        rows = [_row(name, line, lines) for name, line in lines.items()]
+        yield from table(_HEAD, rows)
+        pairs = list(_pairs(lines))
+        yield from ("", _verdict(suite, lines, pairs))
+        if pairs:
+            head = ("first", "second", "probability that the first is better [95 %]", "separated")
+            yield from ("", *table(head, pairs))
+
+
+def ladder_figure(*studies: Study) -> "Figure":
+    """Draw success against exploring episodes: a panel per suite, a line per learner, level lines for PPO."""
+    panels: dict[str, list[plots.Group]] = {}
+    suites = _suites(studies)
+    most = max(len(each) for lines in suites.values() for line in lines.values() for each in line.shares)
+    for suite, lines in suites.items():
+        panels[suite] = []
+        for name, line in lines.items():
+            shares = np.array([each * most if len(each) == 1 else each for each in line.shares])
+            if len(shares) > 1:
+                ends = shares.min(0), shares.max(0)
+            else:
+                ends = None, None
+            panels[suite].append((name, {"success": plots.Curve(np.arange(most), shares.mean(0), *ends)}))
+    figure = plots.draw_panels(panels, "success", "success", (1.0, "exploring episodes"))
+    for axis in figure.axes:
+        axis.set_xticks(range(most))
+        axis.set_ylim(0.0, 1.0)
+    return figure
+
+
+def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
+    """Group runs by meta suite and learner: goal-shown PPO first, then learners by success, blind PPO last."""
+    found: dict[str, dict[str, Line]] = {}
+    runs = [(study.split or "test", run) for study in studies for run in study.runs]
+    played = [pair for pair in runs if isinstance(pair[1].evaluation(), MetaTestEvaluation)]
+    classes = {_suite(run): _split(run.evaluation(), split)[0].keys() for split, run in played}
+    for split, run in runs:
+        suite = _suite(run)
+        by_shot = _split(run.evaluation(), split)
+        names = [name for name in by_shot[0] if name in classes.get(suite, by_shot[0])]
+        if not names:
+            continue
+        line = found.setdefault(suite, {}).setdefault(*_named(run))
+        line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
+        line.steps.append(run.content["steps"])
+        line.minutes.append(run.content["seconds"] / 60)
+    return {suite: dict(sorted(lines.items(), key=_place)) for suite, lines in sorted(found.items())}
+
+
+def _suite(run: StoredRun) -> str:
+    """Return the meta suite that a run belongs to: its own, or that whose goals its suite shows."""
+    return "ML" + str(run.content["suite"]["name"]).removeprefix("ML").removeprefix("MT")
+
+
+def _named(run: StoredRun) -> tuple[str, Line]:
+    """Return the name of a run's line, and an empty line."""
+    algo = run.config().algo
+    if algo != "mtppo":
+        return run.arm, Line(_GIVEN.get(algo, _OWN))
+    if str(run.content["suite"]["name"]).startswith("MT"):
+        return SHOWN, Line("the goal")
+    return BLIND, Line(_OWN)
+
+
+def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
+    """Return the results by class after 0, 1, ... exploring episodes; of PPO one entry, on unseen tasks if it has them.
+
+    PPO on a suite that lists its tasks is evaluated on the same goals with other starts.
+    """
+    if isinstance(evaluation, MetaTestEvaluation):
+        return [shot.classes for shot in evaluation.splits[split].by_shot]
+    unseen = evaluation.other_tasks
+    return [evaluation.policy.classes if unseen is None else unseen.policy.classes]
+
+
+def _place(item: tuple[str, Line]) -> tuple[int, float]:
+    name, line = item
+    return {SHOWN: 0, BLIND: 2}.get(name, 1), -float(line.last.mean())
+
+
+def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
+    shown = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*line.shares, strict=True)]
+    shown += [""] * (3 - len(shown))
+    closed = ""
+    if SHOWN in lines and BLIND in lines and name not in (SHOWN, BLIND):
+        low = lines[BLIND].last.mean()
+        gap = lines[SHOWN].last.mean() - low
+        if gap > 0:
+            closed = mean_and_range(100.0 * (line.last[:, 0] - low) / gap, ".0f", " %")
+    steps = f"{int(np.mean(line.steps)):,}"
+    return [name, line.given, str(len(line.shares)), steps, f"{np.mean(line.minutes):.0f}", *shown, closed]
+
+
+def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:
+    """Yield a row for each pair of reward-only meta-learners; separated: no seed of one reaches a seed of the other."""
+    learners = [name for name, line in lines.items() if line.given == _OWN and name != BLIND]
+    for first, second in combinations(learners, 2):
+        one = lines[first].last
+        other = lines[second].last
+        found = crossed_estimate(_better, [one], [other])
+        apart = min(len(one), len(other)) > 1 and bool(one.min() > other.max())
+        yield [first, second, found.text(form=".2f"), "yes" if apart else "no"]
+
+
+def _better(one: list[np.ndarray], other: list[np.ndarray]) -> float:
+    return probability_of_improvement(np.hstack(one), np.hstack(other))
+
+
+def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]]) -> str:
+    """Return a sentence that says whether the suite is good by the ladder's rule, and why not."""
+    if SHOWN not in lines or BLIND not in lines:
+        return "Not judged yet: blind or goal-shown PPO is missing."
+    reasons = []
+    shown = float(lines[SHOWN].last.mean())
+    blind = float(lines[BLIND].last.mean())
+    choices = re.search(r"choice(\d)$", suite)
+    if choices is None:
+        most = _BLIND_AT_MOST
+    else:
+        most = 1.0 / int(choices[1])
+    if shown < _GOAL_SHOWN_AT_LEAST:
+        reasons.append(f"goal-shown PPO reaches {shown:.0%}, at least {_GOAL_SHOWN_AT_LEAST:.0%} is asked")
+    if blind > most:
+        reasons.append(f"blind PPO reaches {blind:.0%}, at most {most:.0%} is allowed")
+    separated = sum(pair[-1] == "yes" for pair in pairs)
+    if separated < _PAIRS_AT_LEAST:
+        reasons.append(f"{separated} pairs of reward-only learners are separated, at least {_PAIRS_AT_LEAST} are asked")
+    if not reasons:
+        return f"The suite separates learners: {separated} pairs of reward-only learners do not overlap."
+    return f"The suite does not meet the rule yet: {'; '.join(reasons)}."
