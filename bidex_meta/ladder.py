@@ -30,6 +30,36 @@ _SHARED_TASKS = 50
 """Tasks of each split of a shared suite, those of the test split midway between those of the train split."""
 
 
+HIDDEN_NUMBERS = {
+    "BottleCap": 1, "OpenPenCap": 1, "OpenScissors": 1, "SwingCup": 1,
+    "DoorCloseInward": 2, "DoorCloseOutward": 2, "DoorOpenInward": 2, "DoorOpenOutward": 2, "GraspAndPlace": 2,
+    "PourWater": 2, "ReOrientation": 2, "Switch": 2,
+    "CatchAbreast": 3, "CatchOver2Underarm": 3, "CatchUnderarm": 3, "HandOver": 3, "LiftUnderarm": 3, "StackBlock": 3,
+    "PushBlock": 4, "TwoCatchUnderarm": 6,
+}  # fmt: skip
+"""How many numbers a task of each class hides in version 2."""
+_OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
+
+
+class Rung(NamedTuple):
+    """A step of the ladder: suites that hide about as much."""
+
+    hidden: str
+    """What a task hides."""
+    budget: str
+    """What a learner needs at least, by our measurements and estimates (docs/results/ladder.md)."""
+
+
+RUNGS = (
+    Rung("one of two or four goals", "15 minutes of a core"),
+    Rung("one number", "45 minutes of a core"),
+    Rung("two numbers", "2 hours of a core"),
+    Rung("two numbers, several classes", "2 hours of a core"),
+    Rung("three numbers and more", "10 minutes of a GPU"),
+    Rung("all that version 2 hides", "hours of a GPU"),
+)
+
+
 class OfOneClass(NamedTuple):
     """A suite of a single class: its name in parts."""
 
@@ -83,6 +113,21 @@ class OfOneClass(NamedTuple):
                 angle = small + share * (large - small)
                 tasks.append((f"{split}-{number:02}", split, {first: angle, second: angle}))
         return tasks
+
+
+def rung_of(name: str, classes: Iterable[str]) -> int | None:
+    """Return the rung of a suite that hides goals by the rules of version 2, an index of ``RUNGS``; None for others."""
+    if name in _OF_SUITES:
+        return _OF_SUITES[name]
+    parts = parts_of(name)
+    if parts is None or parts.shows_goals:
+        return None
+    if parts.variant.startswith("choice"):
+        return 0
+    if parts.variant == "shared":
+        return 1
+    numbers = max(HIDDEN_NUMBERS[each] for each in classes)
+    return {1: 1, 2: 2}.get(numbers, 4)
 
 
 def names_of(classes: Iterable[str]) -> list[str]:

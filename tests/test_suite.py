@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.ladder import parts_of
+from bidex_meta.ladder import HIDDEN_NUMBERS, parts_of, rung_of
 from bidex_meta.suite import V1, V2, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -96,6 +96,16 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
 def test_an_object_that_is_not_there_is_named(name: str, told: str, tmp_path: Path) -> None:
     with pytest.raises(BidexError, match=rf"own\.toml.*{told}"):
         Benchmark(write(tmp_path, META.replace('split = "test"', f'split = "test"\nobjects = ["{name}"]')))
+
+
+def test_rungs_count_what_the_classes_hide() -> None:
+    for name in registry.names():
+        hidden = sum(len(part.names) for part in registry.get(f"{name}-v2").hides())
+        assert HIDDEN_NUMBERS[name] == hidden, name
+    rungs = {name: rung_of(name, [entry.name for entry in load_suite(name).classes]) for name in suite_names()}
+    of = {"ML1-Switch-choice2": 0, "ML1-SwingCup-v2": 1, "ML1-Switch-shared": 1, "ML1-Switch-v2": 2, "ML5-v2": 3}
+    of |= {"ML1-PushBlock-v2": 4, "ML20-v2": 5, "MT1-Switch-choice2": None, "ML1": None}
+    assert of.items() <= rungs.items()
 
 
 def test_names_and_paths(tmp_path: Path) -> None:

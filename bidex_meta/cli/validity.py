@@ -25,9 +25,10 @@ class ValidityFlags:
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
     For each class: the success on unseen tasks that a policy can have at best without knowing what a task hides; how
-    often the rewards of one exploring episode (rough actions, a witness's or a misled script's with noise) identify the
-    hidden parts; the success of policies that have learned nothing, and of scripts and runs that know the task; and
-    whether return and success agree over all their episodes.
+    often a first observation names the task (chance: one over the number of tasks); how often the rewards of one
+    exploring episode (rough actions, a witness's or a misled script's with noise) identify the hidden parts; the
+    success of policies that have learned nothing, and of scripts and runs that know the task; and whether return and
+    success agree over all their episodes.
     """
 
     suite: str = "ML20-v2"
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     )
 
 
-_SHARES = ("blind", "identified", "uniform", "zero", "held", "witness", "solved")
+_SHARES = ("blind", "named", "identified", "uniform", "zero", "held", "witness", "solved")
 
 
 def _cells(name: str, row: Json) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.memorisation import memorised
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability
@@ -43,6 +44,8 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
     if not isinstance(world, World):
         raise BidexError(f"Expected a suite of hands, got {worlds.name}.")
     results = _results(worlds, world, runs)
+    say("what first observations tell")
+    told = memorised(world, seed=worlds.seed)
     rows: dict[str, Json] = {}
     for slot in world.slots:
         found = results[slot.name]
@@ -56,6 +59,7 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
             "blind": blind_ceiling(slot.task_class, seed=worlds.seed),
             **identified,
             **untrained,
+            **asdict(told[slot.name]),
             "solved": max(known.values(), default=None),
             "alignment": aligned and asdict(aligned),
             "policies": {name: [each.success, each.mean_return] for name, each in found.items()},

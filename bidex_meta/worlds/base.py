@@ -3,12 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.ladder import RUNGS, rung_of
 from bidex_meta.rules import Rules, plain_name
 from bidex_meta.suite import (
     METAWORLD_SUITES,
@@ -209,11 +211,24 @@ def suites_to_run() -> list[str]:
 
 
 def listed() -> list[dict[str, object]]:
-    """Return an entry of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
-    rows: list[tuple[object, ...]] = []
+    """Return the entries of ``bidex-meta list suites``: suites, Meta-World's too, then those of the ladder by rung."""
+    rows: list[dict[str, object]] = []
+    ladder: list[list[dict[str, object]]] = [[] for _ in RUNGS]
     for suite in map(load_suite, suite_names()):
-        classes = ([entry.name for entry in suite.split_classes(split)] for split in SPLITS)
-        rows.append((suite.name, suite.kind, *classes, suite.description))
+        train, test = ([entry.name for entry in suite.split_classes(split)] for split in SPLITS)
+        row = _listed(suite.name, suite.kind, train, test, suite.description)
+        rung = rung_of(suite.name, train)
+        if rung is None:
+            rows.append(row)
+        else:
+            hidden, budget = RUNGS[rung]
+            ladder[rung].append(row | {"rung": rung, "hidden": hidden, "needs": budget})
     summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
-    rows += [(name, "multi-task", list(classes), [], summary) for name, classes in METAWORLD_SUITES.items()]
-    return [dict(zip(("name", "kind", "train_classes", "test_classes", "summary"), row, strict=True)) for row in rows]
+    rows += [_listed(name, "multi-task", list(classes), [], summary) for name, classes in METAWORLD_SUITES.items()]
+    return [*rows, *chain.from_iterable(ladder)]
+
+
+def _listed(name: str, kind: str, train: list[str], test: list[str], summary: str) -> dict[str, object]:
+    """Return an entry without a place on the ladder."""
+    classes = {"train_classes": train, "test_classes": test}
+    return {"name": name, "kind": kind, **classes, "rung": None, "hidden": None, "needs": None, "summary": summary}

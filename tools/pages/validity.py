@@ -7,6 +7,7 @@ from bidex_meta.errors import BidexError
 
 _SHARES = {
     "blind": "blind at best",
+    "named": "named by its start",
     "identified": "identified",
     "uniform": "uniform",
     "zero": "zero",
@@ -25,13 +26,13 @@ def validity_table(suite: str, data: Path) -> list[str]:
     lines = [f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |"]
     lines.append("|---|---|" + "---|" * (len(_SHARES) + 2))
     for name, row in classes.items():
-        cells = [_percent(row[key]) for key in _SHARES]
+        cells = [_percent(row.get(key)) for key in _SHARES]
         if (aligned := row["alignment"]) is None:
             cells += ["", ""]
         else:  # the rank correlation, and the mean return of successes versus the most that a failing policy gets
             cells += [f"{aligned['rank']:.2f}", f"{aligned['solved']:.4g} / {aligned['unsolved']:.4g}"]
         lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
-    means = (_mean([row[key] for row in classes.values()]) for key in _SHARES)
+    means = (_mean([row.get(key) for row in classes.values()]) for key in _SHARES)
     ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
     return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
 

@@ -1,0 +1,85 @@
+"""Whether a task can be told by how its episodes begin.
+
+A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
+et al. 2020, arXiv 1912.03820). Two probes guess the task, or what it hides, from first observations of other episodes:
+the nearest neighbour and a ridge regression. Neither does better than chance if nothing shows the task.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bidex_meta.world import World
+
+_FOLDS = 5
+_RIDGE = 1.0
+"""Weight of the penalty, against standardised observations."""
+
+
+@dataclass(frozen=True)
+class Memorised:
+    """What first observations of one class tell about its tasks."""
+
+    named: float
+    """Share of the episodes whose task the better probe names."""
+    chance: float
+    """That share for a guess: one over the number of tasks."""
+    explained: float
+    """R² of the hidden values, predicted for unseen tasks by the better probe; at most 0 if nothing shows them."""
+
+
+def memorised(world: World, episodes: int = 10, seed: int = 0) -> dict[str, Memorised]:
+    """Return what first observations tell in each class of a world that has an environment for each task.
+
+    The world is reset ``episodes`` times, with starts of its own each time; probes learn from the other resets (the
+    task's name) or from the other tasks (hidden values).
+    """
+    starts = np.stack([world.reset(seed=seed + number)[0].cpu().double().numpy() for number in range(episodes)])
+    found = {}
+    for index, (name, rows) in enumerate(zip(world.task_names, world.slot_env_ids, strict=True)):
+        seen = _standardised(starts[:, rows])
+        tasks = world.task_index[rows].cpu().numpy()
+        labels = np.eye(int(tasks.max()) + 1)[tasks]
+        hidden = world.pools[index][tasks]
+        told = np.broadcast_to(labels, (episodes, *labels.shape))
+        guesses = _guesses(seen, told, np.arange(episodes)[:, None].repeat(len(tasks), 1))
+        named = max(float((guess.argmax(-1) == tasks).mean()) for guess in guesses)
+        values = np.broadcast_to(hidden, (episodes, *hidden.shape))
+        explained = max(_r2(guess, values) for guess in _guesses(seen, values, tasks[None].repeat(episodes, 0)))
+        found[name] = Memorised(named, 1.0 / labels.shape[1], explained)
+    return found
+
+
+def _standardised(starts: np.ndarray) -> np.ndarray:
+    """Return observations (episodes, n, d) with mean 0 and deviation 1; entries that never change are 0."""
+    deviation = starts.std((0, 1))
+    changing = deviation > 1e-9
+    return np.where(changing, (starts - starts.mean((0, 1))) / np.where(changing, deviation, 1.0), 0.0)
+
+
+def _guesses(seen: np.ndarray, told: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both probes' predictions of ``told`` (episodes, n, k), each from the groups in the other folds."""
+    x = seen.reshape(-1, seen.shape[-1])
+    y = told.reshape(-1, told.shape[-1])
+    fold = groups.reshape(-1) % _FOLDS
+    nearest = np.zeros_like(y)
+    linear = np.zeros_like(y)
+    for number in range(_FOLDS):
+        test = fold == number
+        train = ~test
+        distances = (x[test] ** 2).sum(1)[:, None] + (x[train] ** 2).sum(1) - 2.0 * x[test] @ x[train].T
+        nearest[test] = y[train][distances.argmin(1)]
+        mean = y[train].mean(0)
+        square = x[train].T @ x[train] + _RIDGE * len(x) * np.eye(x.shape[1])
+        linear[test] = mean + x[test] @ np.linalg.solve(square, x[train].T @ (y[train] - mean))
+    return nearest.reshape(told.shape), linear.reshape(told.shape)
+
+
+def _r2(guess: np.ndarray, values: np.ndarray) -> float:
+    """Return the mean over columns of the explained share of the variance, without columns that never change."""
+    left = ((values - guess) ** 2).mean((0, 1))
+    all_of_it = values.var((0, 1))
+    changing = all_of_it > 1e-12
+    if not changing.any():
+        return 0.0
+    return float((1.0 - left[changing] / all_of_it[changing]).mean())
