@@ -48,7 +48,6 @@ TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
     ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
     ("mappo", {"popart": True, "value_heads": False}, "leave value_heads on"),
-    ("varibad", {"chunk": 25}, "whole trials"),
     ("happo", {"agents": "thumbs"}, "agents: expected single"),
 ]
 HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))

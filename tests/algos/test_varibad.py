@@ -15,7 +15,7 @@ from tests.algos.families import PointClass, PointGoals, circle, everyone, playe
 SMALL = VariBADConfig(
     hidden=(32,), activation="tanh", memory=32, latent=4, init_std=0.6, episodes_per_trial=2, gamma=0.9,
     num_minibatches=2, learning_rate=2e-3, learning_rate_range=(3e-4, 3e-3), critic_learning_rate=3e-3,
-    belief_learning_rate=3e-3, max_adapt_steps=300,
+    belief_learning_rate=3e-3, max_adapt_steps=300, blind_share=0.3,
 )  # fmt: skip
 TEN = (PointClass(steps=10, count=16),)
 UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, scale=100.0, count=2))

@@ -81,6 +81,6 @@ TUNED: Options = {
 # LiftUnderarm lost 317 of return when it adapted to the first 150 of its 500 steps, and gained 352 with all steps.
 UNSEEN: Options = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}
 
-# For version 2 of the suites (docs/results/ladder.md), from scratch or from a policy of MT-PPO's preset v2. The discount
-# sees a whole episode of 250 steps; small noise lets the policy hold still, as success asks.
+# For version 2 of the suites (docs/results/ladder.md), from scratch or from a policy of MT-PPO's preset v2. The
+# discount sees a whole episode of 250 steps; small noise lets the policy hold still, as success asks.
 V2: Options = TUNED | {"gamma": 0.99, "init_std": 0.3, "step_sizes": "layer"}

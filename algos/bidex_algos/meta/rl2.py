@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
 from bidex_algos.meta.trial_learner import TrialLearner
@@ -89,10 +89,7 @@ class RL2(TrialLearner):
                 "num_envs or lower num_minibatches."
             )
         heads = world.num_tasks if config.value_heads else 1
-        self.critic = RecurrentNet(
-            self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation,
-            config.trial_steps
-        ).to(self.device)  # fmt: skip
+        self.critic = self._make_critic(heads).to(self.device)
         self.adams = AdaptiveAdams(
             self.policy.parameters(), self.critic.parameters(), config.learning_rate, config.learning_rate_range,
             config.followed_kl, config.critic_learning_rate, self.device
@@ -143,13 +140,9 @@ class RL2(TrialLearner):
 
     def _gradients(self, b: Batch, chosen: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
         policy = self.policy
-        chunk = b.chunk[chosen]
-        row = b.row[chosen]
-        x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
-        means, _ = policy.actor(x, b.actor_states[chunk, row])
-        out, _ = self.critic(x, b.critic_states[chunk, row])
+        means, out = self._outputs(b, chosen)
         weights = b.take(b.weights, chosen) / count
-        values = of_task(out, self.world.task_id[row])
+        values = of_task(out, self.world.task_id[b.row[chosen]])
         targets = b.take(b.targets, chosen)
         value = (weights * (values - targets).square()).sum()
         loss = policy_loss(
@@ -160,6 +153,15 @@ class RL2(TrialLearner):
         (loss.surrogate + value - self.config.entropy_weight * loss.entropy).backward()
         return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
 
+    def _outputs(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means (C, B, a) and values (C, B, heads) of the chosen chunks, int64 (B,)."""
+        chunk = b.chunk[chosen]
+        row = b.row[chosen]
+        x = self.policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
+        means, _ = self.policy.actor(x, b.actor_states[chunk, row])
+        values, _ = self.critic(x, b.critic_states[chunk, row])
+        return means, values
+
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor, broken: Tensor) -> dict[str, float]:
         tensors = dict(losses)
         tensors["Policy/std"] = self.policy.log_std.detach().exp().mean()
@@ -167,6 +169,14 @@ class RL2(TrialLearner):
         for name, value in zip(self.world.task_names, explained, strict=True):
             tensors[f"Value/explained_variance/{name}"] = value
         return self._episodes_metrics() | as_numbers(tensors)
+
+    def _make_critic(self, heads: int) -> nn.Module:
+        """Return a network from steps (T, B, inputs) and a memory to values (T, B, heads) and the next memory."""
+        config = self.config
+        return RecurrentNet(
+            self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation,
+            config.trial_steps
+        )  # fmt: skip
 
     @classmethod
     def _make_policy(

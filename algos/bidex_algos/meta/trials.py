@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidex_algos.advantages import explained_variance, gae, normalise_per_task, task_moments
 from bidex_algos.meta.config import USUAL_STEPS
 from bidex_algos.nets.networks import Activation, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
+from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils import maths
@@ -247,7 +247,7 @@ def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
 
 @torch.no_grad()
 def make_batch(
-    t: Trials, policy: RecurrentPolicy, critic: RecurrentNet, return_stats: RunningStats, task_id: Tensor,
+    t: Trials, policy: RecurrentPolicy, critic: nn.Module, return_stats: RunningStats, task_id: Tensor,
     config: TrialConfig
 ) -> tuple[Batch, Tensor]:  # fmt: skip
     """Pass a trial through the networks, chunk by chunk from empty memories, and estimate advantages.

@@ -1,8 +1,8 @@
 """VariBAD: RL² whose memory is a belief about the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
 
 An encoder turns the trial so far into a Gaussian over a latent variable. From a sample of the latent a decoder predicts
-the rewards of the whole trial; this prediction trains encoder and decoder. The policy reads the belief; PPO trains the
-policy but not the encoder.
+the rewards of the whole trial; this prediction trains encoder and decoder. Policy and critic read the belief; PPO
+trains them but not the encoder, whose beliefs about a trial are computed once.
 """
 
 from dataclasses import dataclass
@@ -18,15 +18,17 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, gaussian_kl, linear
 from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_algos.onpolicy.ppo import mini_batches
-from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, sum_gradients
 from bidex_meta.training.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
-# Number of times of a trial whose beliefs a mini-batch decodes, and of steps whose rewards each belief predicts.
 _TIMES = 16
+"""Times of a trial whose beliefs a mini-batch decodes."""
 _STEPS = 64
+"""Steps whose rewards each belief predicts."""
+_BATCHES = 4
+"""Mini-batches of whole trials in a pass of encoder and decoder, at most; a GRU is slow where they are small."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +41,15 @@ class VariBADConfig(RL2Config):
     reward_unit: Positive = 0.3
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.chunk is not None:
-            raise BidexError(
-                f"{self.algo}: a belief is learned from whole trials, got chunk {self.chunk}. Leave it out."
-            )
-
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-# v2: as RL²'s (rl2.py), with whole trials, which beliefs are learned from.
+# v2: as RL²'s (rl2.py). Beliefs are learned from whole trials, whatever the chunk.
 PRESETS: dict[str, VariBADConfig] = {
     "laptop": VariBADConfig(),
-    "v2": VariBADConfig(gamma=0.99, init_std=0.3, hidden=(128, 128), num_minibatches=8, epochs=3),
+    "v2": VariBADConfig(gamma=0.99, init_std=0.3, chunk=125, hidden=(128, 128), num_minibatches=8, epochs=3),
 }
 
 
@@ -78,9 +73,8 @@ class BeliefActor(RecurrentNet):
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute outputs as in the base class; the memory gets no gradient."""
-        with torch.no_grad():
-            mean, log_std, state = self.believe(x, state)
-        return self.actor(torch.cat([x, mean, log_std], dim=-1)), state
+        x, state = self.knowing(x, state)
+        return self.actor(x), state
 
     def believe(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return means and log standard deviations (T, B, latent) of the beliefs at steps (T, B, inputs).
@@ -96,9 +90,29 @@ class BeliefActor(RecurrentNet):
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
+    def knowing(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return steps (T, B, inputs) with their beliefs, (T, B, inputs + 2 latent), and the memory; no gradient."""
+        with torch.no_grad():
+            mean, log_std, state = self.believe(x, state)
+        return torch.cat([x, mean, log_std], dim=-1), state
+
     def model(self) -> list[nn.Parameter]:
         """Return the weights of encoder and decoder, which PPO does not train."""
         return [weight for name, weight in self.named_parameters() if not name.startswith("actor.")]
+
+
+class BeliefCritic(nn.Module):
+    """A critic that reads the observation and the belief of an actor's encoder."""
+
+    def __init__(self, actor: BeliefActor, values: MLP):
+        super().__init__()
+        self._actor = (actor,)  # A tuple, so that its weights are not this module's.
+        self.values = values
+
+    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values (T, B, heads) of steps (T, B, inputs), and the memory after them."""
+        x, state = self._actor[0].knowing(x, state)
+        return self.values(x), state
 
 
 class VariBAD(RL2):
@@ -119,14 +133,37 @@ class VariBAD(RL2):
     def _make_actor(cls, config: VariBADConfig, inputs: Inputs, actions: int, init: torch.Generator) -> BeliefActor:
         return BeliefActor(inputs, inputs.width - actions - 3, config, actions, init)
 
+    def _make_critic(self, heads: int) -> BeliefCritic:
+        config = self.config
+        inputs = self.policy.inputs.extended("belief", 2 * config.latent)
+        values = MLP(inputs, config.hidden, heads, 0.01, self.initial, config.activation)
+        actor: Any = self.policy.actor
+        return BeliefCritic(actor, values)
+
     def _update(self, b: Batch) -> dict[str, Tensor]:
         """Run PPO's update with the beliefs of the played trial, then update encoder and decoder."""
         losses = super()._update(b)
-        cfg = self.config
-        ones = torch.ones_like(b.row, dtype=torch.float32)
-        batches = mini_batches(ones, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
+        ones = torch.ones(b.weights.shape[1], device=self.device)
+        number = min(_BATCHES, self.config.num_minibatches)
+        batches = mini_batches(ones, self.config.epochs, number, self.generator, Tensor.tensor_split)
         reward, divergence = torch.stack([self._descend(b, chosen) for _, chosen, _ in batches]).mean(0)
         return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
+
+    def _prepare(self) -> tuple[Batch, Tensor]:
+        """Prepare a trial as RL² does, and its steps with their beliefs, which PPO does not change."""
+        b, explained = super()._prepare()
+        found = []
+        for number, begin in enumerate(range(0, len(b.obs), b.size)):
+            part = slice(begin, begin + b.size)
+            x = self.policy.see(b.obs[part], *(previous[part] for previous in b.previous))
+            found.append(self.net.knowing(x, b.actor_states[number])[0])
+        self.known = torch.cat(found)
+        return b, explained
+
+    def _outputs(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        known = b.take(self.known, chosen)
+        critic: Any = self.critic
+        return self.net.actor(known), critic.values(known)
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
         """Take one step of encoder and decoder; return the result of :meth:`_bound` over all processes (2,)."""
@@ -142,15 +179,15 @@ class VariBAD(RL2):
         """Return this process's share of the reward error and the KL.
 
         The reward error is the mean squared error of decoded rewards. The KL is the mean KL of each belief from the
-        previous one. In the trials ``chosen``, int64 (B,), beliefs at random times predict rewards of random steps,
-        past and future.
+        previous one. In the trials of the environments ``chosen``, int64 (B,), beliefs at random times predict rewards
+        of random steps, past and future.
         """
         policy = self.policy
         net = self.net
-        previous = [b.take(each, chosen) for each in b.previous]
-        x = policy.see(b.take(b.obs, chosen), *previous)
-        valid = b.take(b.weights, chosen)
-        mean, log_std, _ = net.believe(x, b.actor_states[b.chunk[chosen], b.row[chosen]])
+        previous = [each[:, chosen] for each in b.previous]
+        x = policy.see(b.obs[:, chosen], *previous)
+        valid = b.weights[:, chosen]
+        mean, log_std, _ = net.believe(x, b.actor_states[0, chosen])
         before = (torch.cat([torch.zeros_like(each[:1]), each[:-1]]) for each in (mean, log_std))
         divergence = valid * gaussian_kl(mean, log_std, *before)
         # A slot shows the reward of the previous step, but after the end of an episode not the state that the step led
