@@ -140,7 +140,7 @@ class FinalEvaluation:
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
     those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
     on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
+    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 2.
     rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
     tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
 
@@ -247,6 +247,7 @@ def meta_test(
     trials: Few | None = None,
     num_envs: Environments | None = None,
     seed: Seed = Options.seed,
+    hidden_rewards: bool = False,
     randomisation: str | Path | None = None,
     device: str = "auto",
     engine: str = "auto",
@@ -259,13 +260,14 @@ def meta_test(
         split: ``train``, ``test``, ``others`` (tasks of the train classes that the run was not trained on), or
             ``auto`` for train and test.
         checkpoint: ``last``, ``best`` or a file.
-        shots: Adaptation rounds, one after the other; None: 1.
+        shots: Adaptation rounds, one after the other; None: 2.
         rollouts: Episodes of each task in a shot; None: as in training, 40 at most, else 10.
         episodes: Evaluation episodes of each task; None: the number of rollouts.
         tasks: Tasks of each class, the first of its pool; None: 5.
         trials: Adaptations to each task, each from the start and to other episodes; None: five or more per class.
         num_envs: Most environments stepped together; None: 1024.
         seed: Seed of the episodes' starts; training does not use the default.
+        hidden_rewards: Whether the evaluation episodes are also played with their rewards hidden.
         randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
@@ -280,11 +282,13 @@ def meta_test(
     metatest.check_worlds(worlds, config.algo)
     splits = metatest.splits_of(worlds, split)
     options = Options(
-        shots=shots, rollouts=rollouts, episodes=episodes, tasks=tasks, trials=trials, num_envs=num_envs, seed=seed
-    )
+        shots=shots, rollouts=rollouts, episodes=episodes, tasks=tasks, trials=trials, num_envs=num_envs, seed=seed,
+        hidden_rewards=hidden_rewards,
+    )  # fmt: skip
     state, steps = load_checkpoint(folder, checkpoint)
     load = partial(policy_of, folder, state, config.device)
-    found = metatest.meta_test(worlds, config, load, options, splits)
+    adaptation = metatest.Adaptation.of(worlds, config)
+    found = metatest.meta_test(worlds, adaptation, load, options, splits)
     result = RunMetaTest(folder, config.algo, worlds, steps, options.seed, found, conditions(worlds, options.num_envs))
     if save:
         write_evaluation(folder.evaluation_path, result.record())

@@ -192,12 +192,13 @@ class MetaTestEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares: by class, split and shot."""
+        """Return the results that a verification compares: by class, split, shot, and rewards if they were hidden."""
         rows = {}
         for split, part in self.splits.items():
-            for number, shot in enumerate(part.by_shot):
-                for name, row in shot.classes.items():
-                    rows[f"{name} ({split}, shot {number})"] = row
+            for text, shots in (("", part.by_shot), (", rewards hidden", part.hidden_by_shot or ())):
+                for number, shot in enumerate(shots):
+                    for name, row in shot.classes.items():
+                        rows[f"{name} ({split}, shot {number}{text})"] = row
         return rows
 
 
