@@ -113,6 +113,10 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
     evaluation = read_evaluation(path, again)
     if evaluation.randomisation is not None:
         raise BidexError(f"{path}: expected an evaluation without --randomisation, got one with it. Name another.")
+    if isinstance(evaluation, MetaTestEvaluation) and evaluation.agent is not None:
+        raise BidexError(
+            f"{path}: expected the evaluation of a run, got that of the agent {evaluation.agent}. Name another."
+        )
     needed = {"steps": evaluation.steps, "seed": evaluation.seed}
     if isinstance(evaluation, PolicyEvaluation):
         needed["policy.episodes_per_task"] = evaluation.policy.episodes_per_task
