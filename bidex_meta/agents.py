@@ -70,16 +70,21 @@ class MetaLearningAgent(Agent, Protocol):
 class TrialAgent(Protocol):
     """An agent of your own that learns about a task while it plays. ``meta_test`` asks nothing else of it.
 
-    A trial is a few episodes of one task with rewards shown in all of them. ``copy.deepcopy`` must copy what the agent
-    has learned: the evaluation after each number of episodes plays on a copy.
+    A trial is a few episodes of one task in each of N environments, with rewards shown in all of them. ``reset`` begins
+    trials of other tasks and tells N. Then each step calls ``act`` and ``observe``. The next episode of a trial begins
+    without a call, after ``terminated`` or ``truncated``. Where ``valid`` is False, ignore the environment: its episode
+    is over and it waits for the others, or its physics broke. Tensors are on the device of the world.
+
+    ``copy.deepcopy`` must copy what the agent has learned: copies play the judged episodes, and the agent itself learns
+    from exploring episodes alone.
     """
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin trials of other tasks in the environments of a mask, bool ``(num_envs,)``: forget the last ones."""
+        """Begin trials of other tasks in the environments of a mask, bool ``(N,)``: forget the last ones."""
 
     def act(self, obs: Tensor) -> Tensor:
-        """Return actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``."""
+        """Return actions ``(N, action)`` in [-1, 1] for observations ``(N, observation)``."""
         ...
 
     def observe(self, timestep: Timestep) -> None:
-        """Receive the transition that the last actions led to; ``terminated`` and ``truncated`` end episodes."""
+        """Receive the transition that the last actions led to, with reward ``(N,)``."""

@@ -113,8 +113,8 @@ class RunConfig(Generic[LearnerSettings]):
     take longer. None: as long as --steps take."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
-    that adapt: one shot on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect training.
-    None: never."""
+    that adapt: after two shots on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect
+    training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)

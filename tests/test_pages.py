@@ -25,7 +25,7 @@ SMALLER = (
     (r"num_envs=(256|1024)\b", "num_envs=4"),
     (r"num_envs=(300|40)\b", "num_envs=15"),
     (r"\.learn\(\S+\)", ".learn(64)"),
-    (r"shots=3", "shots=1"),
+    (r"rollouts=10, device", "rollouts=1, device"),
     (r"adaptation_episodes=\d+", "adaptation_episodes=1"),
 )
 

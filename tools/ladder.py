@@ -14,7 +14,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.meta_test import meta_evaluate
-from bidex_meta.experiments.metatest import adapt_steps_of
+from bidex_meta.experiments.metatest import Adaptation
 from bidex_meta.experiments.policies import checkpoint, fitting
 from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
@@ -50,7 +50,7 @@ def ladder(
         split = "train"
     world: Any = worlds.world(split, tasks * len(worlds.tasks(split)))
     found = dict[str, dict[str, list[float]]]()
-    longest = adapt_steps_of(folder.config())
+    longest = Adaptation.of(worlds, folder.config()).max_adapt_steps
 
     state = checkpoint(folder)[0]["learner"]["policy"]
 

@@ -41,7 +41,7 @@ COMMANDS: dict[str, Command] = {
     "sweep": Command("bidex_meta.cli.sweep", "many runs from one file, resumed where they were stopped"),
     "evaluate": Command("bidex_meta.cli.evaluate", "success and return of a trained run, per task class"),
     "verify": Command("bidex_meta.cli.verify", "evaluate a run again and compare with what it recorded"),
-    "submit": Command("bidex_meta.cli.submit", "an entry of the leaderboard, verified by playing the runs"),
+    "submit": Command("bidex_meta.cli.submit", "an entry of the leaderboard, of runs that it plays or of a meta-test"),
     "compare": Command("bidex_meta.cli.compare", "several runs beside each other, intervals over seeds"),
     "control": Command("bidex_meta.cli.control", "held-out tasks, adapted to their own data and to others'"),
     "transfer": Command("bidex_meta.cli.transfer", "held-out classes: learned from a run's policy and from nothing"),

@@ -27,7 +27,7 @@ class ControlFlags:
     runs: RunPaths  # Run folders that differ in the seed alone.
     trials: Few = 25  # Adaptations of each task, each from the start and to other episodes.
     episodes: Few = 80  # Evaluation episodes after each adaptation.
-    shots: Shots = 1  # Adapt so often, one after the other.
+    shots: Shots = 2  # Adaptation rounds, one after the other.
     rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, but 40 at most.
     num_envs: Environments = 1024  # Environments stepped together at most; bounds memory.
     seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.

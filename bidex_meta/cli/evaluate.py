@@ -23,7 +23,7 @@ class EvaluateFlags(Options):
 
     Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
 
-    Learners that adapt (maml, promp, rl2, ...) are shown before and after --shots shots, on train and on test tasks.
+    Learners that adapt (maml, promp, rl2, ...) are shown after 0, 1, ..., --shots shots, on train and on test tasks.
     """
 
     run: RunPath  # Run folder.
@@ -76,6 +76,8 @@ def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:
     for name, number in asked.items():
         if number is not None:
             raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
+    if flags.hidden_rewards:
+        raise BidexError(f"{algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
     if flags.split == "both":
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
     if flags.split == OTHERS:

@@ -56,7 +56,7 @@ def _evaluate(flags: RunFlags, folder: RunFolder) -> None:
     found = flags.final.play(folder, flags.config)
     if isinstance(found, RunMetaTest):
         print_meta_test(found)
-        say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")
+        say(f"More: bidex-meta evaluate {folder.path} --tasks 50   Curves: bidex-meta plot {folder.path} --adaptation")
     else:
         print_evaluation(found, brief=True)
         say(f"More columns: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")

@@ -12,9 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from bidex_meta.errors import one_line
-from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import NONE, Interval
+from bidex_meta.runs.evaluations import Gains, SplitSummary, Summary
 from bidex_meta.utils.streams import output_width
 
 if TYPE_CHECKING:  # torch, which lists and help do without
@@ -32,13 +32,15 @@ class Sheet:
     """Rows under headers; a table that is too wide for the terminal leaves out columns, and names them.
 
     A number with its interval, ``0.7 [0.6, 0.8]`` under ``return [95 %]``, takes two columns. Intervals are left out
-    first, then the columns named in ``spare`` in this order, then the last columns. Names and numbers are never cut.
+    first, then the columns named in ``spare`` in this order, then the last columns; with ``keeps_intervals`` the
+    columns in ``spare`` go before the intervals. Names and numbers are never cut.
     """
 
     headers: Sequence[str]
     title: str = ""
     caption: str = ""
     spare: Sequence[str] = ()
+    keeps_intervals: bool = False
     rows: list[list[str]] = field(default_factory=list)
     styles: list[str] = field(default_factory=list)
 
@@ -87,9 +89,9 @@ class Sheet:
 
     def _first_to_go(self, column: "_Column") -> tuple[int, int]:
         if column.is_interval:
-            return 0, -column.place
+            return int(self.keeps_intervals), -column.place
         if column.header in self.spare:
-            return 1, self.spare.index(column.header)
+            return int(not self.keeps_intervals), self.spare.index(column.header)
         return 2, -column.place
 
 
@@ -150,21 +152,15 @@ def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.",
         print(otherwise)
 
 
-def evaluation_table(
-    title: str, policy: Evaluation, random: Evaluation | None = None, gains: Gains | None = None
-) -> Sheet:
+def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None = None) -> Sheet:
     """Return a table of success, return and score per class.
 
-    With ``random`` the table also has a random policy's results on the same tasks, and the difference. With ``gains``
-    it has the gains by adaptation.
+    With ``random`` the table also has a random policy's results on the same tasks, and the difference.
     """
     caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: by the suite's rule, once or at end"
     headers = ["task", "episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
-    if gains is not None:
-        headers += ["success gained [95 %]", "return gained [95 %]", "score gained [95 %]"]
-        caption += "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
     if any(result.unstable for result in policy.classes.values()):
         caption += f"\n{_BROKEN}"
     table = Sheet(headers, title, caption, _SPARE)
@@ -187,8 +183,6 @@ def evaluation_table(
             difference = differences[name]
             cells += [percent(other["success"]), ranged(other["return"], other["return_interval"])]
             cells += [ranged(difference.value, difference.interval, sign=True)]
-        if gains is not None:
-            cells += gained(gains.classes[name])
         table.add(*cells)
     for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
         success = rows["aggregate"]["success"]
@@ -196,13 +190,11 @@ def evaluation_table(
         cells = [label, "", "", percent(success[key]), "", "", "", _score(score[key] if score else None)]
         if others is not None:
             cells += [percent(others["aggregate"]["success"][key])]
-        if gains is not None and key == "mean":
-            cells += gained({**gains.aggregate, "return": None})  # returns of different classes have different scales
         table.add(*cells, style="dim")
     return table
 
 
-_SPARE = ("once", "at end", "length", "episodes", "score gained", "random return", "return gained", "score")
+_SPARE = ("once", "at end", "length", "episodes", "random return", "score")
 
 
 def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
@@ -225,11 +217,7 @@ def gained(measures: Mapping[str, Difference | None]) -> list[str]:
     success, earned, score = (measures[name] for name in ("success", "return", "score"))
     percents = NONE
     if success is not None:
-        if success.interval is None:
-            ends = None
-        else:
-            ends = (100 * success.interval[0], 100 * success.interval[1])
-        percents = ranged(100 * success.value, ends, sign=True, unit=" %")
+        percents = _percents(success.value, success.interval, sign=True)
     others = ((earned, ""), (score, NONE))
     return [
         percents,
@@ -272,13 +260,62 @@ def _print_played(title: str, played: "PlayedTasks", brief: bool) -> None:
 
 
 def print_meta_test(found: "RunMetaTest") -> None:
-    """Print, for each split, a table before adaptation and a table after adaptation with the gains."""
+    """Print a table of each split."""
+    subject = f"{found.algo} on {found.worlds.name}"
+    if found.steps is not None:
+        subject += f", {found.steps:,} steps"
     for split, result in found.splits.items():
-        subject = f"{found.algo} on {found.worlds.name}, {found.steps:,} steps, {split} tasks"
-        print_table(evaluation_table(f"{subject}, before adaptation", result.before))
-        if shots := len(result.adapt_steps):
-            title = f"{subject}, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
-            print_table(evaluation_table(title, result.after, gains=result.gains()))
+        print_table(meta_test_table(f"{subject}, {split} tasks", result.summary()))
+
+
+def meta_test_table(title: str, found: SplitSummary) -> Sheet:
+    """Return a table of success after 0, 1, ... shots and of the gains of the last one.
+
+    Each class has a second row if the evaluation episodes were also played with hidden rewards.
+    """
+    headers = ["task", *(f"success after {shot} [95 %]" for shot in range(found.shots + 1))]
+    caption = f"after 0, 1, ...: after this number of shots, each of {found.rollouts} exploring episodes of a task"
+    caption += "\n[..] 95 % bootstrap interval over tasks (of few: episodes)"
+    if found.shots:
+        headers.append("success gained [95 %]")
+        caption += "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
+    headers += ["return before", "return", "score before", "score", "episodes"]
+    if any(row.unstable for row in found.after.classes.values()):
+        caption += f"\n{_BROKEN}"
+    rows = {"shown": (found.by_shot, found.gain if found.shots else None)}
+    if found.hidden_by_shot is not None:
+        rows["hidden"] = (found.hidden_by_shot, None)
+        headers.insert(1, "rewards")
+    spare = ("score before", "score", "episodes", "return before", "return")
+    table = Sheet(headers, title, caption, spare, keeps_intervals=True)
+    for name in (*found.after.classes, None):
+        for rewards, (by_shot, gain) in rows.items():
+            labels = [name or "mean over tasks", rewards][: len(rows)]
+            table.add(*labels, *_shot_cells(name, by_shot, gain), style="" if name else "dim")
+    return table
+
+
+def _shot_cells(name: str | None, by_shot: Sequence[Summary], gain: Gains | None) -> list[str]:
+    """Return the cells of a class in a meta-test, or of the mean over classes: returns have different scales."""
+    if name is None:
+        means = [(shot.aggregate or {}).get("success") for shot in by_shot]
+        cells = [NONE if mean is None else _percents(mean.mean, mean.interval) for mean in means]
+        return cells if gain is None else [*cells, gained(gain.aggregate)[0]]
+    rows = [shot.classes[name] for shot in by_shot]
+    cells = [_percents(row.success, row.success_interval) for row in rows]
+    if len(rows) > 1:
+        cells.append(NONE if gain is None else gained(gain.classes[name])[0])
+    ends = (rows[0], rows[-1])
+    cells += [f"{row.mean_return:.4g}" for row in ends]
+    cells += [_score(row.score) for row in ends]
+    unstable = rows[-1].unstable
+    return [*cells, f"{rows[-1].episodes}" + (f" ({unstable} unstable)" if unstable else "")]
+
+
+def _percents(value: float, interval: Interval | None, sign: bool = False) -> str:
+    """Format a share and the ends of its interval in per cent."""
+    ends = None if interval is None else (100 * interval[0], 100 * interval[1])
+    return ranged(100 * value, ends, sign, " %")
 
 
 def percent(value: float) -> str:

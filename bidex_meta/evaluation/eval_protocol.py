@@ -27,7 +27,7 @@ class Protocol:
     seed: int = EVALUATION_SEED  # Seed of all starts.
     tasks: int | None = None  # Number of tasks of each class, the first of its pool; None: all.
     episodes_per_task: int = 4  # Evaluation episodes of each task, after each trial.
-    shots: int = 1  # Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation.
+    shots: int = 2  # Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation.
     rollouts: int | None = None
     """Exploring episodes of each task in a shot; None: one in each environment that plays it."""
     trials: int = 1  # Number of adaptations to each task, each from the start and with other episodes.

@@ -22,6 +22,7 @@ from bidex_meta.evaluation.statistics import (
     share_above,
 )
 from bidex_meta.runs.atomic import Json
+from bidex_meta.runs.evaluations import Aggregate, MetaTestEvaluation, parse_evaluation
 from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
@@ -31,6 +32,7 @@ FORMAT = 2
 _TASKS_OF_METAWORLD = 50
 _ROUNDING = 1e-4  # of stored rates
 _USUAL_WIDTH = 1.96  # standard deviations of half an interval of 95 %
+_NO_MEAN = Aggregate(np.inf, None, np.inf)
 _Interval = tuple[Fraction, Fraction]
 _Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
@@ -99,6 +101,21 @@ class Entry:
         return [np.array(row.tasks) for row in classes.values()]
 
 
+Track = Literal["reward-only", "privileged"]
+"""The training of an agent that adapts: rewards of its own episodes alone; or also teachers, hidden parts of tasks, or
+rewards of other goals."""
+
+
+@dataclass(frozen=True)
+class TrialEntry:
+    """A meta-test that was played elsewhere, in ``trials/`` of the folder of entries. Nothing in it is verified."""
+
+    format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
+    name: _Name
+    track: Track
+    evaluation: MetaTestEvaluation
+
+
 def entry_name(suite: str, name: str) -> str:
     """Return the name of an entry's file."""
     return f"{suite}-{name}.json".replace(" ", "-").replace("/", "-")
@@ -113,6 +130,44 @@ def read_entry(path: Path) -> Entry:
     for fault in _faults(entry, path):
         raise BidexError(f"{path}: {fault}. Submit it anew.")
     return entry
+
+
+def read_trial_entry(path: Path) -> TrialEntry:
+    """Read an entry of an agent; raise BidexError as :func:`read_entry` does."""
+    content = read_json(path, "an entry of the leaderboard")
+    entry = parse(content, TrialEntry, str(path))
+    if portable(content) != content:
+        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+    parse_evaluation(content["evaluation"], f"{path}: evaluation")
+    check_trials(entry.evaluation, str(path))
+    if path.name != entry_name(entry.evaluation.suite or "", entry.name):
+        raise BidexError(f"{path}: expected a file named SUITE-NAME.json of its entries. Submit it anew.")
+    return entry
+
+
+def check_trials(evaluation: MetaTestEvaluation, where: str) -> None:
+    """Raise BidexError, which begins with ``where``, for a meta-test that the leaderboard does not take."""
+    again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
+    if evaluation.agent is None or evaluation.suite is None:
+        raise BidexError(f"{where}: expected a meta-test of an agent that is no run, got no agent or suite. {again}")
+    if evaluation.suite not in suite_names():
+        raise BidexError(f"{where}: expected a shipped suite, got {evaluation.suite}: nobody else can play it.")
+    suite = load_suite(evaluation.suite)
+    if evaluation.conditions.suite_digest != suite.digest or evaluation.randomisation is not None:
+        raise BidexError(f"{where}: expected {suite.name} as it is here, without randomisation, got another. {again}")
+    test = evaluation.splits.get("test")
+    if test is None or len(test.by_shot) != 3 or not test.rewards_shown:
+        raise BidexError(f"{where}: expected test tasks after 0, 1 and 2 shots, with rewards shown. {again}")
+    names = {entry.name for entry in suite.split_classes("test")}
+    for shot in test.by_shot:
+        rates = [row.success for row in shot.classes.values()]
+        mean = ((shot.aggregate or {}).get("success") or _NO_MEAN).mean
+        if shot.classes.keys() != names or max(rates) > 1.0 or min(rates) < 0.0:
+            raise BidexError(f"{where}: expected success in [0, 1] of {', '.join(sorted(names))}. {again}")
+        if abs(mean - np.mean(rates)) > _ROUNDING:
+            raise BidexError(
+                f"{where}: expected the mean of its classes, {np.mean(rates):.4f}, got {mean:.4f}. {again}"
+            )
 
 
 def check_apart(entries: Mapping[Path, Entry]) -> None:

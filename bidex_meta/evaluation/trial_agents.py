@@ -5,7 +5,15 @@ import copy
 import torch
 from torch import Tensor
 
-from bidex_meta.agents import Timestep, TrialAgent
+from bidex_meta.agents import Agent, Timestep, TrialAgent
+from bidex_meta.errors import BidexError, one_line
+
+
+def adapting(agent: TrialAgent | Agent) -> Agent:
+    """Return an agent in the calls of the meta-test: a copy of a ``TrialAgent``, any other agent as it is."""
+    if isinstance(agent, TrialAgent) and not hasattr(agent, "adapt_action"):
+        return AdaptingTrialAgent(_copied(agent))
+    return agent  # pyright: ignore[reportReturnType]
 
 
 class AdaptingTrialAgent:
@@ -28,7 +36,7 @@ class AdaptingTrialAgent:
         if self._is_fresh:
             self._agent.reset(torch.ones_like(env_mask))
             self._is_fresh = False
-        self._playing = copy.deepcopy(self._agent)
+        self._playing = _copied(self._agent)
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the agent's actions (N, a) for observations (N, d)."""
@@ -48,3 +56,14 @@ class AdaptingTrialAgent:
     def observe(self, timestep: Timestep) -> None:
         """Show the copy a transition of an evaluation episode."""
         self._playing.observe(timestep)
+
+
+def _copied(agent: TrialAgent) -> TrialAgent:
+    """Return a deep copy of an agent; raise BidexError if it holds something that cannot be copied."""
+    try:
+        return copy.deepcopy(agent)
+    except (TypeError, RuntimeError) as error:
+        raise BidexError(
+            f"Expected an agent that copy.deepcopy can copy, got a {type(agent).__name__}: {one_line(error)}. Keep no "
+            "open files, locks or tensors with a graph in it, or write its __deepcopy__."
+        ) from None

@@ -47,14 +47,15 @@ def control_runs(
         worlds = Worlds.open(config.to_json())
         set_up_torch(config.threads)
         counts = [len(pool) for pool in worlds.tasks("test").values()]
-        of_shot = metatest.rollouts_of(worlds, config, rollouts, max(1, num_envs // len(counts)))
+        adaptation = metatest.Adaptation.of(worlds, config)
+        of_shot = metatest.rollouts_of(adaptation, rollouts, max(1, num_envs // len(counts)))
         size = metatest.environments_for(len(counts), max(counts) * trials, of_shot, num_envs)
         say(f"{folder.path}: {trials} adaptations of each held-out task, {size} environments.")
         test = worlds.world("test", size)
         train = worlds.world("train", size)
         protocol = Protocol(
             "test", seed, shots=shots, rollouts=of_shot, episodes_per_task=episodes, trials=trials,
-            max_adapt_steps=metatest.adapt_steps_of(config),
+            max_adapt_steps=adaptation.max_adapt_steps,
         )  # fmt: skip
         load = policy_loader(folder, here)[0]
         results.append(control(load, test, train, say=say, protocol=protocol, references=worlds.references()))

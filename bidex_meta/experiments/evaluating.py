@@ -1,20 +1,21 @@
-"""Evaluations of a run: its policy on tasks of its suite, or what its adaptation gains there."""
+"""Evaluations of a run's policy on tasks of its suite, and meta-tests of runs and of other agents that adapt."""
 
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from bidex_meta.agents import Agent
+from bidex_meta.agents import Agent, TrialAgent
 from bidex_meta.config import Switch
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import MetaEvaluation
 from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.evaluation.results import Evaluation, compare
+from bidex_meta.evaluation.trial_agents import adapting
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
-from bidex_meta.experiments.metatest import Options
+from bidex_meta.experiments.metatest import Adaptation, Options
 from bidex_meta.experiments.policies import checkpoint as load_checkpoint
 from bidex_meta.experiments.policies import policy_of
 from bidex_meta.runs import RunFolder
@@ -103,11 +104,13 @@ class RunEvaluation:
 class RunMetaTest:
     """The result of :func:`meta_test`."""
 
-    run: RunFolder
+    run: RunFolder | None
+    """The run; None for an agent of the caller's."""
     algo: str
+    """Name of the learner, or of the agent's class."""
     worlds: Worlds
-    steps: int
-    """Environment steps that the learner was meta-trained for."""
+    steps: int | None
+    """Environment steps that the learner was meta-trained for; None for an agent of the caller's."""
     seed: int
     splits: dict[str, MetaEvaluation]
     """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
@@ -115,11 +118,18 @@ class RunMetaTest:
 
     def record(self) -> MetaTestEvaluation:
         """Return the record of the meta-test, as ``evaluation.json`` holds it."""
+        subject: dict[str, Any] = {"agent": self.algo, "suite": self.worlds.short_name, "task_seed": self.worlds.seed}
+        if self.run is not None:
+            subject = {"run": portable(str(self.run.path))}
         splits = {split: found.summary() for split, found in self.splits.items()}
         return MetaTestEvaluation(
-            run=portable(str(self.run.path)), steps=self.steps, seed=self.seed, splits=splits,
-            conditions=self.conditions, randomisation=_randomised(self.worlds)
+            steps=self.steps, seed=self.seed, splits=splits, conditions=self.conditions,
+            randomisation=_randomised(self.worlds), **subject
         )  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write the content of ``evaluation.json`` to a file."""
+        write_evaluation(Path(path), self.record())
 
     def to_json(self) -> Json:
         """Return the content of ``evaluation.json``."""
@@ -140,7 +150,7 @@ class FinalEvaluation:
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
     those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
     on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 1.
+    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 2.
     rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
     tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
 
@@ -236,7 +246,8 @@ def evaluate(
 
 @checked_arguments
 def meta_test(
-    run: RunFolder | str | Path,
+    agent: RunFolder | str | Path | TrialAgent | Agent,
+    suite: str | Path | None = None,
     *,
     split: str = "auto",
     checkpoint: str = "last",
@@ -247,48 +258,81 @@ def meta_test(
     trials: Few | None = None,
     num_envs: Environments | None = None,
     seed: Seed = Options.seed,
+    task_seed: Seed | None = None,
+    hidden_rewards: bool = False,
     randomisation: str | Path | None = None,
     device: str = "auto",
     engine: str = "auto",
     save: bool = False,
 ) -> RunMetaTest:
-    """Evaluate a run's learner before and after it adapts to tasks.
+    """Evaluate an agent before and after it adapts to tasks.
 
     Args:
-        run: The run's folder, of a learner that adapts.
-        split: ``train``, ``test``, ``others`` (tasks of the train classes that the run was not trained on), or
-            ``auto`` for train and test.
-        checkpoint: ``last``, ``best`` or a file.
-        shots: Adaptation rounds, one after the other; None: 1.
+        agent: A run's folder, of a learner that adapts; or an agent, ``TrialAgent`` or ``MetaLearningAgent``.
+        suite: For an agent: name or file of a suite that hides its goals. A run has its own.
+        split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), or ``auto`` for
+            train and test.
+        checkpoint: Of a run: ``last``, ``best`` or a file.
+        shots: Adaptation rounds, one after the other; None: 2.
         rollouts: Episodes of each task in a shot; None: as in training, 40 at most, else 10.
         episodes: Evaluation episodes of each task; None: the number of rollouts.
         tasks: Tasks of each class, the first of its pool; None: 5.
         trials: Adaptations to each task, each from the start and to other episodes; None: five or more per class.
         num_envs: Most environments stepped together; None: 1024.
         seed: Seed of the episodes' starts; training does not use the default.
+        task_seed: For an agent: seed that draws the tasks, as in ``Benchmark(suite, task_seed)``; None: 0.
+        hidden_rewards: Whether the evaluation episodes are also played with their rewards hidden.
         randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
-        save: Whether the result is written to the run's ``evaluation.json``.
+        save: Whether the result is written to the run's ``evaluation.json``; of an agent call ``result.save(path)``.
 
-    Raises BidexError for a run without such a checkpoint or split, and for learners that do not adapt.
+    Raises BidexError for a run without such a checkpoint or split, for learners and agents that do not adapt, and for
+    suites that show their goals.
     """
-    folder = _opened(run)
-    config, worlds = _set_up(folder, device, engine, randomisation)
-    if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
-        raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
-    metatest.check_worlds(worlds, config.algo)
-    splits = metatest.splits_of(worlds, split)
+    if isinstance(agent, RunFolder | str | Path):
+        for name, value in (("suite", suite), ("task_seed", task_seed)):
+            if value is not None:
+                raise BidexError(f"meta_test: {name}: a run brings its own, got {value}. Leave {name} out.")
+        folder = _opened(agent)
+        config, worlds = _set_up(folder, device, engine, randomisation)
+        if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:
+            raise BidexError(f"{config.algo} does not adapt to tasks. Use evaluate(run).")
+        metatest.check_worlds(worlds, config.algo)
+        state, steps = load_checkpoint(folder, checkpoint)
+        adaptation = Adaptation.of(worlds, config)
+        load = partial(policy_of, folder, state, config.device)
+    else:
+        if suite is None:
+            raise BidexError(
+                'meta_test: suite: expected the suite to play, got None: meta_test(agent, "ML1-Switch-v2").'
+            )
+        if save or checkpoint != "last":
+            raise BidexError("meta_test: save and checkpoint are for runs. Leave both out, and call result.save(path).")
+        folder = None
+        steps = None
+        worlds = _worlds_of(str(suite), task_seed or 0, device, engine, randomisation)
+        load = partial(adapting, agent)
+        adaptation = Adaptation(type(agent).__name__, is_per_environment=not hasattr(agent, "assign"))
+        metatest.check_worlds(worlds, adaptation.name)
     options = Options(
-        shots=shots, rollouts=rollouts, episodes=episodes, tasks=tasks, trials=trials, num_envs=num_envs, seed=seed
-    )
-    state, steps = load_checkpoint(folder, checkpoint)
-    load = partial(policy_of, folder, state, config.device)
-    found = metatest.meta_test(worlds, config, load, options, splits)
-    result = RunMetaTest(folder, config.algo, worlds, steps, options.seed, found, conditions(worlds, options.num_envs))
-    if save:
-        write_evaluation(folder.evaluation_path, result.record())
+        shots=shots, rollouts=rollouts, episodes=episodes, tasks=tasks, trials=trials, num_envs=num_envs, seed=seed,
+        hidden_rewards=hidden_rewards,
+    )  # fmt: skip
+    found = metatest.meta_test(worlds, adaptation, load, options, metatest.splits_of(worlds, split))
+    played = conditions(worlds, options.num_envs)
+    result = RunMetaTest(folder, adaptation.name, worlds, steps, options.seed, found, played)
+    if save and folder is not None:
+        result.save(folder.evaluation_path)
     return result
+
+
+def _worlds_of(suite: str, seed: int, device: str, engine: str, randomisation: str | Path | None) -> Worlds:
+    """Return the worlds of a suite for an agent."""
+    config: Json = {"suite": suite, "seed": seed, "engine": engine}
+    config["randomisation"] = None if randomisation is None else str(randomisation)
+    on_gpu = Worlds.open(config).on_gpu
+    return Worlds.open({**config, "device": resolve_device(device, on_gpu)})
 
 
 def _randomised(worlds: Worlds) -> Json | None:

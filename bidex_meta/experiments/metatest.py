@@ -1,10 +1,10 @@
-"""The meta-test of a run whose learner adapts: its size, its worlds, its tables."""
+"""The meta-test of an agent that adapts: its size and its worlds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from bidex_meta.agents import Agent
-from bidex_meta.config import RunConfig
+from bidex_meta.config import RunConfig, Switch
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
@@ -30,7 +30,7 @@ class Options:
     episodes: Few | None = None
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
     many as --rollouts."""
-    shots: Shots | None = None  # Adapt so often, one after the other, to --rollouts episodes each; None: 1.
+    shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
     rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, 40 at most, else 10.
     tasks: Few | None = None  # Adapt to the first so many tasks of each class; None: 5.
     trials: Few | None = None
@@ -40,17 +40,44 @@ class Options:
     """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
     class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
     seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
+    hidden_rewards: Switch = False  # Learners that adapt also play the evaluation episodes with their rewards hidden.
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """The facts about an agent's adaptation that the size of its meta-test depends on."""
+
+    name: str
+    """Name of the learner or of the agent's class."""
+    rollouts: int = _ROLLOUTS
+    """Default number of episodes of each task in a shot."""
+    max_adapt_steps: int | None = None
+    """Longest episode that the agent adapts to, in steps; None: whole episodes."""
+    is_per_environment: bool = True
+    """Whether each environment adapts from its own episodes alone."""
+
+    @staticmethod
+    def of(worlds: Worlds, config: RunConfig) -> "Adaptation":
+        """Return the facts about a run's learner: shots as large as in training, at most 40 episodes."""
+        rollouts = _ROLLOUTS
+        of_batch = config.learner_values.get("tasks_per_class")
+        if of_batch is not None:
+            counts = [len(pool) for pool in worlds.tasks("train").values()]
+            of_class = config.num_envs // len(counts)
+            rollouts = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
+        capabilities = learner_kind(config.algo).make.capabilities
+        longest = config.learner_values.get("max_adapt_steps")
+        return Adaptation(config.algo, rollouts, longest, Capability.ADAPTS_INDEPENDENTLY in capabilities)
 
 
 def meta_test(
-    worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str]
+    worlds: Worlds, adaptation: Adaptation, load: Callable[[], Agent], options: Options, splits: list[str]
 ) -> dict[str, MetaEvaluation]:  # fmt: skip
-    """Play the meta-test on some splits of a run's worlds.
+    """Play the meta-test on some splits of worlds.
 
-    ``load`` makes a new MetaLearningAgent for each split, so that neither depends on the other. Of the config,
-    ``algo``, ``num_envs`` and ``learner`` are read.
+    ``load`` makes a new MetaLearningAgent for each split, so that neither depends on the other.
     """
-    check_worlds(worlds, config.algo)
+    check_worlds(worlds, adaptation.name)
     found = {}
     for split in splits:
         if split == OTHERS:
@@ -60,7 +87,7 @@ def meta_test(
         part = "train" if split == OTHERS else split
         counts = [len(pool) for pool in source.tasks(part).values()]
         limit = options.num_envs or _ENVIRONMENTS
-        protocol = _protocol(worlds, config, options, split, counts, limit)
+        protocol = _protocol(adaptation, options, split, counts, limit)
         rollouts = protocol.rollouts or 1
         num_envs = environments_for(len(counts), (protocol.tasks or 1) * protocol.trials, rollouts, limit)
         if protocol.trials > 1:
@@ -80,40 +107,29 @@ def meta_test(
     return found
 
 
-def _protocol(
-    worlds: Worlds, config: RunConfig, options: Options, split: str, counts: list[int], limit: int
-) -> Protocol:
+def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list[int], limit: int) -> Protocol:
     """Return the protocol for a split whose classes have ``counts`` tasks, with at most ``limit`` environments."""
-    rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
+    rollouts = rollouts_of(adaptation, options.rollouts, max(1, limit // len(counts)))
     tasks = min(options.tasks or TASKS, max(counts))
-    return Protocol(
-        split, options.seed, tasks, shots=1 if options.shots is None else options.shots, rollouts=rollouts,
+    protocol = Protocol(
+        split, options.seed, tasks, rollouts=rollouts,
         episodes_per_task=options.episodes or rollouts,  # which the same environments play at once
-        trials=options.trials or -(-TASKS // tasks), max_adapt_steps=adapt_steps_of(config)
+        trials=options.trials or -(-TASKS // tasks), hidden_rewards=options.hidden_rewards,
+        max_adapt_steps=adaptation.max_adapt_steps
     )  # fmt: skip
+    return protocol.changed(shots=options.shots)
 
 
-def adapt_steps_of(config: RunConfig) -> int | None:
-    """Return the longest episode that a run's learner adapts to; None: whole episodes."""
-    return config.learner_values.get("max_adapt_steps")
+def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
+    """Return the number of episodes of each task in a shot: as asked, else the default.
 
-
-def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int) -> int:
-    """Episodes of each task in a shot: as asked, else as the run was trained.
-
-    ``most`` are the environments that a class has at most. Where each adapts from its own episodes alone it must have
-    no second one in a shot: then there are fewer.
+    ``most`` is the largest number of environments of a class. An environment that adapts from its own episodes alone
+    plays one episode in a shot, so there are no more episodes than environments.
     """
-    if asked is None:
-        asked = _ROLLOUTS
-        of_batch = config.learner_values.get("tasks_per_class")
-        if of_batch is not None:
-            counts = [len(pool) for pool in worlds.tasks("train").values()]
-            of_class = config.num_envs // len(counts)
-            asked = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
-    if Capability.ADAPTS_INDEPENDENTLY in learner_kind(config.algo).make.capabilities:
-        return min(asked, most)
-    return asked
+    rollouts = asked or adaptation.rollouts
+    if adaptation.is_per_environment:
+        return min(rollouts, most)
+    return rollouts
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
@@ -130,12 +146,12 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
     return classes * -(-adaptations // portions) * rollouts
 
 
-def check_worlds(worlds: Worlds, algo: str) -> None:
-    """Refuses worlds that show their tasks: Meta-World's, multi-task or of a class alone."""
+def check_worlds(worlds: Worlds, name: str) -> None:
+    """Refuse worlds that show their tasks: Meta-World's, multi-task or of a class alone."""
     if not worlds.hides_goals:
         raise BidexError(
-            f"{algo} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite: "
-            "--suite ML1, ML4, ML20, or a file of kind meta."
+            f"{name} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite (ML1-v2, ML5-v2, ML20-v2, "
+            "ML1-CLASS-v2 for any class) or a file of kind meta."
         )
 
 

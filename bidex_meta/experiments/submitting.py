@@ -7,7 +7,7 @@ from pathlib import Path
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import FORMAT, class_rows, entry_name, read_entry
+from bidex_meta.evaluation.leaderboard import FORMAT, Track, check_trials, class_rows, entry_name, read_entry
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments.conditions import check_worlds_of, conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
@@ -15,7 +15,7 @@ from bidex_meta.experiments.policies import checkpoint, fitting, policy_of
 from bidex_meta.runs import RunFolder, training_seconds
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
-from bidex_meta.runs.evaluations import Conditions
+from bidex_meta.runs.evaluations import Conditions, MetaTestEvaluation, evaluation_json, read_evaluation
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
@@ -46,18 +46,12 @@ def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episode
         check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
     weights = _weights(folders)
     name = name or short_name(first.algo)
-    if worlds.suite is None:
-        suite = worlds.name
-    else:
-        suite = worlds.suite.file.stem
-    path = out / entry_name(suite, name)
-    if exists(path):
-        raise BidexError(f"There is {path} already. Give another --name, or delete it.")
+    suite = worlds.short_name
+    path = _new(out / entry_name(suite, name))
     for known in sorted(out.glob("*.json")):
         if twice := {*weights} & {*read_entry(known).weights}:
             run = folders[weights.index(twice.pop())].path
             raise BidexError(f"{run} stands in {known}: their weights are equal. Leave it out, or delete that entry.")
-    check_writable(path)
     facts = [_facts(folder) for folder in folders]
     played = [_play(folder, config, episodes, device) for folder, config in zip(folders, configs, strict=True)]
     verified = played[0][3]
@@ -76,13 +70,50 @@ def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episode
     return path
 
 
+def submit_trials(file: Path, out: Path, *, name: str | None, track: Track | None) -> Path:
+    """Write the leaderboard's entry of a meta-test of somebody's agent, and return its path.
+
+    The agent is not here, so nothing is verified.
+
+    Args:
+        file: The meta-test, as ``meta_test(agent, suite).save(file)`` writes it.
+        out: Folder of the entries.
+        name: The agent's name on the leaderboard; None: its class.
+        track: The kind of its training.
+
+    Raises BidexError for another evaluation, without a track, and if there is an entry of this name.
+    """
+    found = read_evaluation(file, "meta_test(agent, suite).save(file)")
+    if not isinstance(found, MetaTestEvaluation):
+        raise BidexError(f"{file}: expected a meta-test, got an evaluation of a policy. Submit its run instead.")
+    check_trials(found, str(file))
+    if track is None:
+        raise BidexError(
+            "--track: expected reward-only (trained by rewards of its own episodes) or privileged (by teachers, hidden "
+            "parts of tasks or rewards of other goals too), got none."
+        )
+    name = name or found.agent or ""
+    path = _new(out / "trials" / entry_name(found.suite or "", name))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"format": FORMAT, "name": name, "track": track, "evaluation": evaluation_json(found)})
+    return path
+
+
+def _new(path: Path) -> Path:
+    """Return the path of an entry; raise BidexError if there is one, or if it cannot be written."""
+    if exists(path):
+        raise BidexError(f"There is {path} already. Give another --name, or delete it.")
+    check_writable(path)
+    return path
+
+
 def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
     """Raise BidexError if the runs cannot form one entry."""
     for folder, config in zip(folders, configs, strict=True):
         if config.suite is None:
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
         if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
-            raise BidexError(f"{config.algo} adapts to tasks, and the leaderboard is of policies that do not (yet).")
+            raise BidexError(f"{config.algo} adapts to tasks, and runs that adapt are not taken (yet).")
         if run_kind(config) != run_kind(configs[0]):
             raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
     if len({config.seed for config in configs}) < len(configs):

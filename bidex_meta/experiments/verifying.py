@@ -9,7 +9,7 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
-from bidex_meta.experiments.metatest import TASKS, Options, meta_test
+from bidex_meta.experiments.metatest import TASKS, Adaptation, Options, meta_test
 from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
@@ -113,6 +113,10 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
     evaluation = read_evaluation(path, again)
     if evaluation.randomisation is not None:
         raise BidexError(f"{path}: expected an evaluation without --randomisation, got one with it. Name another.")
+    if isinstance(evaluation, MetaTestEvaluation) and evaluation.agent is not None:
+        raise BidexError(
+            f"{path}: expected the evaluation of a run, got that of the agent {evaluation.agent}. Name another."
+        )
     needed = {"steps": evaluation.steps, "seed": evaluation.seed}
     if isinstance(evaluation, PolicyEvaluation):
         needed["policy.episodes_per_task"] = evaluation.policy.episodes_per_task
@@ -176,6 +180,7 @@ def _again(
         world.close()
         return found.summary().classes
     splits = {}
+    adaptation = Adaptation.of(worlds, config)
     for split, part in recorded.splits.items():
         if split not in (*worlds.splits, OTHERS):
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
@@ -187,10 +192,11 @@ def _again(
         options = Options(
             shots=part.shots, rollouts=part.rollouts, trials=part.trials, episodes=part.before.episodes_per_task,
             tasks=max(row.tasks or TASKS for row in part.before.classes.values()), num_envs=num_envs, seed=seed,
+            hidden_rewards=part.hidden_by_shot is not None,
         )  # fmt: skip
         if part.max_adapt_steps is not None:
-            config = replace(config, learner={**config.learner, "max_adapt_steps": part.max_adapt_steps})
-        splits[split] = meta_test(worlds, config, load, options, [split])[split].summary()
+            adaptation = replace(adaptation, max_adapt_steps=part.max_adapt_steps)
+        splits[split] = meta_test(worlds, adaptation, load, options, [split])[split].summary()
     return MetaTestEvaluation(splits=splits).all_results
 
 

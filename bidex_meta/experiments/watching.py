@@ -111,10 +111,10 @@ class Watch:
         return evaluate(policy, world, episodes, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
-        """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
+        """Return the results on train tasks: test tasks must not choose the policy that is judged on them."""
         load = partial(self._policy, self._device)
-        options = metatest.Options()
-        found = metatest.meta_test(self._source, self._config, load, options, ["train"])["train"]
+        adaptation = metatest.Adaptation.of(self._source, self._config)
+        found = metatest.meta_test(self._source, adaptation, load, metatest.Options(), ["train"])["train"]
         before = _metrics(found.before)["Eval/success_rate"]
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
 

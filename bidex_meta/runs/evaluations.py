@@ -167,9 +167,12 @@ class PolicyEvaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class MetaTestEvaluation:
-    """The evaluation of a learner before and after it adapts."""
+    """The evaluation of a learner, or of an agent of the caller's, before and after it adapts."""
 
     run: Text | None = None
+    agent: Text | None = None  # class of an agent that is no run
+    suite: Text | None = None  # that the agent played; a run's is in its config
+    task_seed: Seed | None = None  # that drew the agent's tasks
     steps: Whole | None = None  # environment steps that the learner was meta-trained for
     seed: Seed | None = None  # of the episodes' starts
     splits: Annotated[dict[str, SplitSummary], Meta(min_length=1)]
@@ -192,12 +195,13 @@ class MetaTestEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares: by class, split and shot."""
+        """Return the results that a verification compares: by class, split, shot, and rewards if they were hidden."""
         rows = {}
         for split, part in self.splits.items():
-            for number, shot in enumerate(part.by_shot):
-                for name, row in shot.classes.items():
-                    rows[f"{name} ({split}, shot {number})"] = row
+            for text, shots in (("", part.by_shot), (", rewards hidden", part.hidden_by_shot or ())):
+                for number, shot in enumerate(shots):
+                    for name, row in shot.classes.items():
+                        rows[f"{name} ({split}, shot {number}{text})"] = row
         return rows
 
 

@@ -100,10 +100,8 @@ def check_argument(name: str, value: object, hint: object) -> None:
     """Raise BidexError where a value is not of an annotation; ``name`` begins the message."""
     if _fits(value, hint):
         return
-    if _is_protocol(hint):
-        lacking = _lacking(value, hint)
-    else:
-        lacking = []
+    protocols = [part for part in (hint, *get_args(hint)) if _is_protocol(part)]
+    lacking = min((_lacking(value, protocol) for protocol in protocols), key=len, default=[])
     if lacking:
         without = f", which has no {', '.join(lacking[:6])}"
     else:

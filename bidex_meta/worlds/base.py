@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import chain
+from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.errors import BidexError
@@ -133,6 +134,11 @@ class Worlds(ABC):
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
         """Return the classes of the train split by name; raises BidexError for classes of another library."""
+
+    @property
+    def short_name(self) -> str:
+        """Return the name; of a suite file of the user's own, the file's name without folder and suffix."""
+        return PurePath(self.name).stem if self.name.endswith(".toml") else self.name
 
     @property
     def rules(self) -> Rules | None:

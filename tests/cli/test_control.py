@@ -84,7 +84,7 @@ def test_the_command_shows_all_arms_of_all_runs(runs, shown):
         assert label in table
     found = json.loads(shown("control", *runs, *flags, "--json"))
     assert found["episodes"] == {"CatchUnderarm": 24} and len(found["runs"]) == 2
-    assert (found["shots"], found["trials"]) == (1, 3) and found["rollouts"] > 0
+    assert (found["shots"], found["trials"]) == (2, 3) and found["rollouts"] > 0
     by_arm = found["classes"]["CatchUnderarm"]
     assert by_arm["before"]["own_minus"]["return"]["interval"][0] > 0 and len(by_arm["own"]["runs"]) == 2
 

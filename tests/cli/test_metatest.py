@@ -6,7 +6,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.evaluation.comparison import read_groups
-from bidex_meta.experiments.metatest import rollouts_of
+from bidex_meta.experiments.metatest import Adaptation, rollouts_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.learner import Capability
 from bidex_meta.worlds import Worlds
@@ -17,15 +17,15 @@ from tests.fakes import change, run_config
 pytestmark = pytest.mark.usefixtures("finder")
 
 
-def test_a_run_ends_with_both_tables_of_both_splits_and_trains_on_the_learners_kind_of_world(capsys, request):
+def test_a_run_ends_with_the_table_of_each_split_and_trains_on_the_learners_kind_of_world(capsys, request):
     run = request.getfixturevalue("adapted")  # after capsys, so that what it prints is caught
     shown = capsys.readouterr()
     for split, classes in COUNTS.items():
-        assert f"{split} tasks, before adaptation" in shown.out
-        assert f"{split} tasks, after 1 shot of 4 episodes" in shown.out
+        assert f"24 steps, {split} tasks" in shown.out
         assert all(name in shown.out for name in classes)
-    assert shown.out.count("gained") == 2 * (3 + 1), "three columns and their caption, of each split"
-    assert "5 of 6 tasks of each, 1 shot of 4 episodes, 4 evaluation episodes, 40 environments." in shown.err
+    assert all(f"after {shot}" in shown.out for shot in range(3))
+    assert shown.out.count("gained") == 2 * (1 + 1), "a column and its caption, of each split"
+    assert "5 of 6 tasks of each, 2 shots of 4 episodes, 4 evaluation episodes, 40 environments." in shown.err
     loaded = RunFolder.open(run).checkpoints.load()
     assert loaded is not None and loaded[0]["learner"]["mode"] == "DISABLED"
     stored = json.loads((run / "evaluation.json").read_text())
@@ -65,7 +65,18 @@ def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(
     assert few["before"]["classes"]["Near"]["episodes"] == 20
     assert few["gain"]["classes"]["Near"]["return"]["interval"][0] > 0
     none = shown("evaluate", adapted, "--shots", 0)
-    assert none.count("before adaptation") == 2 and "after" not in none
+    assert "after 0" in none and "after 1" not in none and "gained" not in none
+
+
+def test_hidden_rewards_are_a_second_row_and_are_verified(adapted, shown, tmp_path):
+    flags = ["evaluate", adapted, "--split", "test", "--hidden-rewards"]
+    table = shown(*flags)
+    assert [word in table for word in ("shown", "hidden", "after 2")] == [True] * 3
+    (tmp_path / "hidden.json").write_text(shown(*flags, "--json"))
+    part = json.loads((tmp_path / "hidden.json").read_text())["splits"]["test"]
+    assert len(part["hidden_by_shot"]) == len(part["by_shot"]) == 3
+    again = shown("verify", adapted, "--evaluation", tmp_path / "hidden.json")
+    assert "6 classes: 6 equal" in again and "Near (test, shot 2, rewards hidden)" in again
 
 
 def test_the_curve_of_adaptation(adapted, shown, refused, tmp_path):
@@ -95,9 +106,9 @@ def test_bad_flags_are_one_line(adapted, refused, flags, expected):
 
 def test_what_does_not_adapt_takes_no_shots(adapted, refused):
     change(adapted, algo="mtppo")
-    for flag in ("--shots", "--trials"):
-        expected = f"bidex-meta: mtppo does not adapt to tasks, got {flag} 3. Leave it out.\n"
-        assert refused("evaluate", adapted, flag, "3") == expected
+    for words in ("--shots 3", "--trials 3", "--hidden-rewards"):
+        expected = f"bidex-meta: mtppo does not adapt to tasks, got {words}. Leave it out.\n"
+        assert refused("evaluate", adapted, *words.split()) == expected
 
 
 @pytest.mark.parametrize("on", [("--suite", "metaworld/MT3"), ("--suite", "MT4"), ("--task", "Switch")])
@@ -111,9 +122,11 @@ def test_no_adaptation_where_tasks_are_shown(refused, tmp_path, monkeypatch, on)
 def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     config = run_config(suite="ML4", algo="finder", num_envs=1024)
     source = Worlds.open(config.to_json())
-    assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
+    shared = Adaptation.of(source, config)
+    assert [rollouts_of(shared, asked, 6) for asked in (20, None)] == [20, 10]
     monkeypatch.setattr(Learner, "capabilities", frozenset(Capability))
-    assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
+    alone = Adaptation.of(source, config)
+    assert [rollouts_of(alone, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 
 def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_tasks(tmp_path):

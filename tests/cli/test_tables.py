@@ -8,9 +8,10 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.cli.plot import named_runs
-from bidex_meta.cli.tables import Sheet, evaluation_table, plain_table, print_table, result_table
+from bidex_meta.cli.tables import Sheet, evaluation_table, meta_test_table, plain_table, print_table, result_table
 from bidex_meta.evaluation.comparison import read_groups
-from bidex_meta.evaluation.gains import paired_gains
+from bidex_meta.evaluation.eval_protocol import Protocol
+from bidex_meta.evaluation.meta_test import MetaEvaluation
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
 from bidex_meta.experiments.comparing import class_table, group_table
@@ -41,9 +42,11 @@ def evaluation(seed: int) -> Evaluation:
 
 
 def of_meta_test() -> Sheet:
-    before, after = evaluation(0), evaluation(1)
-    gains = paired_gains(after, before, {name: np.arange(40) // 8 for name in CLASSES})
-    return evaluation_table("promp on ML20-v2, test tasks, after 1 shot of 10 episodes", after, gains=gains)
+    by_shot = [evaluation(seed) for seed in range(3)]
+    adaptations = {name: np.arange(40) // 8 for name in CLASSES}
+    protocol = Protocol(rollouts=10, trials=5)
+    found = MetaEvaluation(by_shot, adaptations, protocol, [1, 1], [evaluation(seed) for seed in range(3)])
+    return meta_test_table("promp on ML20-v2, test tasks", found.summary())
 
 
 def of_sweep() -> Sheet:
@@ -68,6 +71,8 @@ def test_names_and_numbers_are_whole_at_any_width(name: str, width: int) -> None
     assert max(map(len, lines)) <= width and "…" not in "".join(lines)
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if "│" in line]
     assert [row[0] for row in rows] == [row[0] for row in sheet.rows], "a row a line, by its whole name"
+    if name == "meta-test":
+        assert rows[1][1] == "hidden" and (width < 160 or rows[0][3].startswith("["))
     whole = {part.strip() for row in sheet.rows for cell in row for part in (cell, *re.split(r" (?=\[)", cell))}
     for row in rows:
         assert len(row) >= 3 and set(row) <= whole

@@ -119,7 +119,7 @@ def test_no_evaluation_and_another_file(run, capsys, tmp_path):
 def test_a_learner_that_adapts(adapted, tmp_path, capsys):
     path = adapted
     code, shown = verify(capsys, path)
-    assert code == 0 and "6 classes: 6 equal bit for bit" in shown.out and "Near (test, shot 1)" in shown.out
+    assert code == 0 and "9 classes: 9 equal bit for bit" in shown.out and "Near (test, shot 1)" in shown.out
     capsys.readouterr()
     words = ["--shots", "2", "--rollouts", "3", "--tasks", "2", "--trials", "2", "--episodes", "5", "--split", "test"]
     assert main(["evaluate", str(path), "--json", *words, "--num-envs", "8"]) == 0

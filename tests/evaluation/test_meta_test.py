@@ -246,7 +246,7 @@ def test_intervals_know_that_episodes_of_an_adaptation_share_its_luck():
         (Still(), world(), {"trials": 0}, "trials"),
         (Still(), world(), {"max_adapt_steps": 0}, "max_adapt_steps"),
         (Still(), world(), {"episodes_per_task": 0}, "from 1 to"),
-        (Still(), world(), {"evaluated": (2,)}, "from 0 to 1 shots"),
+        (Still(), world(), {"evaluated": (3,)}, "from 0 to 2 shots"),
         (RandomAgent(world().action_space), world(), {}, "RandomAgent has no init, adapt_action, step, adapt"),
         (Still(), world(), {"adapt_world": world(14)}, "observations and actions"),
         (Still(), world(), {"adapt_world": world(12, 2, 2)}, "tasks in its pools"),

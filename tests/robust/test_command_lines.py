@@ -37,7 +37,7 @@ FLAGS = {
 }
 SWITCHES = {
     "run": ["--print-config", "--no-evaluate"],
-    "evaluate": ["--random", "--json"],
+    "evaluate": ["--random", "--json", "--hidden-rewards"],
     "verify": ["--json"],
     "plot": ["--adaptation"],
     "render": ["--tiled"],

@@ -307,7 +307,10 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
         "num_envs": (4, ""), "seed": (0, ""), "device": ("cpu", ""), "engine": ("c", ""), "randomisation": (None, ""),
     }),
     "meta_test": lambda s: (evaluating.meta_test, {
-        "run": (s.run, ""), "shots": (1, ""), "tasks": (1, ""), "trials": (1, ""),
+        "agent": (s.run, ""), "suite": (None, ""), "shots": (1, ""), "tasks": (1, ""), "trials": (1, ""),
+    }),
+    "meta_test of an agent": lambda s: (lambda **a: evaluating.meta_test(Finder(), **a), {
+        "suite": ("MT4", ""), "task_seed": (0, ""), "save": (False, ""), "hidden_rewards": (False, ""),
     }),
     "verify": lambda s: (verify, {"run": (s.run, ""), "device": ("cpu", ""), "num_envs": (4, "")}),
     "SweepPlan.of": lambda s: (SweepPlan.of, {

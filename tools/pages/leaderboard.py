@@ -1,4 +1,4 @@
-"""Tables of the leaderboard, from the entries in ``leaderboard/`` next to the folder of data."""
+"""Tables of the leaderboard, from the entries in ``leaderboard/`` and its ``trials/`` next to the folder of data."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 from bidex_meta.evaluation import leaderboard as board
 from bidex_meta.evaluation.leaderboard import Entry
 from bidex_meta.evaluation.statistics import iqm
+from bidex_meta.runs.evaluations import Aggregate, Summary
 from bidex_meta.suite import load_suite, suite_names
 from tools.pages.tables import table
 
@@ -24,6 +25,33 @@ def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
     above = [f"> {100 * rate:.0f} %" for rate in board.PROFILE]
     head = ["", "entry", "success, IQM", "other tasks, IQM", *above, "above the next", "runs", "steps"]
     yield from table([*head, "stated: hours", "stated: trained on", "stated: commit"], rows) if rows else ()
+
+
+def trials_table(suite: str, data: Path) -> Iterator[str]:
+    """Yield a row for each agent that adapts on a suite, best first; tracks stay apart."""
+    folder = data.parent / "leaderboard" / "trials"
+    entries = [board.read_trial_entry(path) for path in sorted(folder.glob(f"{suite}-*.json"))]
+    found = []
+    for entry in entries:
+        test = entry.evaluation.splits["test"]
+        if entry.evaluation.suite == suite:
+            after = [_mean_success(shot) for shot in test.by_shot]
+            gain = test.gain.aggregate["success"] if test.gain else None
+            cells = [f"{100 * mean.mean:.1f} %{_ends(mean)}" for mean in after]
+            cells += [gain.text(100.0, " %") if gain else "–", str(test.rollouts), "not verified"]
+            found.append((entry.track, -after[-1].mean, [entry.name, entry.track, *cells]))
+    head = ["agent", "training", "after 0", "after 1", "after 2", "gain", "episodes per shot", ""]
+    yield from table(head, [row for *_, row in sorted(found)]) if found else ()
+
+
+def _mean_success(shot: Summary) -> Aggregate:
+    mean = (shot.aggregate or {})["success"]
+    assert mean is not None  # ``check_trials`` refuses entries without it
+    return mean
+
+
+def _ends(mean: Aggregate) -> str:
+    return "" if mean.interval is None else f" [{100 * mean.interval[0]:.1f}, {100 * mean.interval[1]:.1f}]"
 
 
 def _rank(entry: Entry) -> float:
