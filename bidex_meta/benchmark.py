@@ -5,6 +5,7 @@ The four properties and `Task` have Meta-World's names, so that code for Meta-Wo
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar, cast
@@ -26,7 +27,7 @@ from bidex_meta.world import PointsRule, Slot, World, WorldConfig
 from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
 
-TaskSampling = Literal["uniform", "fixed"]
+TaskSampling = Literal["uniform", "fixed", "fresh"]
 
 _NUMBERS = np.dtype("<f8")
 Entry = TypeVar("Entry")
@@ -100,8 +101,10 @@ class Benchmark:
     `seed`, a whole number from 0, chooses the tasks and is the default seed of the worlds. The same name and seed give
     the same tasks in every process; no global random generator is used. The classes make single environments, as in
     Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a `metaworld.Benchmark`.
+    `tasks_per_class` is the number of train tasks per class; 0: training draws a new task in each episode or trial, and
+    `train_tasks` are tasks that training never draws; None: as the suite's file says.
 
-    Raises BidexError for an unknown suite, a faulty suite file or seed.
+    Raises BidexError for an unknown suite, a faulty suite file or seed, or `tasks_per_class` with listed tasks.
 
     Examples:
         >>> from bidex_meta import Benchmark
@@ -110,11 +113,12 @@ class Benchmark:
         (['TwoCatchUnderarm'], 150)
     """
 
-    def __init__(self, name_or_path: str | Path | Suite, seed: int = 0) -> None:
+    def __init__(self, name_or_path: str | Path | Suite, seed: int = 0, tasks_per_class: int | None = None) -> None:
         if isinstance(name_or_path, Suite):
-            self.suite = name_or_path
+            suite = name_or_path
         else:
-            self.suite = load_suite(name_or_path)
+            suite = load_suite(name_or_path)
+        self.suite = suite.with_train_tasks(tasks_per_class)
         self.seed = whole_number("seed", seed, 0)
         classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._classes = ByClass(classes, self.suite.rules)
@@ -183,7 +187,10 @@ class Benchmark:
     @property
     def others(self) -> "Benchmark":
         """Return the same suite with unseen tasks: the same number, drawn by another seed, that no run trained on."""
-        return Benchmark(self.suite, self.seed + OTHER_SEED)
+        suite = self.suite
+        if suite.train_tasks == 0:
+            suite = replace(suite, train_tasks=None)
+        return Benchmark(suite, self.seed + OTHER_SEED)
 
     @property
     def padded_size(self) -> int:
@@ -207,7 +214,7 @@ class Benchmark:
 
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
-        tasks.
+        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
@@ -243,7 +250,9 @@ class Benchmark:
                 randomisation = None
         if seed is None:
             seed = self.seed
-        if evaluates or self.suite.kind == "meta":
+        if split == "train" and self.suite.train_tasks == 0:
+            task_sampling = "fresh"
+        elif evaluates or self.suite.kind == "meta":
             task_sampling = "fixed"
         else:
             task_sampling = "uniform"
@@ -275,7 +284,7 @@ class Benchmark:
         if entry.tasks:
             variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.of(split)]
         else:
-            variations = _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0)
+            variations = _drawn(space, self.seed, key, split, self.suite.drawn_tasks(split))
         env_name = versioned_name(entry.name, self.suite.rules)
         return [Task.from_variation(env_name, variation) for variation in variations]
 
@@ -337,8 +346,9 @@ def make_task_world(
     `task_name` is a task class, e.g. `"HandOver"` (the only one with a fixed base: 398 observations, 40 actions), or
     your own class as `"package.module:Class"` (docs/own-task.md). In addition to arguments of `Benchmark.make_world`:
 
-    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. None:
-      uniform in training worlds, fixed in evaluation worlds.
+    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50;
+      `"fresh"`: each episode draws a new task, which is none of the 50. None: uniform in training worlds, fixed in
+      evaluation worlds.
     - `moving_base`: whether the hands' bases move; None: as the class defines it.
     - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state.
     - `randomisation`: randomisation of the environments (docs/randomisation.md); None: nothing is randomised.

@@ -13,7 +13,7 @@ from msgspec import Meta
 from tyro.constructors import PrimitiveConstructorSpec
 
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import MOST_POINTS
+from bidex_meta.suite import MOST_POINTS, MOST_TASKS
 from bidex_meta.utils.files import Json, JsonObject, read_json
 from bidex_meta.utils.validation import (
     Count,
@@ -93,6 +93,9 @@ class RunConfig(Generic[LearnerSettings]):
     object: Text | None = None
     """With --task: what is thrown in place of the class's own object: a name of the shelf or the path of an MJCF file
     (docs/objects.md)."""
+    tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
+    """With --suite: train tasks of each class; 0: a new task in each episode, or in each trial of a learner that
+    adapts (docs/own-suite.md); by default as the suite's file says."""
     start_from: Text | None = None
     """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
     one."""

@@ -32,14 +32,17 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import Json, absolute, expanded, portable, read_toml
 from bidex_meta.utils.paths import suites_dir
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import parse
+from bidex_meta.utils.validation import parse, whole_number
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
 OTHERS, OTHER_SEED = "others", 500_000
 """Name of the tasks of train classes that no run trained on, and what is added to a run's seed to draw them."""
+DRAWN = 50
+"""Tasks drawn per class and split where a file says ``tasks_per_class = 0``."""
 MOST_POINTS = 16_384
 """Of a cloud: more than a coarse image has pixels are no finer."""
+MOST_TASKS = 1_000_000
 METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     "metaworld/MT10": (
         "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3", "drawer-close-v3",
@@ -107,6 +110,9 @@ class Suite:
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
     file: Path
+    train_tasks: int | None = None
+    """Tasks drawn per class of the train split instead; 0: training draws a new one in each episode or trial, and
+    evaluations on the train split play ``tasks_per_class`` tasks that training never draws."""
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False
@@ -138,6 +144,23 @@ class Suite:
     def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
         """Return the classes of one split, in file order."""
         return tuple(entry for entry in self.classes if split in entry.splits)
+
+    def drawn_tasks(self, split: Split) -> int:
+        """Return the number of tasks in a split's pool of a class that lists none."""
+        if split == "train" and self.train_tasks:
+            return self.train_tasks
+        return self.tasks_per_class or 0
+
+    def with_train_tasks(self, count: int | None) -> "Suite":
+        """Return the suite with another ``train_tasks``; None: as it is.
+
+        Raises BidexError if a class lists its tasks, or the count is no whole number from 0 to a million.
+        """
+        if count is None:
+            return self
+        train_tasks = whole_number("tasks_per_class", count, 0, MOST_TASKS)
+        _check_drawn(self.name, self.classes, train_tasks)
+        return replace(self, train_tasks=train_tasks)
 
 
 _OF_THE_FILE = ("name", "version", "description", "file")
@@ -247,7 +270,7 @@ def load_randomisation(path: str | Path) -> Randomisation:
 
 # What stands in a file, as msgspec checks it. No number is larger than a million: beyond it nothing is meant.
 _Text = Annotated[str, Meta(min_length=1, max_length=500)]
-_Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+_Count = Annotated[int, Meta(ge=1, le=MOST_TASKS)]
 _Number = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 _Tables = Meta(min_length=1, max_length=1000)
 
@@ -287,7 +310,7 @@ class _File:
     reward: Literal["paper", "v2"]
     base: Literal["moving", "alone"]
     classes: Annotated[list[_ClassEntry], _Tables]
-    tasks_per_class: _Count | None = None
+    tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
     points: _PointsEntry | None = None
     randomisation: Randomisation | None = None
     variation: Literal["narrow", "wide"] = "narrow"
@@ -318,6 +341,8 @@ def _parse(file: Path) -> Suite:
     for i, entry in enumerate(content.classes):
         classes += _classes(file, i, entry)
     given |= {"classes": tuple(classes), "file": file, "rules": rules}
+    if content.tasks_per_class == 0:
+        given |= {"tasks_per_class": DRAWN, "train_tasks": 0}
     suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
     _check(suite)
     return suite
@@ -371,18 +396,30 @@ def _check(suite: Suite) -> None:
     if suite.splits != expected:
         wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
         raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
+    if suite.train_tasks is not None:
+        _check_drawn(f"{suite.file}", suite.classes, suite.train_tasks)
     all_listed = all(entry.tasks for entry in suite.classes)
     if all_listed and suite.tasks_per_class is not None:
         mend = "Leave it out: every class lists its tasks."
         raise _error(suite.file, "tasks_per_class", "nothing", suite.tasks_per_class, mend)
     if not all_listed and suite.tasks_per_class is None:
         mend = "Add it, or list every task."
-        raise _error(suite.file, "tasks_per_class", "a whole number from 1 on", "nothing", mend)
+        raise _error(suite.file, "tasks_per_class", "a whole number from 0 on", "nothing", mend)
     if suite.task_id == "task" and not all_listed:
         raise _error(suite.file, "task_id", '"class", since not every class lists its tasks', suite.task_id)
     for index, entry in enumerate(suite.classes):
         if entry.tasks:
             _check_listed(suite.file, f"classes[{index}].tasks", entry)
+
+
+def _check_drawn(name: str, classes: tuple[SuiteClass, ...], count: int) -> None:
+    """Raise BidexError if a class lists its tasks: a number of drawn ones would not be the number it trains on."""
+    for entry in classes:
+        if entry.tasks:
+            raise BidexError(
+                f"{name}: tasks_per_class: expected classes whose tasks are drawn, got {count} with the listed tasks "
+                f"of {entry.name}. Leave tasks_per_class out, or name a suite without listed tasks."
+            )
 
 
 def _check_listed(file: Path, place: str, entry: SuiteClass) -> None:

@@ -122,9 +122,20 @@ def test_names_and_paths(tmp_path: Path) -> None:
     assert load_suite("ml1-switch-CHOICE2").name == "ML1-Switch-choice2"
 
 
+def test_tasks_without_number(tmp_path: Path) -> None:
+    suite = load_suite(write(tmp_path, META))
+    fresh = load_suite(write(tmp_path, META.replace("tasks_per_class = 5", "tasks_per_class = 0")))
+    assert (fresh.train_tasks, fresh.tasks_per_class, fresh.drawn_tasks("train")) == (0, 50, 50)
+    asked = suite.with_train_tasks(0)
+    assert (asked.train_tasks, asked.drawn_tasks("train"), asked.drawn_tasks("test")) == (0, 5, 5)
+    assert suite.with_train_tasks(9).drawn_tasks("train") == 9 and suite.with_train_tasks(None) == suite
+    assert len({each.digest for each in (suite, fresh, asked, suite.with_train_tasks(9))}) == 4
+
+
 BOTH = 'split = "test"', 'objects = ["egg"]\noptions = {object = "egg"}'
 TABLE = "version = 1\nrandomisation = {"
 COUNTED = "version = 1\ntasks_per_class = 3"
+ENDLESS = "version = 1\ntasks_per_class = 0"
 FAULTS = {
     "unknown key": (META, 'base = "moving"', 'base = "moving"\nbasis = 1', "basis: unknown entry, did you mean 'base'"),
     "unknown key in a class": (META, 'split = "test"', 'splitt = "test"', "classes[1].splitt: unknown entry"),
@@ -135,7 +146,7 @@ FAULTS = {
     "blank name": (META, 'name = "own"', 'name = " "', "name: expected printable"),
     "a bell": (META, '"two classes"', '"two\\u0007"', "description: expected printable"),
     "unknown choice": (META, '"masked"', '"hidden"', "observation: expected"),
-    "no tasks": (META, "tasks_per_class = 5", "tasks_per_class = 0", "tasks_per_class: expected"),
+    "no tasks": (META, "tasks_per_class = 5", "tasks_per_class = -1", "tasks_per_class: expected"),
     "tasks neither drawn nor listed": (META, "tasks_per_class = 5\n", "", "tasks_per_class: expected"),
     "empty split": (META, 'split = "test"', 'split = "train"', "a meta suite with the splits train, test, got train"),
     "test split in MT": (META, '"meta"', '"multi-task"', "a multi-task suite with the splits train, got train, test"),
@@ -159,6 +170,7 @@ FAULTS = {
     "overlap": (LISTED, "goal_x = 0.1", "goal_x = 0.0", "train and test tasks that differ, got 'near' and 'far'"),
     "task twice": (LISTED, '"far"', '"near"', "classes[0].tasks.name: expected each name once"),
     "listed split absent": (LISTED, 'split = "both"', 'split = "test"', "classes"),
+    "listed and without number": (LISTED, "version = 1", ENDLESS, "tasks_per_class: expected classes whose tasks are"),
     "listed and counted": (LISTED, "version = 1", COUNTED, "tasks_per_class: expected nothing"),
     "value is no number": (LISTED, "goal_x = 0.1", 'goal_x = "0.1"', "classes[0].tasks[1].fixed[...]: expected"),
     "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "classes[0].tasks[1].fixed[...]: expected"),

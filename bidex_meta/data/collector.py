@@ -124,6 +124,8 @@ class EpisodeCollector(PooledWorldWrapper):
                 self._begin(begun, self._own(obs))
 
     def _begin(self, mask: np.ndarray, obs: np.ndarray) -> None:
+        if getattr(self.world, "endless", False):
+            self._read_pools()  # each episode may have a new task
         self._running &= ~mask
         mask = mask & self.active
         self._observations[mask, 0] = obs[mask]

@@ -256,7 +256,7 @@ def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
     counts = {}
     for suite_class in suite.split_classes("train"):
         listed = sum(task.of("train") for task in suite_class.tasks)
-        counts[suite_class.name] = listed or suite.tasks_per_class or 0
+        counts[suite_class.name] = listed or suite.drawn_tasks("train")
     return counts
 
 

@@ -206,7 +206,8 @@ def evaluate(
 
     Args:
         run: The run's folder.
-        split: ``train``, the tasks that it was trained on, or a meta suite's ``test`` tasks.
+        split: ``train``, the tasks that it was trained on (with ``tasks_per_class`` 0, tasks that training never
+            draws), or a meta suite's ``test`` tasks.
         checkpoint: ``last``, ``best`` or a file.
         random: Whether a random policy plays the same tasks.
         other_tasks: Whether the policy also plays as many tasks that no run was trained on.

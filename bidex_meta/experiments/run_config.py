@@ -33,7 +33,8 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     if config.suite is None and config.task is None:
         config = replace(config, **run_data.implied(datasets))
     _check_names(config)
-    source = Worlds.open({"suite": config.suite, "task": config.task, "object": config.object})
+    named = {name: vars(config)[name] for name in ("suite", "task", "object", "tasks_per_class")}
+    source = Worlds.open(named)
     kind = learner_kind(config.algo, source.class_name)
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
@@ -125,6 +126,11 @@ def _check_names(config: AnyConfig) -> None:
         raise BidexError(f"--base {config.base} goes with --task; a suite's file says whether bases move.")
     if config.object is not None and config.task is None:
         raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
+    if config.tasks_per_class is not None and config.suite is None:
+        raise BidexError(
+            f"--tasks-per-class {config.tasks_per_class} goes with --suite, got --task {config.task}. Name a suite of "
+            "the class, for example --suite MT1-Switch-v2."
+        )
 
 
 def _written(name: str | None) -> str | None:

@@ -177,6 +177,13 @@ class TaskClass(ABC):
         drawn = (*self.variation_space.names, *self.episode_space.names)
         self._order = [drawn.index(name) for name in self.wide_space.names]
 
+    def varied(self, shares: Tensor) -> Tensor:
+        """Return variations (n, variation_space.size) at shares in [0, 1), (n, at least this size), of the space."""
+        space = self.variation_space
+        low = constant(space.low, shares)
+        high = constant(space.high, shares)
+        return low + (high - low) * shares[:, : space.size]
+
     def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
         """Return ``freeze`` of tasks' variations (n, variation_space.size), completed by ``episode_space``.
 

@@ -99,7 +99,6 @@ class _Class:
 
     def __init__(self, world: World, part: Part, number: int, member: Member, ahead: int):
         task = world.slots[member.slot].task_class
-        self._tasks = len(world.slots[member.slot].tasks)
         self._ahead = ahead
         self._world = world
         self._part = part
@@ -129,7 +128,8 @@ class _Class:
     def _begin(self, row: int) -> Actions:
         """Play the script of an environment; nothing is read before its first action is requested."""
         place = self._member.env_ids.start + row
-        given = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
+        tasks = self._world.num_slot_tasks[self._member.slot]
+        given = (self._world.task_index[place : place + 1] + self._ahead) % tasks
         frozen = self._part.frozen(self._number, given)
         places = self._member.scene.sensors
         hands = HandController(self._task, lambda name: self._sensors[row, places[name]], lambda name: frozen[name][0])

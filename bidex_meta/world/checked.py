@@ -47,7 +47,7 @@ def seed(given: object) -> int:
 def choices(task_sampling: object, observation: object, points: object) -> None:
     """Raise BidexError for unknown names, and for points that are neither a ``PointsRule`` nor None."""
     for name, given, known in (
-        ("task_sampling", task_sampling, ("uniform", "fixed")),
+        ("task_sampling", task_sampling, ("uniform", "fixed", "fresh")),
         ("observation", observation, get_args(Rule)),
     ):
         if not isinstance(given, str) or given not in known:

@@ -180,6 +180,24 @@ class PooledWorld(TaskWorld, Protocol):
         ...
 
 
+class EndlessWorld(Protocol):
+    """A world whose suite has no fixed number of train tasks (``tasks_per_class = 0``).
+
+    In SAME_STEP and NEXT_STEP mode every episode draws a new task, until ``set_tasks`` gives others. In DISABLED mode
+    the pools stay, and a learner that plays trials gives each the tasks of another ``fresh_tasks``.
+    """
+
+    endless: bool
+    """True if training draws tasks without number. Worlds with a fixed number have False, or no such attribute."""
+
+    def fresh_tasks(self, number: int, count: int, /) -> dict[str, np.ndarray]:
+        """Return set ``number``, from 0 on, of ``count`` new tasks of each slot, for ``set_tasks``.
+
+        Numbers and the world's own seed decide the tasks. No pool of the suite has one of them.
+        """
+        ...
+
+
 class PrivilegedWorld(Protocol):
     """A world that can show what its observations hide: for teachers, and for learners that are taught in training.
 

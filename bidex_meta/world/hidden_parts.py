@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import indices
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.part import PartedWorld, judge
 
@@ -43,11 +44,13 @@ class HiddenParts:
     def values(self, world: PartedWorld) -> Tensor:
         """See ``PrivilegedWorld.hidden_values``."""
         values = torch.zeros(world.num_envs, world.hidden_size, device=world.device)
-        for slot, env_ids in zip(world.slots, world.slot_env_ids, strict=True):
-            columns = self.columns[slot.name]
-            middle, half = self._ranges[slot.name]
-            scaled = (torch.as_tensor(slot.tasks[:, columns]).to(world.device) - middle) / half
-            values[env_ids, : len(columns)] = scaled.float()[world.task_index[env_ids]]
+        for part in world.parts:
+            for member, tasks in zip(part.group.members, part.tasks, strict=True):
+                slot = world.slots[member.slot]
+                columns = self.columns[slot.name]
+                middle, half = self._ranges[slot.name]
+                scaled = (tasks[:, indices(columns, tasks)] - middle) / half
+                values[member.env_ids, : len(columns)] = scaled.float()[world.task_index[member.env_ids]]
         return values
 
     def rewards(self, world: PartedWorld, goals: Tensor) -> Tensor:
@@ -63,12 +66,12 @@ class HiddenParts:
         rewards = torch.zeros(given.shape[:2], device=world.device)
         for part in world.parts:
             sensors = part.group.engine.sensordata
-            for member in part.group.members:
+            for member, pool in zip(part.group.members, part.tasks, strict=True):
                 slot = world.slots[member.slot]
                 env_ids = member.env_ids
                 columns = self.columns[slot.name]
                 middle, half = self._ranges[slot.name]
-                tasks = torch.as_tensor(slot.tasks).to(sensors)[world.task_index[env_ids]].repeat(len(given), 1)
+                tasks = pool.to(sensors)[world.task_index[env_ids]].repeat(len(given), 1)
                 hidden = given[:, env_ids, : len(columns)].flatten(0, 1)
                 tasks[:, columns] = hidden.to(sensors) * half.to(sensors) + middle.to(sensors)
                 task = member.scene.task

@@ -106,13 +106,33 @@ class Part:
             mounts[member.engine_rows] = xyzw(mounts.new_tensor([task.right.quaternion, task.left.quaternion]))
         return mounts
 
-    def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
-        self._tasks = list[Tensor]()
+    def set_pools(self, slots: list[Slot]) -> None:
+        """Take the pools of tasks of the slots."""
+        self.tasks = list[Tensor]()
+        """Pool of each member, (n, size of its variations), float64."""
         self._pools = list[dict[str, Tensor]]()
         for member in self.group.members:
-            tasks = torch.as_tensor(slots[member.slot].tasks).to(self._engine.sensordata)
-            self._tasks.append(tasks)
-            self._pools.append(member.scene.task.frozen(tasks))
+            tasks = torch.tensor(slots[member.slot].tasks, device=self._engine.device)
+            frozen = member.scene.task.frozen(tasks.to(self._engine.sensordata))
+            self.tasks.append(tasks)
+            # Copies, because some values are views of others, and ``renew`` writes into them.
+            pool = {}
+            for name, value in frozen.items():
+                pool[name] = value.clone(memory_format=torch.contiguous_format)
+            self._pools.append(pool)
+
+    def renew(self, mask: Tensor, shares: Tensor) -> None:
+        """Give the environments of a mask (num,) new tasks; environment j of a member plays entry j of its pool.
+
+        ``shares`` in [0, 1), (num, at least the size of each variation), say where in their spaces the tasks lie. Pools
+        are rewritten in place, and for all environments, because recorded graphs read them and fix all shapes.
+        """
+        for member, tasks, pool in zip(self.group.members, self.tasks, self._pools, strict=True):
+            task = member.scene.task
+            rows = member.engine_rows
+            tasks.copy_(torch.where(mask[rows, None], task.varied(shares[rows]), tasks))
+            for name, values in task.frozen(tasks.to(self._engine.sensordata)).items():
+                pool[name].copy_(values)
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
         """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
@@ -230,11 +250,12 @@ class Part:
             checked.own_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
             checked.own_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
 
-    def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
+    def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor, shares: Tensor | None = None) -> Tensor:
         """Return start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
         ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
-        numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,).
+        numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,). ``shares``: those of new tasks as in
+        ``renew``, (n, ...), in place of tasks of the pools; None: the tasks of the pools.
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         if rows is None:
@@ -247,8 +268,10 @@ class Part:
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
             own = draws[where, : task.draws]
-            if task.episode_space.size:
-                frozen = task.frozen(self._tasks[i][task_index[where]], own)
+            if shares is not None:
+                frozen = task.frozen(task.varied(shares[where]).to(qpos), own)
+            elif task.episode_space.size:
+                frozen = task.frozen(self.tasks[i][task_index[where]].to(qpos), own)
             else:
                 frozen = self.frozen(i, task_index[where])
             task.begin(own, frozen, views)

@@ -6,6 +6,7 @@ tenth of a step's time.
 """
 
 from functools import partial
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -27,7 +28,13 @@ class Starts:
     """The coming episodes of every environment: their tasks, elapsed shares and positions."""
 
     def __init__(
-        self, parts: list[Part], keys: Tensor, start_draws: int, pool_size: Tensor | None, together: Together
+        self,
+        parts: list[Part],
+        keys: Tensor,
+        start_draws: int,
+        pool_size: Tensor | None,
+        together: Together,
+        task_keys: Tensor | None = None,
     ) -> None:
         """Make room for the draws.
 
@@ -38,6 +45,7 @@ class Starts:
             pool_size: Tasks in the pool of each environment's slot, (n,), if episodes draw them; None if environments
                 keep their tasks.
             together: Does a job for each part.
+            task_keys: Random keys of new tasks, (n, 2), if every episode has one; None: tasks are of the pools.
         """
         self._together = together
         self._parts = parts
@@ -52,6 +60,9 @@ class Starts:
         self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64, device=device)
         shapes = [(part.group.engine.num, _AHEAD, part.start_size) for part in parts]
         self._qpos = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
+        self._task_keys = task_keys
+        pools = chain.from_iterable(part.tasks for part in parts)
+        self._task_size = max(tasks.shape[1] for tasks in pools)
         self._masked = parts[0].group.engine.masked
         self._takes = 0
 
@@ -68,7 +79,7 @@ class Starts:
             self._draw((used >= _AHEAD // 2).nonzero().squeeze(1), number, task_index)
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return the starts of the environments in ``mask``, bool (n,), after ``prepare``.
+        """Return the starts of the environments in ``mask``, bool (n,), after ``prepare``; write new tasks into pools.
 
         ``number``: of the episode that begins, or would begin next, of every environment, (n,); ``task_index``: task
         that an environment keeps if none is drawn. Returns task and elapsed share in [0, 1) of every environment, (n,),
@@ -76,6 +87,7 @@ class Starts:
         masked; all valid where the mask is true.
         """
         place = (number - self._first).clamp(max=_AHEAD - 1)[:, None]
+        shares = self._new_tasks(slice(None), number)
         starts = []
         for part, qpos in zip(self._parts, self._qpos, strict=True):
             at = part.group.take(place)
@@ -84,6 +96,8 @@ class Starts:
                 starts.append(qpos.gather(1, at[:, :, None].expand(-1, 1, qpos.shape[2]))[:, 0])
             else:
                 starts.append(qpos[rows, at[rows, 0]])
+            if shares is not None:
+                part.renew(part.group.take(mask), part.group.take(shares))
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
     def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
@@ -91,13 +105,15 @@ class Starts:
         self._first[env_ids] = number[env_ids]
         many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
+        shares = self._new_tasks(many, number[many] + ahead)
         self._task_index[env_ids] = tasks.view(-1, _AHEAD)
         self._elapsed_share[env_ids] = share.view(-1, _AHEAD)
         for part, qpos in zip(self._parts, self._qpos, strict=True):
             engine_row = part.engine_rows[many]
             own = engine_row >= 0
             if own.any():
-                start = part.starts(engine_row[own], signed[own], tasks[own])
+                own_shares = None if shares is None else shares[own]
+                start = part.starts(engine_row[own], signed[own], tasks[own], own_shares)
                 qpos[engine_row[own], ahead[own]] = start.to(qpos.dtype)
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
@@ -105,13 +121,16 @@ class Starts:
         self._first.copy_(number)
         many, ahead = _repeated(torch.arange(len(number), device=number.device))
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
+        shares = self._new_tasks(many, number[many] + ahead)
         self._task_index.copy_(tasks.view(-1, _AHEAD))
         self._elapsed_share.copy_(share.view(-1, _AHEAD))
 
         def place(part: Part, qpos: Tensor) -> None:
-            own = part.group.take(signed.unflatten(0, (-1, _AHEAD))).flatten(0, 1)
-            own_tasks = part.group.take(tasks.unflatten(0, (-1, _AHEAD))).flatten(0, 1)
-            qpos.copy_(part.starts(None, own, own_tasks).view(qpos.shape))
+            def own(values: Tensor) -> Tensor:
+                return part.group.take(values.unflatten(0, (-1, _AHEAD))).flatten(0, 1)
+
+            own_shares = None if shares is None else own(shares)
+            qpos.copy_(part.starts(None, own(signed), own(tasks), own_shares).view(qpos.shape))
 
         self._together([partial(place, part, qpos) for part, qpos in zip(self._parts, self._qpos, strict=True)])
 
@@ -122,6 +141,12 @@ class Starts:
         if self._pool_size is not None:
             tasks = (draws[:, _TASK_DRAW] * self._pool_size[env_ids]).long()
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
+
+    def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
+        """Return where in their spaces the new tasks of episodes (k,) lie, in [0, 1), (k, size); None: none are new."""
+        if self._task_keys is None:
+            return None
+        return uniform(self._task_keys[env_ids], episode, self._task_size)
 
 
 def _repeated(env_ids: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated
@@ -33,6 +33,7 @@ from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool
 from bidex_meta.world.hidden_parts import HiddenParts
 from bidex_meta.world.observations import Rule, observation_groups
 from bidex_meta.world.part import Part, base_rotations, collect
+from bidex_meta.world.random import env_keys, uniform
 from bidex_meta.world.randomiser import Randomiser, deviations
 from bidex_meta.world.rendering import MOST_PIXELS, Painter
 from bidex_meta.world.starts import Starts
@@ -58,7 +59,8 @@ class WorldConfig:
             member or its name.
         observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
         pad_to: Observation entries before the task id; None: those of the widest class.
-        task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n.
+        task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n; "fresh": each
+            episode draws a new task of its class's space, in DISABLED mode as "fixed" (see ``EndlessWorld``).
         threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.
         stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that they do not end together,
             and do not count in ``episode``. False: they begin at 0.
@@ -128,6 +130,12 @@ class World(BatchedWorld):
             num_tasks=[len(slot.tasks) for slot in self.slots],
         )
         super().__init__(table, num_envs, device, config.autoreset_mode, config.stagger, config.seed)
+        self.endless = config.task_sampling == "fresh"
+        self._renews_tasks = self.endless and self.autoreset_mode != AutoresetMode.DISABLED
+        if self._renews_tasks:
+            # Entry j of a pool is of environment j; the start of each episode replaces it.
+            self.slots = [_with_entries(*each) for each in zip(self.slots, self.slot_env_ids, strict=True)]
+            self._set_pool_sizes([len(slot.tasks) for slot in self.slots])
         self.metadata |= {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}
         self.render_mode = "rgb_array"
         self.success_at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
@@ -208,13 +216,32 @@ class World(BatchedWorld):
             pool_size = self._pool_size
         else:
             pool_size = None
-        self._starts = Starts(self.parts, self._keys, draws, pool_size, self._side_by_side.run)
+        task_keys = None
+        if self._renews_tasks:
+            task_keys = self._random_keys(", tasks")
+        self._starts = Starts(self.parts, self._keys, draws, pool_size, self._side_by_side.run, task_keys)
         self._stepper.forget()  # recordings hold the old starts and pools
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        """Replace the pools of tasks of some slots, from the next full reset on; see ``PooledWorld``."""
-        self._set_pools(with_pools(self.slots, pools))
+        """Replace the pools of tasks of some slots, from the next full reset on; see ``PooledWorld``.
+
+        Episodes draw no new tasks from then on.
+        """
+        current = [replace(slot, tasks=tasks) for slot, tasks in zip(self.slots, self.pools, strict=True)]
+        self._set_pools(with_pools(current, pools))
+        self._renews_tasks = False
         self._renew_draws()
+
+    def fresh_tasks(self, number: int, count: int) -> dict[str, np.ndarray]:
+        """Return ``count`` new tasks of each slot; see ``EndlessWorld``."""
+        cpu = torch.device("cpu")
+        episode = torch.full((count,), whole_number("number", number, 0))
+        pools = {}
+        for slot in self.slots:
+            keys = env_keys(self._config.seed, f"{slot.name}, trials", count, cpu)
+            space = slot.task_class.variation_space
+            pools[slot.name] = slot.task_class.varied(uniform(keys, episode, space.size)).numpy()
+        return pools
 
     def _set_pools(self, slots: list[Slot]) -> None:
         self.slots = slots
@@ -351,7 +378,9 @@ class World(BatchedWorld):
         if self._past.numel():
             state["past"] = self._past.clone()
         state["slots"] = list(self.task_names)
-        state["tasks"] = [torch.tensor(slot.tasks) for slot in self.slots]
+        state["tasks"] = [torch.from_numpy(pool) for pool in self.pools]
+        if self.endless:
+            state["renews_tasks"] = self._renews_tasks
         state["action"] = self._action.clone()
         state["engines"] = [part.group.engine.state_dict() for part in self.parts]
         return state
@@ -359,6 +388,8 @@ class World(BatchedWorld):
     def _made(self) -> dict[str, str]:
         made = super()._made()
         made |= {"observation": self._config.observation, "points": str(self.points)}
+        if self.endless:
+            made["tasks"] = "without number"
         drawn = vars(self._config.randomisation or Randomisation())
         made |= {f"randomised {name}": str(value) for name, value in drawn.items() if value != _NOTHING[name]}
         for slot in self.slots:
@@ -372,6 +403,8 @@ class World(BatchedWorld):
     def load_state_dict(self, state: State) -> None:
         """Restore a ``state_dict``; raises BidexError for the state of a world that was made differently."""
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
+        # A world that evaluates may finish the episodes of one that trains.
+        self._renews_tasks = state.get("renews_tasks", False) and self.autoreset_mode != AutoresetMode.DISABLED
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)
         if self._past.numel():
@@ -398,7 +431,11 @@ class World(BatchedWorld):
     @property
     def pools(self) -> list[np.ndarray]:
         """Return the tasks of each slot, each (n, size of its variation)."""
-        return [slot.tasks.copy() for slot in self.slots]
+        pools = {}
+        for part in self.parts:
+            for member, tasks in zip(part.group.members, part.tasks, strict=True):
+                pools[member.slot] = tasks.cpu().numpy().copy()
+        return [pools[slot] for slot in range(self.num_tasks)]
 
     @property
     def hidden_size(self) -> int:
@@ -431,6 +468,11 @@ class World(BatchedWorld):
     def close_extras(self, **kwargs: object) -> None:
         """Free the renderers."""
         self._painter.close()
+
+
+def _with_entries(slot: Slot, env_ids: slice) -> Slot:
+    """Return the slot with as many tasks in its pool as it has environments."""
+    return replace(slot, tasks=slot.tasks[np.arange(env_ids.stop - env_ids.start) % len(slot.tasks)])
 
 
 def _option(value: float | str) -> str:

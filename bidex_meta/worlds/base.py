@@ -46,6 +46,7 @@ class WorldsConfig:
     base: Base = "own"
     points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
     object: str | None = None
+    tasks_per_class: int | None = None  # train tasks per class of a suite; 0: a new one in each episode or trial
     seed: int = 0  # of starts, and of tasks without ``task_seed``
     task_seed: int | None = None  # of tasks and starts instead
     device: str = "cpu"

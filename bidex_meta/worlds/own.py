@@ -24,11 +24,9 @@ class OwnSuite(Worlds):
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
-        suite = load_suite(name)
+        self.suite = load_suite(name).with_train_tasks(config.tasks_per_class)
         if self.points:
-            self.suite = replace(suite, points=self.points)
-        else:
-            self.suite = suite
+            self.suite = replace(self.suite, points=self.points)
         if self.suite.rules.success == "at-end":
             self.preset = V2_PRESET
         self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
@@ -51,8 +49,8 @@ class OwnSuite(Worlds):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the names that the file lists, else numbers; see ``Worlds``."""
-        drawn = list(map(str, range(self.suite.tasks_per_class or 0)))
         of_split = cast(Split, split)
+        drawn = list(map(str, range(self.suite.drawn_tasks(of_split))))
         classes = self.suite.split_classes(of_split)
         pools = {c.name: [task.name for task in c.tasks if task.of(of_split)] or [*drawn] for c in classes}
         if self.suite.task_id == "class":

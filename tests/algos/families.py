@@ -85,6 +85,15 @@ class PointGoals(FakePools):
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 
+class EndlessGoals(PointGoals):
+    """Point goals without number: set ``number`` lies on a circle that begins at an angle of ``number`` radians."""
+
+    endless = True
+
+    def fresh_tasks(self, number: int, count: int) -> dict[str, np.ndarray]:
+        return {name: circle(count, first=float(number), radius=1.0 + i) for i, name in enumerate(self.task_names)}
+
+
 def everyone(world: Any) -> Tensor:
     return torch.ones(world.num_envs, dtype=torch.bool)
 

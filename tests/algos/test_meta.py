@@ -18,7 +18,8 @@ from bidex_algos.meta.stage import Stage, TaskRows, features, fitted, task_batch
 from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 from bidex_algos.trust_region import flatten, write
 from bidex_meta.errors import BidexError
-from tests.algos.families import PointClass, PointGoals, circle, played, shot
+from tests.algos.families import EndlessGoals, PointClass, PointGoals, circle, played, shot
+from tests.algos.ranks import resumed
 
 SHARED: dict[str, Any] = {
     "hidden": (32, 32), "init_std": 0.5, "gamma": 0.99, "tasks_per_class": 8, "normalise_observations": False
@@ -199,6 +200,26 @@ def test_a_meta_batch_draws_tasks_without_repetition_and_splits_rows_over_them()
         seen |= {tuple(np.round(goal, 6)) for goal in world.pools[0]}
     assert len(seen) > 4
     assert [len(pool) for pool in learner.pools] == [8, 3]
+
+
+@pytest.mark.parametrize("slice_steps", [None, 2])
+def test_each_meta_batch_has_new_tasks_where_they_are_without_number(slice_steps: int | None):
+    config = replace(PROMP, tasks_per_class=9, slice_steps=slice_steps, hidden=(8,))
+    mode = ProMP.autoreset_mode(config)
+
+    def learner_of(seed: int) -> ProMP:
+        world = EndlessGoals(rows=18, classes=(PointClass(steps=6),), autoreset_mode=mode)  # its pool has 8 tasks
+        return ProMP(world, config, seed)
+
+    learner = learner_of(0)
+    seen = set()
+    for _ in range(8):
+        learner.iterate()
+        (pool,) = learner.world.pools
+        assert len(pool) == 9 and torch.bincount(learner.rows.task_of_row).tolist() == [2] * 9
+        seen.add(pool.tobytes())
+    assert len(seen) == 8 if slice_steps is None else 1 < len(seen) < 8
+    resumed(learner_of, iterations=1)
 
 
 def test_before_any_data_an_adapting_policy_is_the_meta_policy_and_init_goes_back_to_it():

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from bidex_algos.meta.latent_agent import LatentAgent
 from bidex_algos.meta.pearl import PEARL, PEARLConfig
 from bidex_meta.errors import BidexError
-from tests.algos.families import PointClass, PointGoals, Slopes, everyone, played, shot
+from tests.algos.families import EndlessGoals, PointClass, PointGoals, Slopes, everyone, played, shot
 
 SMALL = PEARLConfig(
     hidden=(32, 32), encoder=(32, 32), latent=2, context=20, batch_size=256, replay_steps=300, cut_share=0.2,
@@ -47,6 +47,13 @@ def test_one_episode_tells_what_is_paid() -> None:
 
 def learner_on(classes: Any = UNEVEN, rows: int = 7, config: PEARLConfig = TINY) -> PEARL:
     return PEARL(PointGoals(rows, classes=classes, autoreset_mode="SAME_STEP"), config, seed=0)
+
+
+def test_tasks_without_number_are_refused() -> None:
+    with pytest.raises(
+        BidexError, match=r"pearl: expected a fixed number of train tasks, .* Use --tasks-per-class 100"
+    ):
+        PEARL(EndlessGoals(8, autoreset_mode="SAME_STEP"), TINY, seed=0)
 
 
 def test_the_posterior_is_made_of_the_episodes_of_a_trial() -> None:

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -10,8 +11,8 @@ from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
-from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
-from tests.algos.ranks import same
+from tests.algos.families import EndlessGoals, PointClass, PointGoals, circle, everyone, played, shot
+from tests.algos.ranks import resumed, same
 
 SMALL = RL2Config(
     hidden=(32,), activation="tanh", memory=32, init_std=0.6, episodes_per_trial=2, gamma=0.9, chunk=20,
@@ -50,6 +51,17 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
     assert evaluated(agent, test) == pytest.approx(after, abs=0.3)
     agent.init()
     assert evaluated(agent, test) == pytest.approx(before, abs=0.3)
+
+
+def test_each_trial_has_new_tasks_where_they_are_without_number():
+    world = EndlessGoals(7, classes=UNEVEN)
+    learner = RL2(world, TINY, seed=0)
+    for trial in range(3):
+        learner.iterate()
+        for pool, radius in zip(world.pools, (1.0, 2.0), strict=True):
+            np.testing.assert_array_equal(pool, circle(4, first=trial, radius=radius))
+        assert world.task_index.tolist() == [0, 1, 2, 3, 0, 1, 2]
+    resumed(lambda seed: RL2(EndlessGoals(7, classes=UNEVEN), TINY, seed))
 
 
 def test_rows_of_different_length_are_recorded_without_gaps():

@@ -135,6 +135,10 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("witness --find", "Unknown flag --find"),
         ("run --task HandOver --points -1", "--points: "),
         ("run --suite MT4 --points 99999", "16384"),
+        ("run --suite MT4 --tasks-per-class -1", "--tasks-per-class: expected a whole number >= 0, got -1."),
+        ("run --suite ML1-Switch-choice2 --tasks-per-class 0", "got 0 with the listed tasks of Switch. Leave"),
+        ("run --suite metaworld/MT3 --tasks-per-class 0", "got metaworld/MT3. Leave --tasks-per-class out."),
+        ("run --task Switch-v2 --tasks-per-class 0", "got --task Switch-v2. Name a suite of the class"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, expected, capsys, tmp_path, monkeypatch):

@@ -131,7 +131,9 @@ MAKING: Arguments = {
 }  # fmt: skip
 ENVS: Arguments = {"seed": (0, SEED + " None")}
 CALLS: dict[str, Callable[[Shop], Call]] = {
-    "Benchmark": lambda s: (Benchmark, {"name_or_path": ("MT4", ""), "seed": (0, SEED)}),
+    "Benchmark": lambda s: (Benchmark, {
+        "name_or_path": ("MT4", ""), "seed": (0, SEED), "tasks_per_class": (None, "None zero one"),
+    }),
     "make_world": lambda s: (made(s.benchmark.make_world), {
         "split": ("train", ""), **MAKING, "seed": (0, SEED + " None"), "randomisation": (None, "None true"),
     }),

@@ -1,5 +1,6 @@
 """Scripts that control the hands: geometry that needs no long play, and classes that they solve."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +17,7 @@ from bidex_meta.witness.controller import GAIN, Actions, HandController, point
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS, Script, script_of
+from tests.tasks.worlds import world_of
 
 
 def test_a_class_without_a_script_is_refused() -> None:
@@ -23,6 +25,20 @@ def test_a_class_without_a_script_is_refused() -> None:
         script_of(HandOver(moving_base=True))
     with pytest.raises(BidexError, match="fixed"):
         script_of(HandOver(moving_base=False))
+
+
+def test_a_script_plays_its_task_in_a_pool_that_grew(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of("Switch-v2", True, 3, tasks=2)
+    scripts = Scripted(world)
+    world.set_tasks({world.task_names[0]: np.repeat(world.pools[0][:1], 3, axis=0)})
+    obs, _ = world.reset()
+    read: list[int] = []
+    (part,) = world.parts
+    frozen = part.frozen
+    monkeypatch.setattr(part, "frozen", lambda number, index: read.append(int(index)) or frozen(number, index))
+    scripts.reset(torch.ones(3, dtype=torch.bool))
+    scripts.eval_action(obs)
+    assert read == [0, 1, 2]
 
 
 def test_a_script_is_led_by_each_rows_state(monkeypatch: pytest.MonkeyPatch) -> None:

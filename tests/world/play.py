@@ -18,8 +18,11 @@ CLASSES = [*THROWN, "DoorCloseInward", "BottleCap"]
 ENDS = ("episode", "_episode", "final_info", "_final_info")
 
 
-def suite_world(name: str, rows: int, mode: str = "SAME_STEP", split: str = "train", seed: int = 0, threads: int = 1):
-    return Benchmark(name).make_world(
+def suite_world(
+    name: str, rows: int, mode: str = "SAME_STEP", split: str = "train", seed: int = 0, threads: int = 1,
+    tasks_per_class: int | None = None,
+):  # fmt: skip
+    return Benchmark(name, tasks_per_class=tasks_per_class).make_world(
         split, num_envs=rows, device="cpu", seed=seed, autoreset_mode=mode, threads=threads
     )
 

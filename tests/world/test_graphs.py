@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -79,12 +80,12 @@ def taped(
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], tuple[World, list[int]]]]:
-    def make(suite: str, rows: int) -> tuple[World, list[int]]:
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., tuple[World, list[int]]]]:
+    def make(suite: str, rows: int, tasks: int | None = None) -> tuple[World, list[int]]:
         with monkeypatch.context() as patch:
             maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
             patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
-            made = suite_world(suite, rows)
+            made = suite_world(suite, rows, tasks_per_class=tasks)
         holder: list[CapturedStepper] = []
         count: list[int] = []
         made._stepper = CapturedStepper(made._state, made._put_state, taped(holder, count))
@@ -94,9 +95,12 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], t
     yield make
 
 
-@pytest.mark.parametrize("suite", ["MT4", "ML4"])
-def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tuple[World, list[int]]]) -> None:
-    plain, (taped_world, count) = suite_world(suite, 9), recorded(suite, 9)
+@pytest.mark.parametrize(("suite", "tasks"), [("MT4", None), ("ML4", None), ("MT4-v2", 0)])
+def test_replayed_steps_are_plain_steps(
+    suite: str, tasks: int | None, recorded: Callable[..., tuple[World, list[int]]]
+) -> None:
+    plain = suite_world(suite, 9, tasks_per_class=tasks)
+    taped_world, count = recorded(suite, 9, tasks)
     actions = random_actions(plain, 75)
     actions[40, 3] = torch.nan
     for one in (plain, taped_world):
@@ -104,6 +108,7 @@ def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tupl
     a, b = play(plain, actions), play(taped_world, actions)
     assert_same(a, b)
     assert number_of_ends(a) >= 9 and a[40]["info/unstable"][3]
+    assert all(np.array_equal(*pools) for pools in zip(plain.pools, taped_world.pools, strict=True))
     assert len(count) == 5  # controls, transitions, starts drawn ahead and taken, first observations
 
 

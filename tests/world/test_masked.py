@@ -87,11 +87,11 @@ def masked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
-def test_masked_resets_give_the_same_episodes(mode: str, request: pytest.FixtureRequest) -> None:
-    one = suite_world("MT4", 9, mode)
+@pytest.mark.parametrize(("mode", "tasks"), [("SAME_STEP", None), ("DISABLED", None), ("SAME_STEP", 0)])
+def test_masked_resets_give_the_same_episodes(mode: str, tasks: int | None, request: pytest.FixtureRequest) -> None:
+    one = suite_world("MT4", 9, mode, tasks_per_class=tasks)
     request.getfixturevalue("masked")
-    other = suite_world("MT4", 9, mode)
+    other = suite_world("MT4", 9, mode, tasks_per_class=tasks)
     assert_same([{"obs": one.reset(seed=3)[0]}], [{"obs": other.reset(seed=3)[0]}])
     actions = random_actions(one, 80)
     a, b = play(one, actions), play(other, actions)
@@ -103,9 +103,11 @@ def test_masked_resets_give_the_same_episodes(mode: str, request: pytest.Fixture
         assert_same(play(one, actions[:5]), play(other, actions[:5]))
 
 
-@pytest.mark.parametrize("name", ["MT4", "ML4", "MT20"])
-def test_no_step_of_a_suite_looks_at_a_number(name: str, masked: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_steps_look_at_nothing(suite_world(name, 20), monkeypatch)
+@pytest.mark.parametrize(("name", "tasks"), [("MT4", None), ("ML4", None), ("MT20", None), ("MT20-v2", 0)])
+def test_no_step_of_a_suite_looks_at_a_number(
+    name: str, tasks: int | None, masked: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert_steps_look_at_nothing(suite_world(name, 20, tasks_per_class=tasks), monkeypatch)
 
 
 def assert_steps_look_at_nothing(rows: World, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """A world on mujoco_warp (Warp's CPU device) against one on C MuJoCo; its contract: tests/test_contract.py."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -16,9 +17,9 @@ CLASSES = ("CatchUnderarm", "BottleCap-v2")
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
 
-def make(engine: str) -> World:
+def make(engine: str, task_sampling: str = "uniform") -> World:
     slots = [slot(registry.get(name)) for name in CLASSES]
-    return World(slots, WorldConfig(ROWS, engine=engine, observation="one-hot", task_sampling="uniform", threads=1))
+    return World(slots, WorldConfig(ROWS, engine=engine, observation="one-hot", task_sampling=task_sampling, threads=1))
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,20 @@ def test_a_seed_means_the_same_starts_and_tasks_as_on_c(world: World, reference:
         assert close(obs, expected) and torch.equal(world.task_index, reference.task_index)
         assert torch.equal(world.episodes.elapsed, reference.episodes.elapsed)
     assert not close(world.reset(seed=4)[0], world.reset(seed=5)[0], 1e-3)
+
+
+def test_new_tasks_are_the_same_as_on_c() -> None:
+    worlds = [make(engine, "fresh") for engine in ("warp", "c")]
+    before = np.zeros(0)
+    for _ in range(3):
+        (obs, _), (expected, _) = (world.reset() for world in worlds)
+        assert close(obs, expected)
+        pools = [world.pools for world in worlds]
+        assert all((one == other).all() for one, other in zip(*pools, strict=True))
+        for world in worlds:
+            world.step(torch.zeros(world.action_space.shape))
+        assert not np.isin(pools[0][1], before).any()
+        before = pools[0][1]
 
 
 def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -> None:

@@ -6,8 +6,9 @@ parameters take an inner step.
 """
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -166,9 +167,13 @@ class MetaLearner(Learner):
         self.steps_with_tasks = 0
         # The tasks to draw from; the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
+        self.endless = getattr(world, "endless", False)
         counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         for name, count, pool in zip(world.task_names, counts, self.pools, strict=True):
-            if count < (tasks := min(config.tasks_per_class, len(pool))):
+            tasks = config.tasks_per_class
+            if not self.endless:
+                tasks = min(tasks, len(pool))
+            if count < tasks:
                 raise BidexError(
                     f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
                     f"at least {tasks * world.num_tasks}, or lower tasks_per_class."
@@ -230,16 +235,25 @@ class MetaLearner(Learner):
         return reported
 
     def _draw_tasks(self) -> None:
-        chosen = {}
-        for name, pool in zip(self.world.task_names, self.pools, strict=True):
-            order = torch.randperm(len(pool), generator=self.tasks_generator)[: self.config.tasks_per_class]
-            chosen[name] = pool[order.numpy()]
+        chosen = self._chosen_tasks()
         self.world.set_tasks(chosen)
         sizes = torch.tensor([len(tasks) for tasks in chosen.values()], device=self.device)
         first = sizes.cumsum(0) - sizes
         self.rows = TaskRows(first[self.world.task_id] + self.world.task_index)
         self.obs = None
         self.steps_with_tasks = 0
+
+    def _chosen_tasks(self) -> dict[str, np.ndarray]:
+        """Return the tasks of the next meta-batch by class, each (tasks_per_class or fewer, size of a variation)."""
+        count = self.config.tasks_per_class
+        if self.endless:
+            world: Any = self.world  # an EndlessWorld
+            return world.fresh_tasks(int(torch.randint(2**31, (), generator=self.tasks_generator)), count)
+        chosen = {}
+        for name, pool in zip(self.world.task_names, self.pools, strict=True):
+            order = torch.randperm(len(pool), generator=self.tasks_generator)[:count]
+            chosen[name] = pool[order.numpy()]
+        return chosen
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:

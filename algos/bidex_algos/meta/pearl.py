@@ -203,7 +203,15 @@ class PEARL(MTSAC):
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Return the environments' task numbers over all classes, (N,); a BidexError if no environment plays some task."""
+    """Return the environments' task numbers over all classes, (N,); a BidexError if no environment plays some task.
+
+    New tasks in each episode are refused too.
+    """
+    if getattr(world, "endless", False):
+        raise BidexError(
+            "pearl: expected a fixed number of train tasks, because it replays transitions by task, got "
+            "tasks_per_class 0. Use --tasks-per-class 100, say, with as many environments per class."
+        )
     for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
         if rows.stop - rows.start < tasks:
             raise BidexError(

@@ -49,6 +49,8 @@ class TrialLearner(Learner):
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         each = zip(world.task_names, world.pools, rows, strict=True)
         self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}
+        self.most_rows = max(rows)
+        self.endless = getattr(world, "endless", False)
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
@@ -68,8 +70,11 @@ class TrialLearner(Learner):
             play(self.world, self.policy, player, trials, obs, blind_share, self.generator, counts)
 
     def _begin(self) -> Tensor:
-        if self.pools:
-            trial = self.trials_played * world_size() + rank()
+        trial = self.trials_played * world_size() + rank()
+        if self.endless:
+            world: Any = self.world  # an EndlessWorld
+            world.set_tasks(world.fresh_tasks(trial, self.most_rows))
+        elif self.pools:
             # The pool rotates, so all tasks of a class are played equally often.
             turned = {name: pool.roll(-trial * rows, 0).numpy() for name, (pool, rows) in self.pools.items()}
             self.world.set_tasks(turned)
