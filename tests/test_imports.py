@@ -36,12 +36,6 @@ ORDER = (
 
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
 
-MUTUAL = {
-    ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
-    ("bidex_meta.worlds.base", "bidex_meta.worlds.external"),
-}
-"""Modules that import each other all the same."""
-
 TWICE = {"base", "config", "learner", "replay", "starts"}
 """Names of several modules. ``base`` is a package's own, ``learner`` contract and base; the others are older."""
 
@@ -109,9 +103,6 @@ def test_packages_do_not_know_the_tools() -> None:
 
 def test_no_module_imports_itself_through_others() -> None:
     graph = {name: set(imported(tree)) - {name} for name, tree in modules().items()}
-    for one, other in MUTUAL:
-        assert other in graph[one] and one in graph[other], f"{one} and {other} no longer are: take them out of MUTUAL"
-        graph[one].discard(other)
     while free := {name for name, needed in graph.items() if not needed & graph.keys()}:
         graph = {name: needed for name, needed in graph.items() if name not in free}
     assert not graph, f"a cycle among {sorted(graph)}"

@@ -22,7 +22,7 @@ from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world.world import World
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 _POLICIES = {
     "random": "uniform actions",
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> None:
     if flags.out is not None:
         references.load_from(flags.out)
         check_writable(flags.out)
-    worlds = Worlds.open(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
+    worlds = open_worlds(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
     if not worlds.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
     if what == "script":

@@ -12,7 +12,7 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
 from bidex_meta.experiments.control_runs import control_runs
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config()
-    worlds = Worlds.open(config.to_json())
+    worlds = open_worlds(config.to_json())
     played = control_runs(
         folders,
         shots=flags.shots,

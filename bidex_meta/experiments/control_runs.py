@@ -16,7 +16,7 @@ from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 
 def control_runs(
@@ -42,9 +42,9 @@ def control_runs(
     results = []
     for folder in folders:
         stored = folder.config()
-        here = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
+        here = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
         config = replace(stored, device=here, engine=engine)
-        worlds = Worlds.open(config.to_json())
+        worlds = open_worlds(config.to_json())
         set_up_torch(config.threads)
         counts = [len(pool) for pool in worlds.tasks("test").values()]
         of_shot = metatest.rollouts_of(worlds, config, rollouts, max(1, num_envs // len(counts)))
@@ -72,7 +72,7 @@ def _check(folders: Sequence[RunFolder]) -> None:
         config = folder.config()
         if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
-        metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
+        metatest.check_worlds(open_worlds(config.to_json()), config.algo)
         if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
             raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
         if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:

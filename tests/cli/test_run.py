@@ -12,7 +12,7 @@ import pytest
 
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.runs import RunFolder, read_metrics
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.algos.ranks import same
 from tests.pages import ROOT
 
@@ -427,7 +427,7 @@ def test_a_stopped_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
 def test_a_single_task_can_be_played_with_moving_bases_as_in_suites(shown, refused):
     for flags, actions in (([], 40), (["--base", "moving"], 52), (["--base", "fixed"], 40)):
         config = json.loads(shown("run", "--task", "HandOver", "--algo", "ppo", "--print-config", *flags))
-        source = Worlds.open(config | {"threads": 1})
+        source = open_worlds(config | {"threads": 1})
         world = source.world()
         assert source.moving_bases == (actions == 52) and world.single_action_space.shape == (actions,)
         world.close()

@@ -36,7 +36,7 @@ from bidex_meta.experiments.transfer_plan import (
 )
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import WorldsConfig, open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import toy
 from tests.data.worlds import ABOUT
@@ -64,7 +64,7 @@ classes = [
 
 
 def opened(suite: str | Path, seed: int = 0) -> Any:
-    return Worlds.open(WorldsConfig(suite=str(suite), seed=seed, threads=1))
+    return open_worlds(WorldsConfig(suite=str(suite), seed=seed, threads=1))
 
 
 @pytest.fixture
