@@ -41,6 +41,13 @@ class Options:
     class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
     seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
 
+    def refuse_adaptation(self, algo: str) -> None:
+        """Raise BidexError if an option is given that concerns adaptation alone."""
+        for name in ("shots", "rollouts", "tasks", "trials"):
+            number = getattr(self, name)
+            if number is not None:
+                raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
+
 
 def meta_test(
     worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str]
