@@ -274,7 +274,7 @@ def test_what_a_run_publishes_holds_no_path_of_this_machine(toy_worlds, tmp_path
     assert len(texts) == 5 and not any(str(tmp_path).encode() in text for text in texts)
 
 
-@pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac"])
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac"])
 def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # narrower tables leave columns out
     path = tmp_path / "r"
