@@ -16,7 +16,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c co
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
+.PHONY: help run results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint style types tests format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -38,7 +38,11 @@ help:
 run: .venv/.installed
 	$(BIN)/bidex-meta run $(RUN_FLAGS) --minutes $(MINUTES) --episodes 1
 
-test: lint
+# pyright needs one core for a minute, so it runs beside the tests.
+test: style
+	@$(MAKE) --no-print-directory -j 2 types tests
+
+tests: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 test-all: lint
@@ -90,9 +94,13 @@ collect experts gallery: .venv/.installed-dev
 witness: .venv/.installed
 	$(BIN)/python -m tools.witness_search $(ARGS)
 
-lint: .venv/.installed-dev
+lint: style types
+
+style: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
+
+types: .venv/.installed-dev
 	$(BIN)/pyright
 
 format: .venv/.installed-dev

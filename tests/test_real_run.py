@@ -36,13 +36,6 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "algos")))}
 
 
-def command(*arguments: object, cwd: Path) -> str:
-    line = [sys.executable, "-m", "bidex_meta.cli", *map(str, arguments)]
-    done = subprocess.run(line, env=environment(), cwd=cwd, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def final(path: Path) -> tuple[State, int]:
     loaded = RunFolder.open(path).checkpoints.load()
     assert loaded is not None
@@ -84,14 +77,17 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     stopped = final(path)[1]
     assert stopped >= 19 * ITERATION  # the last file itself may not have been replaced yet
     goal = stopped + 40 * ITERATION
-    command("run", "--resume", path, "--steps", goal, "--no-evaluate", cwd=path.parent)
+    assert main(["run", "--resume", str(path), "--steps", str(goal), "--no-evaluate"]) == 0
     return path, goal
 
 
-def test_a_killed_run_resumes_to_the_end_of_an_unbroken_one(killed: tuple[Path, int], tmp_path: Path) -> None:
+def test_a_killed_run_resumes_to_the_end_of_an_unbroken_one(
+    killed: tuple[Path, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, goal = killed
     whole = tmp_path / "whole"
-    command("run", *SMALL, "--steps", goal, "--run-dir", whole, "--no-evaluate", cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", *SMALL, "--steps", str(goal), "--run-dir", str(whole), "--no-evaluate"]) == 0
     a, b = final(path), final(whole)
     assert a[1] == b[1] == goal
     assert differences(a[0], b[0]) == []

@@ -12,7 +12,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import PolicyEvaluation
 from bidex_meta.runs.stored import Run, open_runs
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 _SOLVES = 0.5
 """Success over all tasks of a class that an expert must have."""
@@ -28,7 +28,7 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
         suite: Suite whose train classes are looked up.
         out: File of references, written anew.
     """
-    known = best_known(Worlds.open({"suite": suite}).task_classes(), runs)
+    known = best_known(open_worlds({"suite": suite}).task_classes(), runs)
     for name, row in known.items():
         print(f"{name}: {row['return']:.4g} ({row['source']})")
     if out is not None:
@@ -59,7 +59,7 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, Json]:
 def _of_run(run: Run) -> list[tuple[str, Json]]:
     """Return the results of a run's classes from its evaluation, as means over all tasks."""
     config = run.config()
-    source = Worlds.open(config.to_json())
+    source = open_worlds(config.to_json())
     if not source.moving_bases:
         raise BidexError(
             f"Expected a run with moving bases, as in suites, but {run.path} plays {source.name} with fixed ones."

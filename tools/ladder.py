@@ -20,7 +20,7 @@ from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
 from bidex_meta.world.contract import PrivilegedWorld
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 # Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
 _CANDIDATES = 128
@@ -44,7 +44,7 @@ def ladder(
     folder = RunFolder.open(run)
     if folder.config().algo != ICL.name:
         raise BidexError(f"Expected a run of icl, got one of {folder.config().algo}.")
-    worlds = Worlds.open(folder.config().to_json())
+    worlds = open_worlds(folder.config().to_json())
     if split == OTHERS:
         worlds = worlds.others
         split = "train"

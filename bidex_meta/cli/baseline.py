@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,26 +10,9 @@ import tyro
 
 from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import evaluation_table, print_table
-from bidex_meta.errors import BidexError, known_name
-from bidex_meta.evaluation import references
-from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
-from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.runs.atomic import check_writable
-from bidex_meta.runs.versions import collect_versions
-from bidex_meta.utils.files import portable
+from bidex_meta.errors import known_name
+from bidex_meta.experiments.baselines import POLICIES, baseline
 from bidex_meta.utils.validation import Few, Seed, Threads
-from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
-from bidex_meta.witness.scripts import scripts_of
-from bidex_meta.witness.store import load_witness, witness_path
-from bidex_meta.world.world import World
-from bidex_meta.worlds import Worlds, WorldsConfig
-
-_POLICIES = {
-    "random": "uniform actions",
-    "zero": "zero actions",
-    "witness": "the witness of task 0, open loop",
-    "script": "the script of the class, by the state of each step",
-}
 
 
 @dataclass(frozen=True)
@@ -59,58 +42,14 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, print, and store if ``--out`` is given."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    what = known_name("baseline", flags.what, _POLICIES)
-    if flags.out is not None:
-        references.load_from(flags.out)
-        check_writable(flags.out)
-    worlds = Worlds.open(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
-    if not worlds.moving_bases:
-        raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
-    if what == "script":
-        found = _scripted(worlds, flags)
-    else:
-        found = _played(what, worlds, flags)
-    numbers = found.to_json()["classes"]
-    if flags.out is not None:
-        stored = ("return", "return_interval", "success", "episodes", "unstable")
-        made = {"policy": _POLICIES[what], "suite": portable(flags.suite), "seed": flags.seed}
-        made |= {"versions": collect_versions()}
-        classes = {name: {key: row[key] for key in stored} for name, row in numbers.items()}
-        references.store(flags.out, classes, made)
+    policy = known_name("baseline", flags.what, POLICIES)
+    found = baseline(
+        policy, flags.suite, episodes=flags.episodes, seed=flags.seed, threads=flags.threads, out=flags.out
+    )
     if flags.json:
-        print(json.dumps(numbers, indent=2))
+        print(json.dumps(found.to_json()["classes"], indent=2))
         return
-    if flags.out is None:
-        where = ""
-    else:
-        where = f", stored in {flags.out}"
-    print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{where}", found))
-
-
-def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
-    world = worlds.world()
-    names = world.task_names
-    if what == "random":
-        agent = RandomAgent(world.action_space, flags.seed)
-    elif what == "zero":
-        agent = ZeroAgent(world.action_space)
-    else:
-        witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
-        agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
-        names = list(witnesses)
-    found = evaluate(agent, world, flags.episodes, references={})
-    world.close()
-    return replace(found, classes={name: found.classes[name] for name in names})
-
-
-def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
-    """Evaluate the scripts of all classes that have one."""
-    scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
-    names = [name for name in worlds.task_classes() if name in scripts]
-    if not names:
-        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {flags.suite}.")
-    world = worlds.world()
-    assert isinstance(world, World)
-    found = evaluate(Scripted(world, names=names), world, flags.episodes, references={})
-    world.close()
-    return replace(found, classes={name: found.classes[name] for name in names})
+    title = f"{POLICIES[policy]} on {flags.suite}"
+    if flags.out is not None:
+        title += f", stored in {flags.out}"
+    print_table(evaluation_table(title, found))

@@ -2,17 +2,15 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
 from bidex_meta.cli.tables import Json, Sheet, gained, percent, print_table
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.control_arms import arms
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED
 from bidex_meta.experiments.control_runs import control_runs
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
-from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -41,33 +39,18 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(ControlFlags, arguments, "control")
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
-    folders = [RunFolder.open(path) for path in flags.runs]
-    config = folders[0].config()
-    worlds = Worlds.open(config.to_json())
-    played = control_runs(
-        folders,
-        shots=flags.shots,
-        rollouts=flags.rollouts,
-        episodes=flags.episodes,
-        trials=flags.trials,
-        num_envs=flags.num_envs,
-        seed=flags.seed,
-        device=flags.device,
+    found = control_runs(
+        [RunFolder.open(path) for path in flags.runs], shots=flags.shots, rollouts=flags.rollouts,
+        episodes=flags.episodes, trials=flags.trials, num_envs=flags.num_envs, seed=flags.seed, device=flags.device,
         engine=flags.engine,
-    )
-    tasks = worlds.tasks("train")
-    found = {name: arms(played, name, tasks[name]) for name in played[0].own.classes}
-    episodes = {name: result.episodes * len(played) for name, result in played[0].own.classes.items()}
+    )  # fmt: skip
     if flags.json:
-        report = {"runs": [str(folder.path) for folder in folders], "shots": flags.shots, "trials": flags.trials}
-        report |= {"rollouts": played[0].rollouts, "episodes": episodes}
-        classes = {name: {arm: _plain(of) for arm, of in by_arm.items()} for name, by_arm in found.items()}
-        print(json.dumps(report | {"classes": classes}, indent=2))
+        print(json.dumps(found.to_json(), indent=2))
         return
-    for name, by_arm in found.items():
-        title = f"{config.algo} on {worlds.name}, held-out tasks of {name}, "
-        title += f"{len(played)} run{'s' * (len(played) > 1)}, {episodes[name]:,} episodes an arm"
-        _print_table(title, by_arm)
+    count = len(found.runs)
+    for name, by_arm in found.classes.items():
+        title = f"{found.title}, held-out tasks of {name}, {count} run{'s' * (count > 1)}, "
+        _print_table(f"{title}{found.episodes[name]:,} episodes an arm", by_arm)
 
 
 def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
@@ -84,8 +67,3 @@ def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
         cells += [" ".join(f"{value:.4g}" for value in of["runs"]), percent(of["success"])]
         table.add(*cells, *(gained(of["own_minus"]) if "own_minus" in of else []))
     print_table(table)
-
-
-def _plain(arm: Json) -> Json:
-    gains = arm.get("own_minus", {})
-    return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}

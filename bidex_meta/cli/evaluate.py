@@ -72,12 +72,7 @@ def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
 
 
 def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:
-    asked = {"shots": flags.shots, "rollouts": flags.rollouts, "tasks": flags.tasks, "trials": flags.trials}
-    for name, number in asked.items():
-        if number is not None:
-            raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
-    if flags.hidden_rewards:
-        raise BidexError(f"{algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
+    flags.refuse_adaptation(algo)
     if flags.split == "both":
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
     if flags.split == OTHERS:

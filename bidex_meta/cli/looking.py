@@ -13,7 +13,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.world.contract import TaskWorld
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 
 def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
@@ -56,7 +56,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
             config = replace(config, object=run.object)
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
-    worlds = Worlds.open(config)
+    worlds = open_worlds(config)
     slots = slots_of(worlds)
     classes = worlds.task_classes()  # raises BidexError for worlds that are not ours
     if flags.actor not in ("zero", "random"):

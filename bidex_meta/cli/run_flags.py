@@ -14,14 +14,11 @@ from bidex_meta.experiments.learners import USUAL_SETTINGS
 from bidex_meta.experiments.run_config import resolve
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 
-_EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 _USUAL: dict[str, tuple[str, ...]] = {
     "task": ("--suite", "--task", "--algo", "--preset", "--seed"),
     "budget": ("--steps", "--minutes", "--stop-at-success", "--num-envs", "--device"),
     "data": ("--start-from", "--dataset", "--teacher"),
-    "output": (
-        "--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config",
-    ),
+    "output": ("--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config"),
 }  # fmt: skip
 """Flags that ``run --help`` shows; the learner's stand in ``USUAL_SETTINGS``."""
 
@@ -44,16 +41,13 @@ class RunFlags(Generic[LearnerSettings]):
 
 
 def run_flags(arguments: Sequence[str]) -> RunFlags:
-    """Return the flags with a resolved config.
+    """Return the flags with a resolved config; raise BidexError for bad input.
 
     The learner, its preset and the device decide the other flags and their defaults, so these three are read first.
-    BidexError is raised for bad input.
     """
-    resume = peek(arguments, "--resume")
-    if resume:
+    folder = None
+    if resume := peek(arguments, "--resume"):
         folder = RunFolder.open(Path(resume))
-    else:
-        folder = None
     default = _defaults(arguments, folder)
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
@@ -61,16 +55,12 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     settings = [f"--learner.{name.replace('_', '-')}" for name in USUAL_SETTINGS]
     flags = parse(options, arguments, "run", start, _USUAL | {f"learner ({default.algo})": settings})
     is_named = folder is not None or any(peek(arguments, f"--{name}") for name in ("suite", "task", "dataset"))
-    config = replace(
-        flags.config,
-        suite=flags.config.suite if is_named else None,  # a config without a named suite is refused
-        dataset=default.dataset,
-        demonstrations=flags.config.demonstrations or default.demonstrations,
-        teacher=flags.config.teacher or default.teacher,
-        algo=default.algo,
-        preset=default.preset,
-    )
-    config = resolve(config)
+    config = flags.config
+    if not is_named:
+        config = replace(config, suite=None)  # a config without a named suite is refused
+    demonstrations = config.demonstrations or default.demonstrations
+    config = replace(config, demonstrations=demonstrations, teacher=config.teacher or default.teacher)
+    config = resolve(replace(config, dataset=default.dataset, algo=default.algo, preset=default.preset))
     flags.final.check(config)
     return replace(flags, config=config)
 
@@ -84,5 +74,5 @@ def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:
     if folder is not None:
         return resolve(replace(folder.config(), **given), str(folder.config_path))
     if not given.keys() & {"suite", "task", "dataset"}:
-        given["suite"] = _EXAMPLE  # only --help uses this suite: a run without one is refused later
+        given["suite"] = "MT4"  # `run --help` shows its defaults; a run without a suite is refused later
     return resolve(RunConfig(**given))

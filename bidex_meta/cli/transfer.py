@@ -6,14 +6,16 @@ from pathlib import Path
 
 from bidex_meta.cli.parsing import RunPath, parse
 from bidex_meta.cli.run_flags import run_flags
-from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
+from bidex_meta.cli.tables import plain_table, print_table
 from bidex_meta.config import Several, Steps
 from bidex_meta.errors import EXIT_FAILED
-from bidex_meta.evaluation.statistics import Estimate
+from bidex_meta.experiments.transfer_tables import demonstrations_table, reinforcement_table
 from bidex_meta.experiments.transferring import transfer
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.launch import say
 from bidex_meta.utils.validation import Environments, Few, Whole
+
+_SPARE = ("seeds", "return")  # columns that a narrow terminal leaves out first
 
 
 @dataclass(frozen=True)
@@ -55,43 +57,10 @@ def main(arguments: Sequence[str]) -> None:
         workers=flags.workers, cores=flags.cores,
     )  # fmt: skip
     if result.reinforcement:
-        _print_reinforcement(result.reinforcement, flags.steps)
+        print_table(plain_table(*reinforcement_table(result.reinforcement, flags.steps), spare=_SPARE))
     if result.demonstrations:
-        _print_demonstrations(result.demonstrations)
+        print_table(plain_table(*demonstrations_table(result.demonstrations), spare=_SPARE))
     say(f"Tables and figures: {result.folder}")
     if result.failures:
         say(f"{result.failures} failed or were stopped. Start it again to go on with them.")
         raise SystemExit(EXIT_FAILED)
-
-
-def _print_reinforcement(rows: Sequence[Json], end: int) -> None:
-    columns = [*(f"at {int(at):,} (%)" for at in rows[0]["at"]), "at the end (%)", "return", "area (%)"]
-    cells = []
-    for row in rows:
-        median = row["half"]["median"]
-        seeds = row["half"]["of_seeds"]
-        half = f"> {end:,}" if median is None else f"{median:,}"
-        reached = sum(steps is not None for steps in seeds)
-        measures = [*map(_text, (*row["at"].values(), row["success"])), _text(row["return"], 1.0), _text(row["area"])]
-        cells.append([*measures, _text(row["over_nothing"], form="+.1f"), f"{half} ({reached} of {len(seeds)})"])
-    _print(rows, [*columns, "area over nothing", "steps to 50 %"], cells)
-
-
-def _print_demonstrations(rows: Sequence[Json]) -> None:
-    cells = []
-    for row in rows:
-        measures = [_text(row["success"]), _text(row["return"], 1.0), _text(row["over_nothing"], form="+.1f")]
-        cells.append([str(row["demonstrations"]), *measures])
-    _print(rows, ["demonstrations", "success (%)", "return", "success over nothing"], cells)
-
-
-def _print(rows: Sequence[Json], columns: Sequence[str], cells: Sequence[Sequence[str]]) -> None:
-    starts = [[row["class"], row["from"], ", ".join(map(str, row["seeds"]))] for row in rows]
-    table = [[*start, *measures] for start, measures in zip(starts, cells, strict=True)]
-    print_table(plain_table(["class", "from", "seeds", *columns], table, spare=("seeds", "return")))
-
-
-def _text(estimate: Json | None, factor: float = 100.0, form: str = ".1f") -> str:
-    if estimate is None:
-        return NONE
-    return Estimate(estimate["value"], estimate["interval"]).text(factor, form=form)

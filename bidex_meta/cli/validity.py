@@ -15,7 +15,7 @@ from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Seed, Threads
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import WorldsConfig, open_worlds
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(ValidityFlags, arguments, "validity")
     if flags.out is not None:
         check_writable(flags.out)
-    worlds = Worlds.open(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
+    worlds = open_worlds(WorldsConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
     rows = validity_rows(worlds, flags.policy)
     made = {"suite": portable(flags.suite), "seed": flags.seed, "versions": collect_versions()}
     if flags.out is not None:

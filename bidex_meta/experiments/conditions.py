@@ -9,7 +9,7 @@ from bidex_meta.runs.evaluations import Conditions
 from bidex_meta.runs.provenance import Difference, differences, versions_of
 from bidex_meta.runs.versions import package_versions
 from bidex_meta.training.launch import say
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
@@ -33,7 +33,7 @@ def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
     """Return how a run's record differs from this installation and the run's own worlds, here ``worlds`` if known."""
-    return differences(versions_of(folder), conditions(worlds or Worlds.open(folder.config().to_json())))
+    return differences(versions_of(folder), conditions(worlds or open_worlds(folder.config().to_json())))
 
 
 def say_differences(folder: RunFolder) -> None:

@@ -1,29 +1,54 @@
 """A control of adaptation: held-out tasks, adapted to their own data and to data of other tasks."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.control_arms import Control, control
+from bidex_meta.evaluation.control_arms import arms, control
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.learners import learner_kind, resolve_device
 from bidex_meta.experiments.policies import policy_loader
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.provenance import check_alike
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
+
+
+@dataclass(frozen=True)
+class ControlResult:
+    """Result of a control over all runs."""
+
+    runs: list[str]  # their folders
+    title: str  # learner and suite
+    shots: int
+    trials: int
+    rollouts: int  # episodes of each task in a shot
+    episodes: dict[str, int]  # of an arm, by class
+    classes: dict[str, dict[str, Json]]  # by class and arm, as of ``arms``
+
+    def to_json(self) -> Json:
+        """Return the result with plain values, ready for JSON."""
+        entries = {name: value for name, value in vars(self).items() if name not in ("title", "classes")}
+        classes = {name: {arm: _plain(of) for arm, of in by_arm.items()} for name, by_arm in self.classes.items()}
+        return entries | {"classes": classes}
+
+
+def _plain(arm: Json) -> Json:
+    gains = arm.get("own_minus", {})
+    return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
 
 
 def control_runs(
     folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
     seed: int, device: str, engine: str
-) -> list[Control]:  # fmt: skip
-    """Play all arms of runs that differ in the seed alone, and return the results of each run.
+) -> ControlResult:  # fmt: skip
+    """Play all arms of runs that differ in the seed alone.
 
     Args:
         folders: Runs of a learner that adapts, on a suite whose classes stand in both splits.
@@ -42,9 +67,9 @@ def control_runs(
     results = []
     for folder in folders:
         stored = folder.config()
-        here = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
+        here = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
         config = replace(stored, device=here, engine=engine)
-        worlds = Worlds.open(config.to_json())
+        worlds = open_worlds(config.to_json())
         set_up_torch(config.threads)
         counts = [len(pool) for pool in worlds.tasks("test").values()]
         adaptation = metatest.Adaptation.of(worlds, config)
@@ -61,7 +86,19 @@ def control_runs(
         results.append(control(load, test, train, say=say, protocol=protocol, references=worlds.references()))
         test.close()
         train.close()
-    return results
+    config = folders[0].config()
+    worlds = open_worlds(config.to_json())
+    tasks = worlds.tasks("train")
+    own = results[0].own.classes
+    return ControlResult(
+        runs=[str(folder.path) for folder in folders],
+        title=f"{config.algo} on {worlds.name}",
+        shots=shots,
+        trials=trials,
+        rollouts=results[0].rollouts,
+        episodes={name: result.episodes * len(results) for name, result in own.items()},
+        classes={name: arms(results, name, tasks[name]) for name in own},
+    )
 
 
 def _check(folders: Sequence[RunFolder]) -> None:
@@ -73,7 +110,7 @@ def _check(folders: Sequence[RunFolder]) -> None:
         config = folder.config()
         if Capability.ADAPTS not in learner_kind(config.algo).make.capabilities:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
-        metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
+        metatest.check_worlds(open_worlds(config.to_json()), config.algo)
         if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
             raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
         if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:

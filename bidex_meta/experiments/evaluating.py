@@ -36,7 +36,7 @@ from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import Count, Environments, Few, Seed, Shots, check_fields
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class FinalEvaluation:
         if adapts:
             if self.other_tasks:
                 raise BidexError(f"{config.algo} adapts: --split others plays unseen tasks of its train classes.")
-            metatest.splits_of(Worlds.open(config.to_json()), self.split)
+            metatest.splits_of(open_worlds(config.to_json()), self.split)
             return
         for name in ("split", "shots", "rollouts", "tasks"):
             if getattr(self, name) not in (None, "auto"):
@@ -332,8 +332,8 @@ def _worlds_of(suite: str, seed: int, device: str, engine: str, randomisation: s
     """Return the worlds of a suite for an agent."""
     config: Json = {"suite": suite, "seed": seed, "engine": engine}
     config["randomisation"] = None if randomisation is None else str(randomisation)
-    on_gpu = Worlds.open(config).on_gpu
-    return Worlds.open({**config, "device": resolve_device(device, on_gpu)})
+    on_gpu = open_worlds(config).on_gpu
+    return open_worlds({**config, "device": resolve_device(device, on_gpu)})
 
 
 def _randomised(worlds: Worlds) -> Json | None:
@@ -350,13 +350,13 @@ def _opened(run: RunFolder | str | Path) -> RunFolder:
 def _set_up(folder: RunFolder, device: str, engine: str, randomisation: str | Path | None) -> tuple[AnyConfig, Worlds]:
     """Return the run's config with the device and engine to evaluate with, and its worlds."""
     stored = folder.config()
-    device = resolve_device(device, Worlds.open(stored.to_json()).on_gpu)
+    device = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=engine)
     if randomisation is None:
         file = None
     else:
         file = str(randomisation)
-    worlds = Worlds.open({**config.to_json(), "randomisation": file})
+    worlds = open_worlds({**config.to_json(), "randomisation": file})
     set_up_torch(config.threads)
     return config, worlds
 

@@ -20,7 +20,7 @@ from bidex_meta.runs.atomic import Json, check_writable, write_atomic
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import parse as parse_content
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 TOLERANCE = 1e-5
 """Largest allowed difference of an action from torch's."""
@@ -138,7 +138,7 @@ def _observations(rows: int, shape: Json) -> torch.Tensor:
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
     """Return the file's metadata: texts by name, lists and tables as JSON."""
-    worlds = Worlds.open(config.to_json())
+    worlds = open_worlds(config.to_json())
     versions = folder.versions()
     facts = {
         "suite": portable(worlds.name), "suite_version": worlds.identity()["suite_version"], "algorithm": config.algo,

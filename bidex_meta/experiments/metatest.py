@@ -42,6 +42,15 @@ class Options:
     seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
     hidden_rewards: Switch = False  # Learners that adapt also play the evaluation episodes with their rewards hidden.
 
+    def refuse_adaptation(self, algo: str) -> None:
+        """Raise BidexError if an option is given that concerns adaptation alone."""
+        for name in ("shots", "rollouts", "tasks", "trials"):
+            number = getattr(self, name)
+            if number is not None:
+                raise BidexError(f"{algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
+        if self.hidden_rewards:
+            raise BidexError(f"{algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
+
 
 @dataclass(frozen=True)
 class Adaptation:

@@ -18,7 +18,7 @@ from bidex_meta.training.distributed import LostProcess
 from bidex_meta.training.launch import say
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import is_file
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 
 def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
@@ -104,7 +104,7 @@ def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[
 def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
     """Say in one line how the rules that a run's policy has learned by differ from those of some worlds, if they do."""
     with contextlib.suppress(BidexError):  # the suite's file of the run may be gone
-        learned = Worlds.open(folder.config().to_json())
+        learned = open_worlds(folder.config().to_json())
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
             say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")
 

@@ -42,7 +42,7 @@ from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import load_witness
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and the number of runs that each kind takes."""
@@ -213,7 +213,7 @@ def _announce(collection: _Collection, world: PooledWorld, name: str) -> int:
 def _episodes(settings: RecordConfig, kind: str) -> _Collection:
     """Return the collection of episodes of uniform actions, or of runs' policies."""
     config = _source_config(settings)
-    source = Worlds.open(config)
+    source = open_worlds(config)
     # Sums depend on how torch splits them over threads, so a resumed collection keeps its number of threads.
     before = writer.stored_plan(writer.dataset_path(settings.out, source.name, kind)[0])
     config["threads"] = settings.threads or before.get("threads") or usable_cores()
@@ -281,7 +281,7 @@ def _source_config(settings: RecordConfig) -> Json:
         }
         if settings.suite is not None and settings.suite.endswith(".toml"):
             config["suite"] = str(absolute(settings.suite))
-    return config | {"device": resolve_device(settings.device, Worlds.open(config).on_gpu), "engine": settings.engine}
+    return config | {"device": resolve_device(settings.device, open_worlds(config).on_gpu), "engine": settings.engine}
 
 
 def _actor(settings: RecordConfig, path: Path, device: str) -> tuple[Actor, Json]:
@@ -306,7 +306,7 @@ def _demonstrations(settings: RecordConfig) -> _Collection:
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
         )
-    source = Worlds.open({"task": settings.task, "base": "moving", "seed": 0, "threads": settings.threads})
+    source = open_worlds({"task": settings.task, "base": "moving", "seed": 0, "threads": settings.threads})
     name = source.name
     size = settings.size or SIZE["demonstrations"]
     rows = settings.num_envs or _DEMONSTRATORS[settings.starts]
@@ -365,6 +365,6 @@ def _publish_replay(settings: RecordConfig) -> tuple[Path, str]:
     if not config.record:
         raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
     dataset = open_dataset(folder.path / "replay")
-    out, name = writer.dataset_path(settings.out, Worlds.open(config.to_json()).name, "replay")
+    out, name = writer.dataset_path(settings.out, open_worlds(config.to_json()).name, "replay")
     writer.adopt(dataset.folder, out, name)
     return out, name

@@ -16,7 +16,7 @@ from bidex_meta.training.launch import launch, resume_command
 from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 _WIDTH = 1200  # numbers that a step of one environment holds at most: two observations, actions, what is computed
 
@@ -34,7 +34,7 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
         config = replace(config, **run_data.implied(datasets))
     _check_names(config)
     named = {name: vars(config)[name] for name in ("suite", "task", "object", "tasks_per_class")}
-    source = Worlds.open(named)
+    source = open_worlds(named)
     kind = learner_kind(config.algo, source.class_name)
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
@@ -77,7 +77,7 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
 def check(config: AnyConfig, with_memory: bool = True) -> None:
     """Raise BidexError if entries of a resolved config do not go together, or need more memory than there is."""
     kind = learner_kind(config.algo, config.task)
-    worlds = Worlds.open(config.to_json())
+    worlds = open_worlds(config.to_json())
     if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
     if config.record:
@@ -108,12 +108,12 @@ def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
             "start a new run."
         )
     mend = "Resume with the versions in versions.json, or start a new run from it: --start-from RUN."
-    check_worlds_of(folder, Worlds.open(config.to_json()), mend)
+    check_worlds_of(folder, open_worlds(config.to_json()), mend)
 
 
 def preset_reason(config: AnyConfig) -> str:
     """Return in words why a resolved config has its preset."""
-    source = Worlds.open({"suite": config.suite, "task": config.task, "object": config.object})
+    source = open_worlds({"suite": config.suite, "task": config.task, "object": config.object})
     kind = learner_kind(config.algo, source.class_name)
     name, reason = choose_preset(kind, "auto", config.device, source.preset)
     return reason if name == config.preset else "as asked"

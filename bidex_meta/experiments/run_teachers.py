@@ -19,7 +19,7 @@ from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import VectorWorld
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 SCRIPTS = "scripts"
 
@@ -81,7 +81,7 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
-    other = Worlds.open(config.to_json())
+    other = open_worlds(config.to_json())
     own = source.task_classes()
     theirs = other.task_classes()
     if other.class_name is None:
@@ -119,7 +119,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
             policy, _ = load_policy(RunFolder.open(Path(name)), device)
-            single = Worlds.open(RunFolder.open(Path(name)).config().to_json()).class_name is not None
+            single = open_worlds(RunFolder.open(Path(name)).config().to_json()).class_name is not None
             if single:
                 width = classes[learn[0]].observation_size
             else:

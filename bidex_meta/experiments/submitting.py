@@ -22,7 +22,7 @@ from bidex_meta.training.learner import Capability
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 
 def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episodes: int, device: str) -> Path:
@@ -40,7 +40,7 @@ def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episode
     configs = [folder.config() for folder in folders]
     _check(folders, configs)
     first = configs[0]
-    worlds = Worlds.open(first.to_json())
+    worlds = open_worlds(first.to_json())
     check_alike(folders)
     for folder in folders:
         check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
@@ -152,8 +152,8 @@ def _play(
 ) -> tuple[Evaluation, Evaluation, int, Conditions]:
     """Return the evaluations on own and on other tasks, the policy's steps, and the conditions."""
     config = stored.to_json()
-    config |= {"device": resolve_device(device, Worlds.open(config).on_gpu), "engine": "auto"}
-    worlds = Worlds.open(config)
+    config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
+    worlds = open_worlds(config)
     others = worlds.others
     set_up_torch(stored.threads)
     state, steps = checkpoint(folder, noted=True)

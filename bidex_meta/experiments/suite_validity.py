@@ -22,7 +22,7 @@ from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world import Slot, World, WorldConfig
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 _NOTHING = ("uniform", "zero", "held")  # policies that have learned nothing
 
@@ -119,7 +119,7 @@ def _results(worlds: Worlds, world: World, runs: Sequence[Path]) -> dict[str, di
         say(f"the policy of {path}")
         folder = RunFolder.open(path)
         config = replace(WorldsConfig.of(folder.config().to_json()), task_seed=worlds.seed, threads=worlds.threads)
-        own = Worlds.open(config)
+        own = open_worlds(config)
         say_other_rules(folder, worlds)
         agent, _ = load_policy(folder, "cpu")
         for name, result in own.judge(agent, own.world(), own.protocol("train", 1)).classes.items():

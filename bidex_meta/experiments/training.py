@@ -30,7 +30,7 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 _LOG = logging.getLogger("bidex_meta")
 
@@ -141,7 +141,7 @@ def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
 def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: contextlib.ExitStack) -> None:
     """Lock the run's folder, and refuse what would fail in the middle of the training, before anything is built."""
     kind = learner_kind(config.algo, config.task)
-    worlds = Worlds.open(config.to_json())
+    worlds = open_worlds(config.to_json())
     if launch().rank == 0:
         if old is not None:
             old.check_own()
@@ -192,7 +192,7 @@ def _begin(
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
     set_up_torch(config.threads)
     kind = learner_kind(config.algo, config.task)
-    worlds = Worlds.open({**config.to_json(), "device": launch().own_device(config.device)})
+    worlds = open_worlds({**config.to_json(), "device": launch().own_device(config.device)})
     if launch().count > 1:
         rows = f"{launch().count} x {config.num_envs}"
     else:

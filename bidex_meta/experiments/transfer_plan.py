@@ -27,7 +27,7 @@ from bidex_meta.utils.files import JsonObject, absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.scripts import scripts_of
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 _NETWORK = ("architecture", "hidden", "activation", "normalise_observations", "point_widths")
 """Fields of a learner's config that a policy to start from must share."""
@@ -143,7 +143,7 @@ def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path,
     Returns None if there is neither a data set nor a script. BidexError is raised for a data set of other rules,
     because an episode that succeeds under other rules may fail here.
     """
-    worlds = Worlds.open(WorldsConfig(suite=str(file)))
+    worlds = open_worlds(WorldsConfig(suite=str(file)))
     task = worlds.task_classes()[name]
     for dataset in map(open_dataset, given):
         if [plain_name(slot.partition("/")[0]) for slot in dataset.metadata["tasks"]] != [name]:

@@ -25,7 +25,7 @@ from bidex_meta.training.launch import say
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import JsonObject, portable
 from bidex_meta.utils.validation import Few, Whole
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 USUAL_RUN: RunConfig = RunConfig(
     algo="ppo", preset="laptop", logger="none", num_envs=256, learner={"demonstration_cloning": 5000}
@@ -88,7 +88,7 @@ def transfer(
     arms = arms_of([measured, *others])
     for folder in (measured, *others):
         say_differences(folder)
-    worlds = Worlds.open(measured.config().to_json())
+    worlds = open_worlds(measured.config().to_json())
     for folder in others:
         say_other_rules(folder, worlds)
     names = held_out(worlds, classes)

@@ -30,7 +30,7 @@ from bidex_meta.training.learner import Capability
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def verify(
     recorded = recorded_evaluation(folder.path, evaluation)
     then = recorded_conditions(recorded, versions_of(folder), config)
     config = _where(device, engine, then, config)
-    worlds = Worlds.open(config.to_json())
+    worlds = open_worlds(config.to_json())
     set_up_torch(config.threads)
     if num_envs is None:
         environments = then.num_envs
@@ -131,7 +131,7 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
 
 def _where(device: str, engine: str | None, then: Conditions, config: AnyConfig) -> AnyConfig:
     """Return the run's config with the device and engine to evaluate with."""
-    on_gpu = Worlds.open(config.to_json()).on_gpu
+    on_gpu = open_worlds(config.to_json()).on_gpu
     recorded = then.device or config.device
     try:
         found = resolve_device(recorded if device == "auto" else device, on_gpu)

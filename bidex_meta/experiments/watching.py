@@ -26,7 +26,7 @@ from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability, Learner
 from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import Worlds, open_worlds
 
 TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
 _LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
@@ -122,7 +122,7 @@ class Watch:
         """Film an environment of each class side by side; report a failure without ending the training."""
         try:
             if "film" not in self._worlds:
-                worlds = Worlds.open({**self._config.to_json(), "device": "cpu", "engine": "auto"})
+                worlds = open_worlds({**self._config.to_json(), "device": "cpu", "engine": "auto"})
                 self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))

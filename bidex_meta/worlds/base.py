@@ -1,29 +1,16 @@
-"""`Worlds.open(config)` resolves the worlds that a config names, without loading torch and physics."""
+"""The interface of all worlds that a config can name, without loading torch and physics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from itertools import chain
 from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.ladder import RUNGS, rung_of
-from bidex_meta.rules import Rules, plain_name
-from bidex_meta.suite import (
-    METAWORLD_SUITES,
-    OTHER_SEED,
-    SPLITS,
-    Suite,
-    known_suite,
-    load_randomisation,
-    load_suite,
-    suite_names,
-)
-from bidex_meta.tasks import registry
+from bidex_meta.rules import Rules
+from bidex_meta.suite import OTHER_SEED, Suite, load_randomisation
 from bidex_meta.utils.files import Json
 
 if TYPE_CHECKING:
@@ -82,6 +69,7 @@ class Worlds(ABC):
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
         self.name = name
+        self._opened_as = name
         self.config = config
         if config.task_seed is None:
             self.seed = config.seed
@@ -95,29 +83,6 @@ class Worlds(ABC):
             self.randomisation = None
         else:
             self.randomisation = load_randomisation(config.randomisation)
-
-    @staticmethod
-    def open(config: Mapping[str, Json] | WorldsConfig) -> "Worlds":
-        """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
-
-        Raises BidexError for unknown or faulty ones.
-        """
-        from bidex_meta.worlds import external, own
-
-        config = WorldsConfig.of(config)
-        if config.suite is None:
-            task = config.task or ""
-            if task.casefold() == external.HUMANOID.casefold():
-                return external.HumanoidTask(external.HUMANOID, config)
-            if task in suites_to_run():
-                raise BidexError(f"{task} is a suite, not a class: name it by suite (--suite {task}).")
-            return own.SingleClass(registry.resolve(task, "task"), config)
-        suite = config.suite
-        if not suite.endswith(".toml"):
-            if plain_name(suite) in registry.names():
-                raise BidexError(f"{suite} is a class, not a suite: name it by task (--task {suite}).")
-            suite = known_suite(suite, METAWORLD_SUITES)
-        return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
@@ -154,7 +119,7 @@ class Worlds(ABC):
     @property
     def others(self) -> "Worlds":
         """Return worlds with the same number of unseen tasks: another seed draws them, and no run trained on them."""
-        return Worlds.open(replace(self.config, task_seed=self.seed + OTHER_SEED))
+        return type(self)(self._opened_as, replace(self.config, task_seed=self.seed + OTHER_SEED))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """Return the default sizes of a training: environments, and steps over all of them.
@@ -210,32 +175,3 @@ def physics_of(classes: "Mapping[str, TaskClass]") -> str:
     from bidex_meta.tasks.scene import compile_scene
 
     return common_identity({name: compile_scene(task_class).model for name, task_class in classes.items()})
-
-
-def suites_to_run() -> list[str]:
-    """Return every suite that a config may name: the shipped ones and Meta-World's."""
-    return [*suite_names(), *METAWORLD_SUITES]
-
-
-def listed() -> list[dict[str, object]]:
-    """Return the entries of ``bidex-meta list suites``: suites, Meta-World's too, then those of the ladder by rung."""
-    rows: list[dict[str, object]] = []
-    ladder: list[list[dict[str, object]]] = [[] for _ in RUNGS]
-    for suite in map(load_suite, suite_names()):
-        train, test = ([entry.name for entry in suite.split_classes(split)] for split in SPLITS)
-        row = _listed(suite.name, suite.kind, train, test, suite.description)
-        rung = rung_of(suite.name, train)
-        if rung is None:
-            rows.append(row)
-        else:
-            hidden, budget = RUNGS[rung]
-            ladder[rung].append(row | {"rung": rung, "hidden": hidden, "needs": budget})
-    summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
-    rows += [_listed(name, "multi-task", list(classes), [], summary) for name, classes in METAWORLD_SUITES.items()]
-    return [*rows, *chain.from_iterable(ladder)]
-
-
-def _listed(name: str, kind: str, train: list[str], test: list[str], summary: str) -> dict[str, object]:
-    """Return an entry without a place on the ladder."""
-    classes = {"train_classes": train, "test_classes": test}
-    return {"name": name, "kind": kind, **classes, "rung": None, "hidden": None, "needs": None, "summary": summary}

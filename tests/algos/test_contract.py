@@ -21,10 +21,14 @@ from tests.algos.toy import ToyWorld, nearness
 from tests.fakes import run_config
 from tests.offline.stored import as_data, noisy, played
 
-ON: dict[str, Any] = {"hidden": (16, 16), "rollout_steps": 8, "autocast": "off"}
+ON: dict[str, Any] = {
+    "hidden": (16, 16), "rollout_steps": 8, "num_minibatches": 2, "autocast": "off",
+}  # fmt: skip
+PPO = ON | {"epochs": 2}
+TRPO = ON | {"critic_epochs": 2}
 OFF: dict[str, Any] = {
-    "hidden": (16, 16), "replay_steps": 20, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128, "gamma": 0.8,
-    "tau": 0.05, "updates_per_step": 3, "n_steps": 2, "steps_per_iteration": 5, "autocast": "off",
+    "hidden": (16, 16), "replay_steps": 20, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 32, "gamma": 0.8,
+    "tau": 0.05, "updates_per_step": 1, "n_steps": 2, "steps_per_iteration": 5, "autocast": "off",
 }  # fmt: skip
 ATOMS: dict[str, Any] = OFF | {"critic_hidden": (16, 16), "atoms": 51}
 META: dict[str, Any] = {"hidden": (16, 16), "tasks_per_class": 3, "max_adapt_steps": 30}
@@ -75,10 +79,10 @@ class Case:
 
 
 CASES = {
-    "mtppo": Case("mtppo", ON), "mtppo bf16": Case("mtppo", ON | {"autocast": "on", "policy_heads": True}),
-    "mttrpo": Case("mttrpo", ON | {"policy_heads": True}), "ippo": Case("ippo", ON | {"agents": PAIR}),
-    "mappo": Case("mappo", ON | {"agents": PAIR}), "happo": Case("happo", ON | {"agents": PAIR}),
-    "hatrpo": Case("hatrpo", ON | {"agents": PAIR}), "maddpg": Case("maddpg", OFF | {"agents": PAIR}),
+    "mtppo": Case("mtppo", PPO), "mtppo bf16": Case("mtppo", PPO | {"autocast": "on", "policy_heads": True}),
+    "mttrpo": Case("mttrpo", TRPO | {"policy_heads": True}), "ippo": Case("ippo", PPO | {"agents": PAIR}),
+    "mappo": Case("mappo", PPO | {"agents": PAIR}), "happo": Case("happo", PPO | {"agents": PAIR}),
+    "hatrpo": Case("hatrpo", TRPO | {"agents": PAIR}), "maddpg": Case("maddpg", OFF | {"agents": PAIR}),
     "ddpg": Case("ddpg", OFF), "td3": Case("td3", OFF | {"policy_heads": True}), "mtsac": Case("mtsac", OFF),
     "mtsac bf16": Case("mtsac", OFF | {"autocast": "on", "policy_heads": True}),
     "fasttd3": Case("fasttd3", ATOMS), "brc": Case("brc", ATOMS),
@@ -86,8 +90,9 @@ CASES = {
     "maml": Case("maml", META), "promp": Case("promp", META), "promp slices": Case("promp", META | {"slice_steps": 7}),
     "maml slices": Case("maml", META | {"slice_steps": 7}),
     "promp sizes": Case("promp", META | {"step_sizes": "layer"}),
-    "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
-    "varibad": Case("varibad", {"hidden": (8,), "memory": 8, "num_minibatches": 2}),
+    "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 10, "num_minibatches": 2, "epochs": 1}),
+    "varibad": Case("varibad", {"hidden": (8,), "memory": 8, "num_minibatches": 2, "epochs": 1}),
+    "bc": Case("bc", DATA),
     "pearl": Case("pearl", OFF | {"encoder": (8,), "context": 8, "tasks_per_update": 4, "episodes_per_trial": 2}),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
     "dagger": Case("dagger", DATA),
@@ -95,7 +100,7 @@ CASES = {
 }  # fmt: skip
 SHARING = {
     f"{algo} {name}": Case(algo, more | {"hidden": (16, 8)} | shared)
-    for algo, more in (("mtppo", ON), ("mttrpo", ON), ("mtsac", OFF), ("td3", OFF))
+    for algo, more in (("mtppo", PPO), ("mttrpo", TRPO), ("mtsac", OFF), ("td3", OFF))
     for name, shared in (
         *((trunk, {"architecture": trunk}) for trunk in ("soft_modules", "paco", "moore", "towers")),
         ("transformer", {"architecture": "transformer", "hidden": (8, 8)}),
@@ -118,7 +123,8 @@ def each(cases: dict[str, Case]) -> Callable[..., Any]:
 
 @each(CASES | SHARING)
 def test_save_load_resume_is_bit_equal(case: Case) -> None:
-    unbroken, again = resumed(case.make, iterations=2)
+    # Networks of SHARING differ, and the state beside them does not: one iteration shows what they save.
+    unbroken, again = resumed(case.make, iterations=2 if case in CASES.values() else 1)
     policy = type(again).load_policy(again.policy_state_dict())
     obs = torch.randn(5, again.shape.observations)  # of another number of environments
     if again.shape.num_id_columns:
@@ -132,13 +138,13 @@ def test_save_load_resume_is_bit_equal(case: Case) -> None:
 @each(PLAYING)
 def test_a_transition_that_broke_physics_teaches_nothing(case: Case) -> None:
     states = []
-    for garbage in (0.0, 1e8, float("nan")):
+    for garbage in (1e8, float("nan")):
         learner = case.make(world=case.world(unstable=((2, 5), (3, 10), (7, 0)), garbage=garbage))
         told = learner.iterate()
         assert "Train/unstable" not in told or told["Train/unstable"] > 0
         learner.iterate()
         states.append(learner.state_dict())
-    assert same(states[0], states[1]) and same(states[0], states[2])
+    assert same(*states)
 
 
 @each({name: case for name, case in PLAYING.items() if "slices" not in name and "policy_heads" not in case.options})

@@ -87,18 +87,29 @@ def points(source, split="train", rows=None, mode="DISABLED"):
     return place
 
 
+def find_points(patch: pytest.MonkeyPatch) -> None:
+    """Suites are points to be found, and ``finder`` is a learner that adapts."""
+    patch.setattr(OwnSuite, "world", points)
+    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
+    patch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
+    patch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
+
+
 @pytest.fixture
 def finder(monkeypatch):
-    """Suites are points to be found, and ``finder`` is a learner that adapts."""
-    monkeypatch.setattr(OwnSuite, "world", points)
-    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
-    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
-    monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
+    find_points(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def adapted_once(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("finder") / "r"
+    with pytest.MonkeyPatch.context() as patch:
+        find_points(patch)
+        assert main(["run", *FINDER, "--run-dir", str(path)]) == 0
+    return path
 
 
 @pytest.fixture
-def adapted(finder, tmp_path) -> Path:
-    """A run of it."""
-    path = tmp_path / "r"
-    assert main(["run", *FINDER, "--run-dir", str(path)]) == 0
-    return path
+def adapted(adapted_once, finder, tmp_path) -> Path:
+    """An evaluated run of ``finder``."""
+    return shutil.copytree(adapted_once, tmp_path / "r")

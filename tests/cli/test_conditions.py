@@ -46,8 +46,7 @@ def test_what_is_not_recorded_is_no_difference() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_readers_of_one_run_say_it_in_a_line(name: str, run: Path, capsys, caplog, tmp_path: Path) -> None:
+def test_readers_of_one_run_say_it_in_a_line(run: Path, capsys, tmp_path: Path) -> None:
     def said(*words: object) -> list[str]:
         capsys.readouterr()
         assert main([str(word) for word in words]) == 0, capsys.readouterr().err
@@ -57,18 +56,26 @@ def test_readers_of_one_run_say_it_in_a_line(name: str, run: Path, capsys, caplo
 
     start = ["run", *SMALL, "--steps", "24", "--no-evaluate", "--start-from", run]
     assert said("evaluate", run) == said(*start, "--run-dir", tmp_path / "s1") == []
-    edited(run, name)
-    text = f"{run} was made with {TEXTS[name]}"
-    for words in (["evaluate", run], [*start, "--run-dir", tmp_path / "s2"]):
+    for name, words in (("mujoco", ["evaluate", run]), ("suite digest", [*start, "--run-dir", tmp_path / "s2"])):
+        edited(run, name)
         (line,) = said(*words)
-        assert line.startswith(text), words
+        assert line.startswith(f"{run} was made with "), words
+        assert TEXTS[name] in f"{line}, ", words
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_verify_and_what_loads_a_policy_say_it_in_a_line(name: str, run: Path, capsys, caplog) -> None:
+    """``play``, ``render``, ``record``, ``export``, ``teachers``, ``validity`` and ``control`` load policies."""
+    edited(run, name)
     caplog.set_level("INFO", "bidex_meta")
-    load_policy(run)  # what play, render, record, export, teachers, validity and control call
-    assert caplog.messages[-1].startswith(text)
+    load_policy(run)
+    assert caplog.messages[-1].startswith(f"{run} was made with {TEXTS[name]}")
     evaluation = json.loads((run / "evaluation.json").read_text())
     evaluation["conditions"] = {"device": "cpu", "engine": "auto"}  # of an older one: verify asks the run's record
     (run / "evaluation.json").write_text(json.dumps(evaluation))
-    (line,) = said("verify", run)
+    capsys.readouterr()
+    assert main(["verify", str(run)]) == 0
+    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Conditions: ")]
     assert line.startswith(f"Conditions: {TEXTS[name]}")
 
 

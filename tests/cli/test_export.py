@@ -35,10 +35,10 @@ def policy(algo: str, **options: object) -> torch.nn.Module:
 
 
 POLICIES: list[tuple[str, dict[str, object]]] = [
-    ("mtppo", {"architecture": "towers"}), ("mtppo", {"architecture": "moore"}),
-    ("mtppo", {"architecture": "soft_modules"}),
-    ("mtppo", {"architecture": "transformer", "hidden": (8,)}), ("mtsac", {}),
-    ("dagger", {"normalise_per_task": True}), ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
+    ("mtsac", {"architecture": "towers"}), ("mtppo", {"architecture": "soft_modules"}),
+    ("mtppo", {"architecture": "transformer", "hidden": (8,)}),
+    ("dagger", {"architecture": "moore", "normalise_per_task": True}),
+    ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
 ]  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.experiments.metatest import Adaptation, rollouts_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.learner import Capability
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.adapting_learner import Learner
 from tests.cli.conftest import COUNTS, FINDER
 from tests.fakes import change, run_config
@@ -121,7 +121,7 @@ def test_no_adaptation_where_tasks_are_shown(refused, tmp_path, monkeypatch, on)
 
 def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     config = run_config(suite="ML4", algo="finder", num_envs=1024)
-    source = Worlds.open(config.to_json())
+    source = open_worlds(config.to_json())
     shared = Adaptation.of(source, config)
     assert [rollouts_of(shared, asked, 6) for asked in (20, None)] == [20, 10]
     monkeypatch.setattr(Learner, "capabilities", frozenset(Capability))

@@ -13,7 +13,7 @@ from bidex_meta.experiments.policies import checkpoint, policy_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V1, V2
 from bidex_meta.utils import paths
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.fakes import trained_run
 
 
@@ -70,7 +70,7 @@ def test_data_of_other_rules_are_noted(monkeypatch: pytest.MonkeyPatch, caplog: 
         dataset = SimpleNamespace(name="some/data-v0", metadata=recorded, num_steps=1, num_episodes=1)
         caplog.clear()
         monkeypatch.setattr(run_data, "open_datasets", lambda names, dataset=dataset: [dataset])
-        run_data.announced(["some/data-v0"], "Reading", Worlds.open({"task": "HandOver-v2"}))
+        run_data.announced(["some/data-v0"], "Reading", open_worlds({"task": "HandOver-v2"}))
         shown.append(caplog.messages[1:])
     assert shown[0] == shown[2] == shown[4] == [] and len(shown[1]) == len(shown[3]) == 1
     note = "Note: some/data-v0 was recorded by other rules than those of HandOver-v2: reward"

@@ -36,7 +36,7 @@ from bidex_meta.experiments.transfer_plan import (
 )
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import WorldsConfig, open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import toy
 from tests.data.worlds import ABOUT
@@ -64,7 +64,7 @@ classes = [
 
 
 def opened(suite: str | Path, seed: int = 0) -> Any:
-    return Worlds.open(WorldsConfig(suite=str(suite), seed=seed, threads=1))
+    return open_worlds(WorldsConfig(suite=str(suite), seed=seed, threads=1))
 
 
 @pytest.fixture
@@ -254,7 +254,7 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
 
 
 def test_what_no_demonstration_shows_plays_the_policy_itself(trained: Path, shown) -> None:
-    shown("transfer", trained, *FLAGS, "--steps", "0", "--out", "t", *MORE[:-2])
+    shown("transfer", trained, *FLAGS, "--steps", "0", "--seeds", "1", "--out", "t", *MORE[:-2])
     before = weights(trained)
     for name, weight in weights(Path("t/runs/TwoCatchUnderarm-start-0-demonstrations-seed0")).items():
         assert name.endswith("count") or torch.equal(weight, before[name]), name

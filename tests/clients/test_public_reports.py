@@ -16,11 +16,10 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers import RecordEpisodeStatistics as RecordOne
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
-from bidex_meta import Benchmark, make_task_world
+from bidex_meta import Benchmark
 from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.data.part_files import Episode
@@ -235,18 +234,16 @@ def start_of_agents(env: Any) -> np.ndarray:
 
 
 def test_copies_without_a_seed_are_no_copies() -> None:
-    """Vector environments without a seed: all sub-environments play the same episodes."""
-    pairs = [
-        [gymnasium.make(ID) for _ in range(2)],
-        [gymnasium.make_vec(ID, device="cpu", threads=1) for _ in range(2)],
-    ]
+    """Vector environments without a seed: all sub-environments play the same episodes.
+
+    Gymnasium's ids: tests/clients/test_gymnasium_ids.py.
+    """
     benchmark = Benchmark("MT1-v2")
     (kind,) = benchmark.train_classes.values()
-    pairs.append([kind() for _ in range(2)])
-    for env in pairs[-1]:
+    envs = [kind() for _ in range(2)]
+    for env in envs:
         env.set_task(benchmark.train_tasks[0])
-    for one, two in pairs:
-        assert not np.array_equal(start(one), start(two))
+    assert not np.array_equal(*map(start, envs))
     if find_spec("pettingzoo"):
         make = import_module("bidex_meta.clients.pettingzoo").parallel_env
         one, two, again = (start_of_agents(make(NAME, "single", seed=seed)) for seed in (None, 2, 2))
@@ -326,23 +323,6 @@ def test_spaces_are_seeded_one_by_one() -> None:
 # Tasks and splits.
 
 
-def test_benchmarks_of_a_seed_are_equal_in_any_order() -> None:
-    """Metaworld #225 and #147: two instances differ, and what was made before matters."""
-    one = Benchmark("ML4-v2", seed=5)
-    Benchmark("MT4-v2", seed=1)
-    two, other = Benchmark("ML4-v2", seed=5), Benchmark("ML4-v2", seed=6)
-    assert one.train_tasks == two.train_tasks and one.test_tasks == two.test_tasks
-    assert not set(one.train_tasks) & set(other.train_tasks)
-
-
-@pytest.mark.parametrize("suite", ["ML1", "ML4", "ML20", "ML1-v2", "ML4-v2", "ML20-v2", "ML1-wide", "ML1-objects"])
-def test_no_test_task_is_a_training_task(suite: str) -> None:
-    """Meta-RL benchmarks: tasks of both splits overlap."""
-    benchmark = Benchmark(suite)
-    assert benchmark.test_tasks and not set(benchmark.train_tasks) & set(benchmark.test_tasks)
-    assert len({task.data for task in benchmark.train_tasks}) > 1
-
-
 @pytest.mark.parametrize("version", ["v1", "v2"])
 def test_the_id_of_a_split_gives_this_split(version: str) -> None:
     """Metaworld #573: `ML1-train` silently gives the test tasks."""
@@ -382,12 +362,12 @@ def test_each_task_counts_alike_in_an_evaluation() -> None:
 # Observations.
 
 
-@pytest.mark.parametrize("suite", ["MT4", "MT4-v2", "ML4-v2", "MT1-objects"])
+@pytest.mark.parametrize("suite", ["MT4-v2", "MT1-objects"])
 def test_observations_lie_within_their_space(suite: str) -> None:
     """Metaworld #599: goals are seen, but their bounds are zero; stable-baselines3: float64 in a float32 space."""
     world = suite_world(suite, 4)
     obs, _ = world.reset(seed=0)
-    for action in np.random.default_rng(0).uniform(-1, 1, (80, 4, 52)).astype(np.float32):
+    for action in np.random.default_rng(0).uniform(-1, 1, (30, 4, 52)).astype(np.float32):
         assert world.observation_space.contains(numbers(obs))
         obs, *_, info = world.step(torch.from_numpy(action))
         assert all(world.single_observation_space.contains(row) for row in numbers(info["final_obs"]))
@@ -429,24 +409,6 @@ def test_what_a_step_returned_is_not_changed_by_the_next(name: str) -> None:
         for now, then in zip(raw, before, strict=True):
             if then.dtype != object:
                 np.testing.assert_array_equal(numbers(now), then)
-
-
-def test_numbers_that_are_none_stay_in_their_environment() -> None:
-    """Batched simulators: a NaN action or a broken environment spoils all others."""
-    one, two = (class_world(NAME, 3) for _ in range(2))
-    for world in (one, two):
-        world.stagger = False
-        world.reset(seed=0)
-    for step in range(3):
-        action = torch.zeros(3, 52)
-        expected = one.step(action)
-        if step == 1:
-            action[1] = torch.nan
-        found = two.step(action)
-        assert all(bool(value.isfinite().all()) for value in found[:2])
-        for a, b in zip(expected[:4], found[:4], strict=True):
-            assert torch.equal(a[[0, 2]], b[[0, 2]])
-        assert bool(found[3][1]) == (step == 1) == bool(found[4]["unstable"][1])
 
 
 # Ends of episodes.
@@ -503,15 +465,6 @@ def test_an_environment_that_is_not_reset_does_not_end_again() -> None:
     for _ in range(40):
         env.step(np.zeros((ROWS, 2), np.float32))
     assert env.episode_count == ROWS
-    one = RecordOne(TaskEnv(NAME))
-    one.reset(seed=0)
-    ended = False
-    while not ended:
-        _, _, terminated, truncated, info = one.step(np.zeros(52, np.float32))
-        ended = terminated or truncated
-    assert "episode" in info
-    with pytest.raises(BidexError, match="reset"):
-        one.step(np.zeros(52, np.float32))
 
 
 @pytest.mark.parametrize("name", ["world", "numpy", "sb3"])
@@ -613,14 +566,3 @@ def test_closing_twice_does_no_harm(name: str) -> None:
     one.reset(0)
     one.close()
     one.close()
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_an_environment_does_not_depend_on_its_neighbours(threads: int) -> None:
-    """Parallel simulators: results depend on the number of environments or workers."""
-    few, many = (make_task_world(NAME, rows, "cpu", threads=threads, stagger=False) for rows in (2, 5))
-    for world in (few, many):
-        world.reset(seed=3)
-    for action in np.random.default_rng(0).uniform(-1, 1, (20, 5, 52)).astype(np.float32):
-        a, b = few.step(torch.from_numpy(action[:2])), many.step(torch.from_numpy(action))
-        assert torch.equal(a[0], b[0][:2]) and torch.equal(a[1], b[1][:2])

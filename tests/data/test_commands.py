@@ -20,7 +20,7 @@ from bidex_meta.experiments import run_recording
 from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils import memory
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.data.worlds import changed, printed, rough
 from tests.pages import ROOT
@@ -85,7 +85,7 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
 
 def recorded(folder: Path, **config: Any) -> Dataset:
     """Uniform actions in two rows of what a config names."""
-    source = Worlds.open({"seed": 0, "threads": 1, **config})
+    source = open_worlds({"seed": 0, "threads": 1, **config})
     world, out = source.world("train", 2), DatasetWriter(folder)
     try:
         collect.collect(world, [collect.Actor(None)], out, 60, 0, lambda now, seconds: None)

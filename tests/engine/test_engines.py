@@ -119,7 +119,7 @@ def test_a_broken_row_is_reported_and_its_neighbours_do_not_change_by_a_bit(
     other.step(SUBSTEPS)
     assert engine.unstable().tolist() == [False, True, False, False]
     rest = [0, 2, 3]
-    assert same(run(engine, 3, seed=1), run(other, 3, seed=1), rest)
+    assert same(run(engine, 2, seed=1), run(other, 2, seed=1), rest)
     assert engine.unstable().tolist() == [False, True, False, False], "until the reset"
     assert not other.unstable().any()
     # After a reset the row is as good as new.
@@ -129,7 +129,7 @@ def test_a_broken_row_is_reported_and_its_neighbours_do_not_change_by_a_bit(
     assert torch.equal(engine.sensordata[1], other.sensordata[1])
     for view in ("qvel", "ctrl", "xfrc_applied"):
         assert (getattr(engine, view)[1] == 0).all(), view
-    assert same(run(engine, 8, seed=4), run(other, 8, seed=4), [1])
+    assert same(run(engine, 3, seed=4), run(other, 3, seed=4), [1])
 
 
 def test_a_reset_touches_only_its_rows(engine: Either, other: Either, scenes: list[Scene]) -> None:

@@ -15,7 +15,7 @@ from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
 from bidex_meta.evaluation.trial_agents import AdaptingTrialAgent
 from bidex_meta.metaworld.adapters import FromMetaWorld
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.fakes import ToyWorld
 from tests.points import Climber, Finder, PointWorld, Still, ring
 
@@ -296,7 +296,7 @@ def test_one_protocol_says_what_is_played():
 
 @pytest.mark.parametrize("suite", ["ML1", "MT4-v2"])
 def test_others_are_tasks_of_another_seed(suite):
-    worlds = Worlds.open({"suite": suite, "threads": 1, "seed": 7})
+    worlds = open_worlds({"suite": suite, "threads": 1, "seed": 7})
     own, others = (each.world("train", 4).pools[0] for each in (worlds, worlds.others))
     assert own.shape == others.shape and not (own == others).all(1).any()
     benchmark = Benchmark(suite, seed=7)

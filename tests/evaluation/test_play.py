@@ -13,7 +13,7 @@ from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
 from bidex_meta.experiments.metatest import Options
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.algos.families import Passing
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
@@ -79,7 +79,7 @@ def test_python_and_the_commands_play_the_same_starts():
         place.reset(seed=seed)
         found.append(evaluate(ZeroAgent(place.action_space), place, 1).to_json())
     options = Options(episodes=1)
-    protocol = Worlds.open({"suite": "MT4"}).protocol("train", options.episodes, options.seed)
+    protocol = open_worlds({"suite": "MT4"}).protocol("train", options.episodes, options.seed)
     for seed in (EVALUATION_SEED, protocol.seed):
         place = ToyWorld(6, "DISABLED")
         found.append(evaluate(ZeroAgent(place.action_space), place, 1, seed=seed).to_json())

@@ -10,7 +10,7 @@ from bidex_meta.evaluation.references import Reference
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.tasks import registry
 from bidex_meta.utils import paths
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config
 
@@ -100,7 +100,7 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     suite = tmp_path / "mine.toml"
     text = (paths.suites_dir() / "MT1.toml").read_text().replace('base = "moving"', 'base = "alone"')
     suite.write_text(text.replace("CatchUnderarm", "HandOver"))
-    assert Worlds.open({"suite": str(suite)}).references() == {}
-    assert Worlds.open({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
+    assert open_worlds({"suite": str(suite)}).references() == {}
+    assert open_worlds({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()

@@ -12,7 +12,7 @@ from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 FOUR = ["CatchUnderarm-egg", "CatchUnderarm-block", "CatchUnderarm-gelatin_box", "CatchUnderarm-tennis_ball"]
 
@@ -54,7 +54,7 @@ def test_a_held_out_object_is_a_test_split() -> None:
 def test_success_is_told_by_object(tmp_path: Path) -> None:
     text = load_suite("MT1-objects").file.read_text()
     (tmp_path / "one.toml").write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 1"))
-    source = Worlds.open({"suite": str(tmp_path / "one.toml"), "threads": 1})
+    source = open_worlds({"suite": str(tmp_path / "one.toml"), "threads": 1})
     assert list(source.tasks("train")) == FOUR
     world = source.world("train", 4)
     found = evaluate(RandomAgent(world.action_space), world, 1, seed=0, references=source.references())

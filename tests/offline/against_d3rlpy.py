@@ -26,7 +26,7 @@ from bidex_meta.data.joined import Joined, join
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.run_data import implied, task_seed
 from bidex_meta.training.learner import Sources
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 ALGOS = ("td3bc", "iql")
 TRAIN = Path(__file__).with_name("d3rlpy_train.py")
@@ -100,7 +100,7 @@ def main() -> None:
     flags = parser.parse_args()
     dataset = open_dataset(flags.dataset)
     config = {"suite": None, "task": None, **implied([dataset]), "task_seed": task_seed([dataset])}
-    source = Worlds.open(config)
+    source = open_worlds(config)
     world, tested = source.world("train", len(source.tasks("train")), "SAME_STEP"), source.world()
 
     def judge(agent: Any) -> float:

@@ -50,7 +50,7 @@ def test_configs_of_a_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.Monke
         assert listing(place) == before
 
     try:
-        draws(300, of_files(of_values()), check)
+        draws(100, of_files(of_values()), check)
     finally:
         remove(path)
         path.write_bytes(whole)

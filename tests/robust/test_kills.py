@@ -83,7 +83,7 @@ def test_killed_runs_that_record(algo: str, seed: int, killer: subprocess.Popen[
     assert killed_often(algo, seed, killer, place, record=True)["recorded"]
 
 
-@pytest.mark.parametrize("stride", [15, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stride", [30, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_before_operations_on_files(stride: int, killer: subprocess.Popen[str], place: Path) -> None:
     """Runs of four iterations, each killed before another operation on a file of its folder."""
     whole = Victim(killer, arguments("mtppo", 4), place / f"{stride}whole")

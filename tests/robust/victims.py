@@ -25,7 +25,7 @@ from torch import Tensor
 from bidex_meta.cli import main
 from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.training import runner
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fake_world import FakePools
 from tests.points import ring
@@ -205,7 +205,7 @@ def serve() -> None:
     for algo in FLAGS:
         learner_kind(algo)
     for suite in ("MT4", "ML4"):
-        Worlds.open({"suite": suite}).task_classes()
+        open_worlds({"suite": suite}).task_classes()
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:
         print(json.dumps(do(json.loads(line))), file=answers, flush=True)

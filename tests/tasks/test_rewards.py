@@ -8,7 +8,7 @@ from bidex_meta.world import World
 from tests.tasks.formulas import FAILING, FORMULAS
 from tests.tasks.worlds import Lens, each_case, engine_of, mixed_world, scene_of, set_pose, task_of, world_of
 
-ROWS, STEPS = 12, 60
+ROWS, STEPS = 12, 40
 
 
 def judgements(world: World, name: str, lens: Lens) -> list:

@@ -13,12 +13,12 @@ from bidex_meta.utils import gl_backend
 from bidex_meta.viewer import playback
 from bidex_meta.viewer.browser import Browser, colour, shape, visible
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 
 
 @pytest.fixture(scope="module")
 def world():
-    return Worlds.open({"suite": "MT4", "threads": 1}).world("train", 4)
+    return open_worlds({"suite": "MT4", "threads": 1}).world("train", 4)
 
 
 @pytest.fixture

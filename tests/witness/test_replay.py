@@ -126,7 +126,7 @@ def test_the_baseline_of_witnesses_is_of_the_classes_that_have_one(tmp_path, mon
     world = ToyWorld(6, "DISABLED", 0)
     first, actions = world.task_names[0], np.zeros((2, *world.single_action_space.shape), np.float32)
     save_witness(tmp_path / first, actions, {"return": 1.0, "first_success": 0, "rival": None})
-    for module in ("witness.store", "cli.baseline"):
+    for module in ("witness.store", "experiments.baselines"):
         monkeypatch.setattr(f"bidex_meta.{module}.witness_path", lambda name: tmp_path / name)
     assert main(["baseline", "witness", "--suite", "MT4", "--episodes", "1", "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)) == [first]

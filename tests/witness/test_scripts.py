@@ -154,12 +154,12 @@ def test_a_script_of_version_2_brings_things_to_where_a_task_wants_them(
 ) -> None:
     if name in STATELESS:
         monkeypatch.setitem(WIDE_SCRIPTS, name, begun_anew(WIDE_SCRIPTS[name]))
-    world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
+    world = make_task_world(f"{name}-v2", 8, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
     world.reset(seed=4)
-    agent, rows = Scripted(world), torch.arange(50) < 4
+    agent, rows = Scripted(world), torch.arange(8) < 4
     agent.reset(rows)
     for _ in range(int(world.max_episode_steps.max())):
-        *_, info = world.step(agent.eval_action(torch.zeros(50, 1)))
+        *_, info = world.step(agent.eval_action(torch.zeros(8, 1)))
     assert int(info["running"]["success"][rows].sum()) >= 2 and not bool(info["running"]["success"][~rows].any())
 
 

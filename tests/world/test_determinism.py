@@ -49,19 +49,19 @@ SIZES = [
 @pytest.mark.parametrize(("name", "steps", "small"), [*SIZES, ("CatchOver2Underarm", 120, 8)])
 def test_a_rows_trajectory_does_not_depend_on_the_number_of_rows(name: str, steps: int, small: int) -> None:
     played = []
-    for rows in (small, 64):
+    for rows in (small, 24):
         world = class_world(name, rows)
         world.reset(seed=0)
-        played.append(play(world, random_actions(world, steps, rows=64)))
-    assert number_of_ends(played[1]) > 5
+        played.append(play(world, random_actions(world, steps, rows=24)))
+    assert number_of_ends(played[1]) > 2
     assert_same(*played, rows_a=slice(None), rows_b=slice(small))
 
 
 @pytest.mark.parametrize("name", ["TwoCatchUnderarm", "BottleCap", "DoorCloseInward", "DoorCloseInward-v2"])
-def test_128_resets_equal_128_fresh_worlds(name: str) -> None:
-    used = class_world(name, 128, "DISABLED", moving_base=True)
+def test_resets_equal_fresh_worlds(name: str) -> None:
+    used = class_world(name, 32, "DISABLED", moving_base=True)
     used.reset(seed=0)
-    odd, actions = torch.arange(128) % 2 == 1, random_actions(used, 30)
+    odd, actions = torch.arange(32) % 2 == 1, random_actions(used, 30)
     play(used, actions[:10])
     used.reset(options={"reset_mask": odd})
     play(used, actions[:5])  # the odd rows are reset in the midst of an episode, after few steps and after many

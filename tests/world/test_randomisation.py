@@ -17,7 +17,7 @@ from bidex_meta import Benchmark, BidexError, load_suite, make_task_world
 from bidex_meta.engine.models import differing_fields
 from bidex_meta.suite import FACTORS, Randomisation, load_randomisation
 from bidex_meta.world import World
-from bidex_meta.worlds import Worlds
+from bidex_meta.worlds import open_worlds
 from tests.world.play import assert_same, engine_state, flat, number_of_ends, play, random_actions
 from tests.world.test_graphs import recorded  # noqa: F401  (a fixture)
 from tests.world.test_masked import assert_steps_look_at_nothing, masked  # noqa: F401  (a fixture)
@@ -293,12 +293,12 @@ def test_bad_input(tmp_path: Path) -> None:
     file.write_text("[randomisation]\nfriction = [0.7, 1.3]\n")
     assert load_randomisation(file) == Randomisation(friction=(0.7, 1.3))
     for named in ({"suite": "MT4"}, {"task": "HandOver"}):
-        world = Worlds.open({**named, "randomisation": str(file)}).world(rows=4 if "suite" in named else 2)
+        world = open_worlds({**named, "randomisation": str(file)}).world(rows=4 if "suite" in named else 2)
         assert list(world.randomised) == ["friction"]  # type: ignore[attr-defined]
     with pytest.raises(BidexError, match="Worlds of our own are randomised, got metaworld/MT3"):
-        Worlds.open({"suite": "metaworld/MT3", "randomisation": str(file)})
+        open_worlds({"suite": "metaworld/MT3", "randomisation": str(file)})
     suite = randomised_suite(tmp_path)
-    worlds = Worlds.open({"suite": suite})
+    worlds = open_worlds({"suite": suite})
     assert not worlds.world(rows=4).randomised  # type: ignore[attr-defined]
     assert worlds.world("train", 4, "DISABLED").randomised  # type: ignore[attr-defined]  (to train so)
     assert flat(worlds.world(rows=4).reset(seed=0))  # it runs

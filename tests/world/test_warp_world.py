@@ -74,6 +74,8 @@ def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -
         ended |= now
         assert close(found["obs"][now], wanted["obs"][now]) if now.any() else True
         assert torch.equal(found["obs"][~now], found["info/final_obs"][~now])
+        if ended[:3].sum() >= 2:
+            break
     assert ended[:3].any(), "an egg was dropped"
 
 

@@ -1,4 +1,4 @@
-"""``Worlds.open``: own suites, single classes and Meta-World's suites answer the same questions."""
+"""``open_worlds``: own suites, single classes and Meta-World's suites answer the same questions."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.utils import paths
-from bidex_meta.worlds import Worlds, WorldsConfig
+from bidex_meta.worlds import WorldsConfig, open_worlds
 
 CORE = Path(paths.__file__).parents[1]
 
@@ -36,7 +36,7 @@ WORLDS: list[Any] = [
 
 @pytest.mark.parametrize(("named", "expected"), WORLDS, indirect=["named"])
 def test_worlds_of_each_split(named: dict[str, object], expected: dict[str, tuple[int, ...]]) -> None:
-    source = Worlds.open(named)
+    source = open_worlds(named)
     assert source.name == (named.get("suite") or named["task"])
     assert source.splits == list(expected)
     for split, (slots, tasks, rows, observations, actions) in expected.items():
@@ -53,20 +53,20 @@ def test_worlds_of_each_split(named: dict[str, object], expected: dict[str, tupl
 
 
 def test_tasks_are_called_as_the_suite_file_calls_them() -> None:
-    ml1 = Worlds.open({"suite": "ML1"})
+    ml1 = open_worlds({"suite": "ML1"})
     assert ml1.tasks("train") == {"CatchUnderarm": ["original", "left", "right"]}
-    assert ml1.tasks("test") == {"CatchUnderarm": ["back"]} and Worlds.open({"suite": "MT4"}).tasks("test") == {}
+    assert ml1.tasks("test") == {"CatchUnderarm": ["back"]} and open_worlds({"suite": "MT4"}).tasks("test") == {}
 
 
 def test_defaults_follow_the_source() -> None:
     own, alone, foreign = (
-        Worlds.open(config) for config in ({"suite": "ML1"}, {"task": "HandOver"}, {"suite": "metaworld/MT10"})
+        open_worlds(config) for config in ({"suite": "ML1"}, {"task": "HandOver"}, {"suite": "metaworld/MT10"})
     )
     assert [s.hides_goals for s in (own, alone, foreign)] == [True, False, False]
     assert [s.on_gpu for s in (own, alone, foreign)] == [True, True, False]
     assert [s.default_episodes for s in (own, alone, foreign)] == [4, 4, 1]
     assert [s.preset and s.preset[0] for s in (own, alone, foreign)] == [None, None, "metaworld"]
-    of_version_2 = (Worlds.open(config) for config in ({"suite": "ML1-v2"}, {"task": "HandOver-v2"}))
+    of_version_2 = (open_worlds(config) for config in ({"suite": "ML1-v2"}, {"task": "HandOver-v2"}))
     assert [s.preset and s.preset[0] for s in of_version_2] == ["v2", "v2"]
     assert own.rows_and_steps("cpu", adapts=True) == (300, 20_000_000)
     assert alone.rows_and_steps("cuda:0", adapts=False) == (8192, 200_000_000)
@@ -76,19 +76,19 @@ def test_defaults_follow_the_source() -> None:
 def test_a_meta_suite_may_show_its_goals(tmp_path: Path) -> None:
     file = tmp_path / "shown.toml"
     file.write_text((paths.suites_dir() / "ML4.toml").read_text().replace('"masked"', '"plain"'))
-    shown = Worlds.open({"suite": str(file), "threads": 1})
+    shown = open_worlds({"suite": str(file), "threads": 1})
     assert not shown.hides_goals and shown.splits == ["train", "test"]
 
 
 def test_references_are_of_moving_bases() -> None:
-    assert Worlds.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
+    assert open_worlds({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
     for config in ({"task": "HandOver"}, {"suite": "metaworld/MT3"}, {"task": "gymnasium/Humanoid-v5"}):
-        assert Worlds.open(config).references() == {}
-    assert Worlds.open({"task": "HandOver", "base": "moving"}).references()
+        assert open_worlds(config).references() == {}
+    assert open_worlds({"task": "HandOver", "base": "moving"}).references()
 
 
 def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
-    source = Worlds.open({"task": "Switch", "threads": 1})
+    source = open_worlds({"task": "Switch", "threads": 1})
     world = source.world()
     found = source.judge(ZeroAgent(world.action_space), world, source.protocol("train", 1, 3))
     world.close()
@@ -106,7 +106,7 @@ def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
 )
 def test_an_unknown_name_is_one_line(config: dict[str, object], told: str) -> None:
     with pytest.raises(BidexError) as error:
-        Worlds.open(config)
+        open_worlds(config)
     assert str(error.value).startswith(told) and "\n" not in str(error.value)
 
 
@@ -123,12 +123,12 @@ def test_an_unknown_name_is_one_line(config: dict[str, object], told: str) -> No
 )
 def test_a_world_that_cannot_be_is_refused(config: dict[str, object], split: str, told: str) -> None:
     with pytest.raises(BidexError) as error:
-        Worlds.open(config).world(split)
+        open_worlds(config).world(split)
     assert told in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_config_is_taken_as_it_is_or_from_a_run() -> None:
     config = WorldsConfig(task="HandOver", seed=1, task_seed=5)
     of_run = {"task": "HandOver", "suite": None, "algo": "ppo", "seed": 1, "task_seed": 5}
-    assert WorldsConfig.of(of_run) == config == Worlds.open(config).config
-    assert Worlds.open(of_run).seed == 5
+    assert WorldsConfig.of(of_run) == config == open_worlds(config).config
+    assert open_worlds(of_run).seed == 5

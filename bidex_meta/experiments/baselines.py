@@ -1,0 +1,87 @@
+"""Measure the references of the normalised score: policies that have learned nothing, and the best known ones."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.evaluation import references
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.runs.atomic import check_writable
+from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.files import portable
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
+from bidex_meta.witness.scripts import scripts_of
+from bidex_meta.witness.store import load_witness, witness_path
+from bidex_meta.world.world import World
+from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
+
+POLICIES = {
+    "random": "uniform actions",
+    "zero": "zero actions",
+    "witness": "the witness of task 0, open loop",
+    "script": "the script of the class, by the state of each step",
+}
+_STORED = ("return", "return_interval", "success", "episodes", "unstable")
+
+
+def baseline(
+    policy: str, suite: str, *, episodes: int = 4, seed: int = 0, threads: int | None = None, out: Path | None = None
+) -> Evaluation:
+    """Measure a policy of ``POLICIES`` on a suite's train tasks, and store the figures in ``out`` if it is given.
+
+    Args:
+        policy: Name of the policy.
+        suite: Suite whose classes have moving bases.
+        episodes: Episodes of each task.
+        seed: Seed of tasks, starts and actions.
+        threads: Threads of the physics; None: one per core.
+        out: JSON file that takes the figures, beside those of other classes.
+
+    Raises BidexError for bad input, before anything is measured.
+    """
+    policy = known_name("baseline", policy, POLICIES)
+    if out is not None:
+        references.load_from(out)
+        check_writable(out)
+    worlds = open_worlds(WorldsConfig(suite=suite, seed=seed, threads=threads))
+    if not worlds.moving_bases:
+        raise BidexError(f'References are of moving bases, but {suite} has fixed ones. Write base = "moving".')
+    if policy == "script":
+        found = _scripted(worlds, episodes)
+    else:
+        found = _played(policy, worlds, episodes, seed)
+    if out is not None:
+        made = {"policy": POLICIES[policy], "suite": portable(suite), "seed": seed, "versions": collect_versions()}
+        rows = found.to_json()["classes"]
+        references.store(out, {name: {key: row[key] for key in _STORED} for name, row in rows.items()}, made)
+    return found
+
+
+def _played(policy: str, worlds: Worlds, episodes: int, seed: int) -> Evaluation:
+    world = worlds.world()
+    names = world.task_names
+    if policy == "random":
+        agent = RandomAgent(world.action_space, seed)
+    elif policy == "zero":
+        agent = ZeroAgent(world.action_space)
+    else:
+        witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
+        agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
+        names = list(witnesses)
+    found = evaluate(agent, world, episodes, references={})
+    world.close()
+    return replace(found, classes={name: found.classes[name] for name in names})
+
+
+def _scripted(worlds: Worlds, episodes: int) -> Evaluation:
+    """Evaluate the scripts of all classes that have one."""
+    scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
+    names = [name for name in worlds.task_classes() if name in scripts]
+    if not names:
+        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {worlds.name}.")
+    world = worlds.world()
+    assert isinstance(world, World)
+    found = evaluate(Scripted(world, names=names), world, episodes, references={})
+    world.close()
+    return replace(found, classes={name: found.classes[name] for name in names})
