@@ -17,8 +17,9 @@ from tests.fakes import change, run_config
 pytestmark = pytest.mark.usefixtures("finder")
 
 
-def test_a_run_ends_with_the_table_of_each_split_and_trains_on_the_learners_kind_of_world(capsys, request):
-    run = request.getfixturevalue("adapted")  # after capsys, so that what it prints is caught
+def test_a_run_ends_with_the_table_of_each_split_and_trains_on_the_learners_kind_of_world(capsys, tmp_path):
+    run = tmp_path / "r"
+    assert main(["run", *FINDER, "--run-dir", str(run)]) == 0
     shown = capsys.readouterr()
     for split, classes in COUNTS.items():
         assert f"24 steps, {split} tasks" in shown.out
@@ -68,7 +69,8 @@ def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(
     assert "after 0" in none and "after 1" not in none and "gained" not in none
 
 
-def test_hidden_rewards_are_a_second_row_and_are_verified(adapted, shown, tmp_path):
+def test_hidden_rewards_are_a_second_row_and_are_verified(adapted, shown, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # narrower tables break names
     flags = ["evaluate", adapted, "--split", "test", "--hidden-rewards"]
     table = shown(*flags)
     assert [word in table for word in ("shown", "hidden", "after 2")] == [True] * 3
