@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	done)
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c constraints.txt
+PIP := $(BIN)/python -m pip install --no-compile --disable-pip-version-check --no-input -c constraints.txt
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
