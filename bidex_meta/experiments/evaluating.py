@@ -153,6 +153,7 @@ class FinalEvaluation:
     shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 2.
     rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
     tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
+    hidden_rewards: Switch = False  # That evaluation is also played with its rewards hidden.
 
     def check(self, config: AnyConfig) -> None:
         """Raise BidexError for a bad value, and if an option does not go with the learner of a resolved config."""
@@ -163,6 +164,8 @@ class FinalEvaluation:
                 raise BidexError(f"{config.algo} adapts: --split others plays unseen tasks of its train classes.")
             metatest.splits_of(open_worlds(config.to_json()), self.split)
             return
+        if self.hidden_rewards:
+            raise BidexError(f"{config.algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
         for name in ("split", "shots", "rollouts", "tasks"):
             if getattr(self, name) not in (None, "auto"):
                 raise BidexError(
@@ -175,7 +178,7 @@ class FinalEvaluation:
         if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
             return meta_test(
                 run, split=self.split, shots=self.shots, rollouts=self.rollouts, episodes=self.episodes,
-                tasks=self.tasks, device=device, engine=config.engine, save=True,
+                tasks=self.tasks, hidden_rewards=self.hidden_rewards, device=device, engine=config.engine, save=True,
             )  # fmt: skip
         return evaluate(
             run, episodes=self.episodes, random=True, other_tasks=self.other_tasks, device=device,

@@ -35,13 +35,17 @@ def test_a_run_ends_with_the_table_of_each_split_and_trains_on_the_learners_kind
 
 def test_flags_say_what_the_meta_test_of_a_run_plays(tmp_path, refused):
     path, flags = tmp_path / "r", ["run", *FINDER, "--run-dir"]
-    asked = ["--split", "test", "--shots", "2", "--rollouts", "7", "--tasks", "1"]
+    asked = ["--split", "test", "--shots", "2", "--rollouts", "7", "--tasks", "1", "--hidden-rewards"]
     assert main([*flags, str(path), *asked]) == 0
     splits = json.loads((path / "evaluation.json").read_text())["splits"]
     assert list(splits) == ["test"] and [splits["test"][name] for name in ("shots", "rollouts", "trials")] == [2, 7, 5]
+    assert len(splits["test"]["hidden_by_shot"]) == 3
     # A resumed run may differ.
-    assert not {"split", "shots", "rollouts", "tasks"} & RunFolder.open(path).config().to_json().keys()
+    assert (
+        not {"split", "shots", "rollouts", "tasks", "hidden_rewards"} & RunFolder.open(path).config().to_json().keys()
+    )
     assert "--rollouts" in refused(*flags, tmp_path / "other", "--rollouts", "0")
+    assert "--hidden-rewards" in refused(*flags, tmp_path / "other", "--hidden-rewards", "--algo", "mtppo")
     other = refused(*flags, tmp_path / "other", "--shots", "2", "--algo", "mtppo")
     assert "--shots is for learners that adapt" in other and not (tmp_path / "other").exists()
 

@@ -25,7 +25,10 @@ SHOWN = "goal-shown PPO"
 _GIVEN = {"icl": "teachers, rewards of other goals"}
 """What learners see in training beyond the rewards of their own episodes, by the learner's name."""
 _OWN = "own rewards"
-_HEAD = ("learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "gap closed")
+_HEAD = (
+    "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
+    "gap closed",
+)  # fmt: skip
 _GOAL_SHOWN_AT_LEAST = 0.6
 _BLIND_AT_MOST = 0.15
 _PAIRS_AT_LEAST = 3
@@ -38,6 +41,8 @@ class Line:
     given: str
     shares: list[list[float]] = field(default_factory=list)
     """Per seed the success after 0, 1, ... exploring episodes, mean over classes; of PPO one number."""
+    hidden: list[float] = field(default_factory=list)
+    """Per seed the success after all exploring episodes in an episode that hides its rewards, if that was played."""
     steps: list[int] = field(default_factory=list)
     minutes: list[float] = field(default_factory=list)
 
@@ -101,6 +106,9 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
             continue
         line = found.setdefault(suite, {}).setdefault(*_named(run))
         line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
+        evaluation = run.evaluation()
+        if isinstance(evaluation, MetaTestEvaluation) and (shots := evaluation.splits[split].hidden_by_shot):
+            line.hidden.append(float(np.mean([shots[-1].classes[name].success for name in names])))
         line.steps.append(run.content["steps"])
         line.minutes.append(run.content["seconds"] / 60)
     return {suite: dict(sorted(lines.items(), key=_place)) for suite, lines in sorted(found.items())}
@@ -140,6 +148,10 @@ def _place(item: tuple[str, Line]) -> tuple[int, float]:
 def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
     shown = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*line.shares, strict=True)]
     shown += [""] * (3 - len(shown))
+    if line.hidden:
+        shown.append(mean_and_range(100.0 * np.array(line.hidden), ".3g", " %"))
+    else:
+        shown.append("")
     closed = ""
     if SHOWN in lines and BLIND in lines and name not in (SHOWN, BLIND):
         low = lines[BLIND].last.mean()

@@ -1,0 +1,102 @@
+"""The table of the ladder: lines, the gap that is closed, pairs, and the rule that a suite keeps or not."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, PolicyEvaluation, SplitSummary, Summary
+from tools.pages.ladder import BLIND, SHOWN, ladder_figure, ladder_table
+
+SUITE = "ML1-Door-choice4"
+
+
+def summary(success: float) -> Summary:
+    return Summary(classes={"Door": ClassSummary(success=success, mean_return=1.0)})
+
+
+def run(arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None) -> Any:
+    """A stored run: of a learner that adapts if there is success after several numbers of episodes."""
+    if len(success) == 1:
+        found: Any = PolicyEvaluation(policy=summary(success[0]))
+        algo = "mtppo"
+    else:
+        shots = [summary(share) for share in success]
+        split = SplitSummary(
+            split="test", shots=2, rollouts=1, trials=1, before=shots[0], after=shots[-1], by_shot=shots,
+            rewards_shown=True, hidden_by_shot=None if hidden is None else [summary(hidden)] * 3,
+        )  # fmt: skip
+        found = MetaTestEvaluation(splits={"test": split})
+        algo = arm
+    content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}}
+    config = SimpleNamespace(algo=algo, seed=seed)
+    return SimpleNamespace(arm=arm, content=content, evaluation=lambda: found, config=lambda: config)
+
+
+def table(*runs: Any) -> list[str]:
+    study: Any = SimpleNamespace(split=None, runs=runs)
+    return list(ladder_table(study))
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def learners(shown: float = 0.9, blind: float = 0.1) -> list[Any]:
+    runs = []
+    for seed in (0, 1):
+        runs.append(run("ppo", seed, shown + 0.02 * seed, suite=SUITE.replace("ML", "MT")))
+        runs.append(run("ppo", seed, blind))
+        runs.append(run("icl", seed, 0.1, 0.8, 0.9))
+        runs += [
+            run(name, seed, 0.1, level, level + 0.01 * seed) for name, level in (("a", 0.7), ("b", 0.4), ("c", 0.2))
+        ]
+    return runs
+
+
+def test_lines_stand_between_goal_shown_and_blind() -> None:
+    lines = table(*learners())
+    assert lines[0] == f"**{SUITE}**"
+    rows = [cells(line) for line in lines[4:10]]
+    assert [row[0] for row in rows] == [SHOWN, "icl", "a", "b", "c", BLIND]
+    assert rows[1][1] == "teachers, rewards of other goals" and rows[2][1] == "own rewards"
+    assert rows[2][2:5] == ["2", "1,000", "2"]
+    assert rows[2][5:9] == ["10 % (10 to 10)", "70 % (70 to 70)", "70.5 % (70 to 71)", ""]
+    assert rows[2][-1].startswith(f"{100 * (0.705 - 0.1) / (0.91 - 0.1):.0f} %")
+    assert rows[0][-1] == rows[-1][-1] == ""
+
+
+def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
+    lines = table(*learners())
+    assert "The suite separates learners: 3 pairs of reward-only learners do not overlap." in lines
+    pairs = [cells(line) for line in lines[-3:]]
+    assert [(first, second, apart) for first, second, _, apart in pairs] == [
+        ("a", "b", "yes"), ("a", "c", "yes"), ("b", "c", "yes")
+    ]  # fmt: skip
+    assert pairs[0][2].startswith("1.00")
+
+
+@pytest.mark.parametrize(
+    ("runs", "told"),
+    [
+        (learners(shown=0.5), "goal-shown PPO reaches 51%"),
+        (learners(blind=0.3), "blind PPO reaches 30%, at most 25%"),
+        (learners()[:4], "0 pairs of reward-only learners"),
+        ([run("a", 0, 0.1, 0.2, 0.3)], "Not judged yet"),
+    ],
+)
+def test_what_a_suite_lacks_is_told(runs: list[Any], told: str) -> None:
+    assert any(told in line for line in table(*runs))
+
+
+def test_seeds_that_overlap_are_not_separated_and_hidden_rewards_have_a_column() -> None:
+    runs = [run("a", 0, 0.1, 0.5, 0.5, hidden=0.3), run("a", 1, 0.1, 0.9, 0.9, hidden=0.5)]
+    runs += [run("b", 0, 0.1, 0.4, 0.6), run("b", 1, 0.1, 0.4, 0.2)]
+    lines = table(*runs)
+    assert cells(lines[4])[8] == "40 % (30 to 50)" and cells(lines[5])[8] == ""
+    assert cells(lines[-1])[-1] == "no"
+
+
+def test_the_figure_has_a_panel_for_each_suite() -> None:
+    study: Any = SimpleNamespace(split=None, runs=[*learners(), run("a", 0, 0.1, 0.2, 0.3, suite="ML1-Other-choice2")])
+    assert [axis.get_title() for axis in ladder_figure(study).axes] == [SUITE, "ML1-Other-choice2"]
