@@ -13,10 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.learner import as_numbers
+from bidex_algos.meta.config import USUAL_STEPS
 from bidex_algos.meta.trial_learner import TrialLearner
-from bidex_algos.meta.trials import Batch, Sampling, TrialConfig, Trials, make_batch, of_task
+from bidex_algos.meta.trials import Batch, Sampling, Trials, make_batch, of_task
 from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import Activation
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
@@ -24,20 +26,41 @@ from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PPOConfig, mini_batch
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import all_sum, sum_gradients, world_size
 from bidex_meta.training.learner import Parts
-from bidex_meta.utils.validation import Finite, Positive, check_rising
+from bidex_meta.utils.validation import Count, Finite, Fraction, Positive, Widths, check_rising
 from bidex_meta.world.contract import PooledWorld
 
 
 @dataclass(frozen=True)
-class RL2Config(PPOConfig, TrialConfig):
+class RL2Config(PPOConfig):
     """All options of RL²; the defaults are the preset ``laptop``."""
 
+    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
+    activation: Activation = "elu"  # Non-linearity of the encoder.
+    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
+    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
+    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
+    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
+    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
+    blind_share: Fraction = 0.0
+    """Share of the episodes whose rewards the policy is not shown, as in a meta-test with hidden rewards."""
+    reward_unit: Positive = 0.01
+    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
+    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    chunk: Count | None = None
+    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and critic apart.
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
     value_horizon: Positive = 100.0
     """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
+
+    @property
+    def trial_steps(self) -> int:
+        """Return the maximum steps of a trial; for whole episodes an estimate, until a learner knows its world."""
+        return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,42 +11,12 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.advantages import explained_variance, gae, normalise_per_task, task_moments
-from bidex_algos.meta.config import USUAL_STEPS
-from bidex_algos.nets.networks import Activation, gaussian_log_prob
+from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils import maths
-from bidex_meta.utils.validation import Count, Fraction, Positive, Widths
 from bidex_meta.world.contract import VectorWorld
-
-
-@dataclass(frozen=True)
-class TrialConfig(LearnerConfig):
-    """Options of the networks and trials of RL²."""
-
-    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
-    activation: Activation = "elu"  # Non-linearity of the encoder.
-    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
-    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
-    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
-    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
-    blind_share: Fraction = 0.0
-    """Share of the episodes whose rewards the policy is not shown, as in a meta-test with hidden rewards."""
-    reward_unit: Positive = 0.01
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
-    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
-    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
-    chunk: Count | None = None
-    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
-
-    @property
-    def trial_steps(self) -> int:
-        """Return the maximum steps of a trial; for whole episodes an estimate, until a learner knows its world."""
-        return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
@@ -245,10 +215,29 @@ def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
     return outputs.gather(2, task_id.expand(len(outputs), -1)[..., None]).squeeze(-1)
 
 
+class Discounting(Protocol):
+    """The options by which a trial is cut and its rewards are discounted."""
+
+    @property
+    def chunk(self) -> int | None:
+        """Return the steps that gradients flow back through the memory; None: the whole trial."""
+        ...
+
+    @property
+    def gamma(self) -> float:
+        """Return the discount per step."""
+        ...
+
+    @property
+    def lam(self) -> float:
+        """Return the trace decay of the advantage estimate."""
+        ...
+
+
 @torch.no_grad()
 def make_batch(
     t: Trials, policy: RecurrentPolicy, critic: nn.Module, return_stats: RunningStats, task_id: Tensor,
-    config: TrialConfig
+    config: Discounting
 ) -> tuple[Batch, Tensor]:  # fmt: skip
     """Pass a trial through the networks, chunk by chunk from empty memories, and estimate advantages.
 
