@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	done)
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --no-compile --disable-pip-version-check --no-input -c constraints.txt
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c constraints.txt
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
@@ -41,6 +41,9 @@ run: .venv/.installed
 # pyright needs one core for a minute, so it runs beside the tests.
 test: style
 	@$(MAKE) --no-print-directory -j 2 types tests
+
+# Hundreds of tests start a process: it reads compiled modules, even where the environment forbids writing them.
+tests test-all test-parity: export PYTHONDONTWRITEBYTECODE :=
 
 tests: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
