@@ -37,7 +37,7 @@ HIDDEN_NUMBERS = {
     "CatchAbreast": 3, "CatchOver2Underarm": 3, "CatchUnderarm": 3, "HandOver": 3, "LiftUnderarm": 3, "StackBlock": 3,
     "PushBlock": 4, "TwoCatchUnderarm": 6,
 }  # fmt: skip
-"""How many numbers a task of each class hides in version 2."""
+"""Number of values that a task of each class hides in version 2."""
 _OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
 
 
@@ -45,9 +45,9 @@ class Rung(NamedTuple):
     """A step of the ladder: suites that hide about as much."""
 
     hidden: str
-    """What a task hides."""
+    """Hidden part of a task, in words."""
     budget: str
-    """What a learner needs at least, by our measurements and estimates (docs/results/ladder.md)."""
+    """Time that a learner may take. An estimate: docs/results/ladder.md has no figures of most rungs yet."""
 
 
 RUNGS = (

@@ -126,7 +126,7 @@ def read_entry(path: Path) -> Entry:
     content = read_json(path, "an entry of the leaderboard")
     entry = parse(content, Entry, str(path), exact=True)
     if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
     for fault in _faults(entry, path):
         raise BidexError(f"{path}: {fault}. Submit it anew.")
     return entry
@@ -137,11 +137,11 @@ def read_trial_entry(path: Path) -> TrialEntry:
     content = read_json(path, "an entry of the leaderboard")
     entry = parse(content, TrialEntry, str(path))
     if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
     parse_evaluation(content["evaluation"], f"{path}: evaluation")
     check_trials(entry.evaluation, str(path))
     if path.name != entry_name(entry.evaluation.suite or "", entry.name):
-        raise BidexError(f"{path}: expected a file named SUITE-NAME.json of its entries. Submit it anew.")
+        raise BidexError(f"{path}: expected a file named SUITE-NAME.json of its entries. Submit it again.")
     return entry
 
 

@@ -1,8 +1,8 @@
-"""Whether a task can be told by how its episodes begin.
+"""Probes that guess a task from how its episodes begin.
 
 A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
-et al. 2020, arXiv 1912.03820). Two probes guess the task, or what it hides, from first observations of other episodes:
-the nearest neighbour and a ridge regression. Neither does better than chance if nothing shows the task.
+et al. 2020, arXiv 1912.03820). There are two probes, of the task and of what it hides: the nearest neighbour among
+other episodes, and a ridge regression on them. Neither does better than chance if nothing shows the task.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _RIDGE = 1.0
 
 @dataclass(frozen=True)
 class Memorised:
-    """What first observations of one class tell about its tasks."""
+    """Results of the probes for one class."""
 
     named: float
     """Share of the episodes whose task the better probe names."""
@@ -41,8 +41,8 @@ def memorised(world: World, episodes: int = 10, seed: int = 0) -> dict[str, Memo
         tasks = world.task_index[rows].cpu().numpy()
         labels = np.eye(int(tasks.max()) + 1)[tasks]
         hidden = world.pools[index][tasks]
-        told = np.broadcast_to(labels, (episodes, *labels.shape))
-        guesses = _guesses(seen, told, np.arange(episodes)[:, None].repeat(len(tasks), 1))
+        targets = np.broadcast_to(labels, (episodes, *labels.shape))
+        guesses = _guesses(seen, targets, np.arange(episodes)[:, None].repeat(len(tasks), 1))
         named = max(float((guess.argmax(-1) == tasks).mean()) for guess in guesses)
         values = np.broadcast_to(hidden, (episodes, *hidden.shape))
         explained = max(_r2(guess, values) for guess in _guesses(seen, values, tasks[None].repeat(episodes, 0)))
@@ -57,10 +57,10 @@ def _standardised(starts: np.ndarray) -> np.ndarray:
     return np.where(changing, (starts - starts.mean((0, 1))) / np.where(changing, deviation, 1.0), 0.0)
 
 
-def _guesses(seen: np.ndarray, told: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both probes' predictions of ``told`` (episodes, n, k), each from the groups in the other folds."""
+def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both probes' predictions of ``targets`` (episodes, n, k), each from the groups in the other folds."""
     x = seen.reshape(-1, seen.shape[-1])
-    y = told.reshape(-1, told.shape[-1])
+    y = targets.reshape(-1, targets.shape[-1])
     fold = groups.reshape(-1) % _FOLDS
     nearest = np.zeros_like(y)
     linear = np.zeros_like(y)
@@ -72,7 +72,7 @@ def _guesses(seen: np.ndarray, told: np.ndarray, groups: np.ndarray) -> tuple[np
         mean = y[train].mean(0)
         square = x[train].T @ x[train] + _RIDGE * len(x) * np.eye(x.shape[1])
         linear[test] = mean + x[test] @ np.linalg.solve(square, x[train].T @ (y[train] - mean))
-    return nearest.reshape(told.shape), linear.reshape(told.shape)
+    return nearest.reshape(targets.shape), linear.reshape(targets.shape)
 
 
 def _r2(guess: np.ndarray, values: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""What data sets hold, as rows of tables and as text."""
+"""Tables and text about the content of data sets."""
 
 from dataclasses import asdict
 

@@ -45,7 +45,7 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
         raise BidexError(f"Expected a suite of hands, got {worlds.name}.")
     results = _results(worlds, world, runs)
     say("what first observations tell")
-    told = memorised(world, seed=worlds.seed)
+    starts = memorised(world, seed=worlds.seed)
     rows: dict[str, Json] = {}
     for slot in world.slots:
         found = results[slot.name]
@@ -59,7 +59,7 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
             "blind": blind_ceiling(slot.task_class, seed=worlds.seed),
             **identified,
             **untrained,
-            **asdict(told[slot.name]),
+            **asdict(starts[slot.name]),
             "solved": max(known.values(), default=None),
             "alignment": aligned and asdict(aligned),
             "policies": {name: [each.success, each.mean_return] for name, each in found.items()},

@@ -210,7 +210,7 @@ def _tasks(world: TaskWorld) -> Tensor:
     if getattr(world, "endless", False):
         raise BidexError(
             "pearl: expected a fixed number of train tasks, because it replays transitions by task, got "
-            "tasks_per_class 0. Use --tasks-per-class 100, say, with as many environments per class."
+            "tasks_per_class 0. Use --tasks-per-class 100 or another number, and as many environments per class."
         )
     for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
         if rows.stop - rows.start < tasks:
