@@ -39,6 +39,8 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     device = resolve_device(config.device, source.on_gpu)
     preset, _ = choose_preset(kind, config.preset, device, source.preset)
     num_envs, steps = source.rows_and_steps(device, Capability.ADAPTS in kind.make.capabilities)
+    if kind.make.environments_per_class and device == "cpu":
+        num_envs = kind.make.environments_per_class * len(source.tasks("train"))
     if Capability.OFFLINE in kind.make.capabilities:
         num_envs = max(1, len(source.tasks("train")))  # it takes sizes and names from its world
         steps = run_data.UPDATES

@@ -99,6 +99,8 @@ class Learner(ABC):
     """Capabilities that commands and training rely on."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
+    environments_per_class: int | None = None
+    """Default number of environments of each class on a CPU; None: the default of the suite."""
     env_steps: int
     """Environment steps so far, over all environments of all processes; offline: updates."""
 

@@ -81,6 +81,11 @@ def test_a_resolved_config_is_complete_and_stays_as_it_is() -> None:
     assert None not in (config.num_envs, config.steps, config.threads) and resolve(config) == config
 
 
+@pytest.mark.parametrize(("suite", "algo", "rows"), [("ML1-Switch-v2", "rl2", 16), ("ML4-v2", "varibad", 48)])
+def test_learners_of_whole_trials_take_few_environments_of_each_class(suite: str, algo: str, rows: int) -> None:
+    assert resolve(RunConfig(suite=suite, algo=algo, device="cpu")).num_envs == rows
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

@@ -1,12 +1,14 @@
 """The table of the ladder: lines, the gap that is closed, pairs, and the rule that a suite keeps or not."""
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, PolicyEvaluation, SplitSummary, Summary
-from tools.pages.ladder import BLIND, SHOWN, ladder_figure, ladder_table
+from tools.pages.ladder import BLIND, SHOWN, ladder_figure, ladder_table, suites_table
 
 SUITE = "ML1-Door-choice4"
 
@@ -74,6 +76,19 @@ def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
         ("a", "b", "yes"), ("a", "c", "yes"), ("b", "c", "yes")
     ]  # fmt: skip
     assert pairs[0][2].startswith("1.00")
+
+
+def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None:
+    rows = {"Door": {"hidden": ["left_angle"], "blind": 0.25, "named": None, "identified": 1.0}}
+    (tmp_path / "validity").mkdir()
+    (tmp_path / "validity" / f"{SUITE}.json").write_text(json.dumps({"classes": rows}))
+    runs = learners()
+    runs[0].path = tmp_path / "data" / "ladder.json"
+    study: Any = SimpleNamespace(split=None, runs=runs)
+    row = cells(list(suites_table(study))[2])
+    assert row == [SUITE, "left_angle", "25.0 %", "", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
+    runs[0].path = tmp_path / "elsewhere" / "data" / "ladder.json"
+    assert cells(list(suites_table(study))[2])[:5] == [SUITE, "", "", "", ""]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table, shots_figure, shots_table
-from tools.pages.ladder import ladder_figure, ladder_table
+from tools.pages.ladder import ladder_figure, ladder_table, suites_table
 from tools.pages.leaderboard import leaderboard_table, trials_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
@@ -35,6 +35,7 @@ _TABLES = {
     "gains": gains_table,
     "shots": shots_table,
     "ladder": ladder_table,
+    "ladder-suites": suites_table,
     "offline": offline_table,
     "rows": rows_table,
 }
@@ -45,7 +46,7 @@ _FIGURES = {
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
-_JOINED = ("ladder", "ladder-curves")
+_JOINED = ("ladder", "ladder-suites", "ladder-curves")
 """Tables and pictures of all suites of a study, which others show one by one."""
 _DIGEST = "Description"
 """Entry of a picture's PNG metadata: the digest of its data."""

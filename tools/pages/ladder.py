@@ -1,15 +1,18 @@
 """The ladder: meta-learners between a policy that sees neither goal nor rewards and one that sees the goal."""
 
+import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bidex_meta.evaluation.statistics import crossed_estimate, probability_of_improvement
 from bidex_meta.runs import plots
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study
@@ -29,6 +32,8 @@ _HEAD = (
     "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
     "gap closed",
 )  # fmt: skip
+_VALIDITY = {"blind": "blind at best", "named": "named by its start", "identified": "identified"}
+"""Figures of ``bidex-meta validity`` and their headings."""
 _GOAL_SHOWN_AT_LEAST = 0.6
 _BLIND_AT_MOST = 0.15
 _PAIRS_AT_LEAST = 3
@@ -69,6 +74,33 @@ def ladder_table(*studies: Study) -> Iterator[str]:
         if pairs:
             head = ("first", "second", "probability that the first is better [95 %]", "separated")
             yield from ("", *table(head, pairs))
+
+
+def suites_table(*studies: Study) -> Iterator[str]:
+    """Yield a table of suites: what a policy can reach blind, what tells the task, and what both lines of PPO reach.
+
+    All but PPO's lines are from ``validity/SUITE.json`` next to the folder of data; means over classes.
+    """
+    rows = []
+    for suite, lines in _suites(studies).items():
+        file = studies[0].runs[0].path.parent.parent / "validity" / f"{suite}.json"
+        classes = _classes(file)
+        hidden = sorted({part for row in classes for part in row["hidden"]})
+        cells = [suite, ", ".join(hidden)]
+        for figure in _VALIDITY:
+            known = [row[figure] for row in classes if row.get(figure) is not None]
+            cells.append(f"{np.mean(known):.1%}".replace("%", " %") if known else "")
+        for line in (BLIND, SHOWN):
+            cells.append(mean_and_range(100.0 * lines[line].last[:, 0], ".3g", " %") if line in lines else "")
+        rows.append(cells)
+    yield from table(("suite", "hidden", *_VALIDITY.values(), BLIND, SHOWN), rows)
+
+
+def _classes(file: Path) -> list[Json]:
+    """Return the rows of a file of ``bidex-meta validity``; none if there is no such file."""
+    if not file.is_file():
+        return []
+    return list(json.loads(file.read_text())["classes"].values())
 
 
 def ladder_figure(*studies: Study) -> "Figure":

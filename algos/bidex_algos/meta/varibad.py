@@ -49,7 +49,7 @@ class VariBADConfig(RL2Config):
 # v2: as RL²'s (rl2.py). Beliefs are learned from whole trials, whatever the chunk.
 PRESETS: dict[str, VariBADConfig] = {
     "laptop": VariBADConfig(),
-    "v2": VariBADConfig(gamma=0.99, init_std=0.3, chunk=125, hidden=(128, 128), num_minibatches=8, epochs=3),
+    "v2": VariBADConfig(gamma=0.99, init_std=0.3, chunk=125, hidden=(128, 128), num_minibatches=4, epochs=3),
 }
 
 
