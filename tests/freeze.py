@@ -155,6 +155,9 @@ def _differences(was: Any, now: Any, where: str) -> Iterator[str]:
 
 def main(what: str, *parts: str) -> int:
     """``write`` or ``compare``, of all parts or those named; the exit code."""
+    if what not in ("write", "compare") or not set(parts) <= PARTS.keys():
+        print(f"Expected write or compare, and any of {', '.join(PARTS)}; got {' '.join([what, *parts])}.")
+        return 2
     stored = json.loads(FILE.read_text()) if FILE.exists() else {}
     differences = list(_differences(stored.get("build", build()), build(), "build"))
     stored["build"] = build()
