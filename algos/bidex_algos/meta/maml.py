@@ -37,7 +37,7 @@ PRESETS: dict[str, MAMLConfig] = {
     "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
     "tuned": MAMLConfig(**TUNED),
     "unseen": MAMLConfig(**UNSEEN),
-    "v2": MAMLConfig(**V2),
+    "v2": MAMLConfig(**V2, max_kl=0.03),  # MT-PPO's desired_kl
     "laptop": MAMLConfig(),
 }
 

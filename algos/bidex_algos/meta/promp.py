@@ -49,7 +49,7 @@ PRESETS: dict[str, ProMPConfig] = {
     # lost a third of the return. With a KL of 0.05 one seed lost 0.5 of a return of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
-    "v2": ProMPConfig(**V2, outer_learning_rate=1e-4, desired_kl=0.0125),
+    "v2": ProMPConfig(**V2, outer_learning_rate=3e-5, desired_kl=0.03),  # MT-PPO's
     "laptop": ProMPConfig(),
 }  # fmt: skip
 
