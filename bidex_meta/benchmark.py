@@ -209,12 +209,14 @@ class Benchmark:
         stagger: bool = True,
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
+        episodes_per_task: int = 1,
     ) -> World:
         """Make a batched world of one split.
 
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
-        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task.
+        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task. With
+        `episodes_per_task` above 1 environments of a training world draw a task for so many episodes.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
@@ -231,13 +233,16 @@ class Benchmark:
             randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training
                 worlds; or a `Randomisation` (docs/randomisation.md).
             pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
+            episodes_per_task: Consecutive episodes of an environment that play one drawn task, as in a trial
+                (docs/clients.md#trials-as-episodes); 1: as above.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         if split == OTHERS:
             return self.others.make_world(
-                "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels
-            )
+                "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels,
+                episodes_per_task
+            )  # fmt: skip
         slots = self._slots(self._checked_split(split))
         mode = checked_mode(autoreset_mode)
         evaluates = mode.name == "DISABLED"
@@ -252,7 +257,7 @@ class Benchmark:
             seed = self.seed
         if split == "train" and self.suite.train_tasks == 0:
             task_sampling = "fresh"
-        elif evaluates or self.suite.kind == "meta":
+        elif evaluates or (self.suite.kind == "meta" and episodes_per_task == 1):
             task_sampling = "fixed"
         else:
             task_sampling = "uniform"
@@ -274,6 +279,7 @@ class Benchmark:
             points=points,
             randomisation=randomisation,
             pixels=pixels,
+            episodes_per_task=episodes_per_task,
         )
         return World(slots, config)
 
