@@ -222,8 +222,9 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         task = self._tasks[int(self.np_random.integers(len(self._tasks)))]
         if not self._draws_new:
             return task
-        space = self._envs[task.env_name].task_class.variation_space
-        return Task.from_variation(task.env_name, space.sample(self.np_random, 1)[0])
+        task_class = self._envs[task.env_name].task_class
+        variation = task_class.variation_space.sample(self.np_random, 1)[0]
+        return Task.from_variation(task.env_name, variation, task_class.instruction(variation, hidden=True))
 
     def _begin_episode(self) -> np.ndarray:
         self._solved = False

@@ -446,6 +446,16 @@ class World(BatchedWorld):
                 pools[member.slot] = tasks.cpu().numpy().copy()
         return [pools[slot] for slot in range(self.num_tasks)]
 
+    def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
+        """Return in a sentence what a task of a slot asks for, without what the world hides; None: the class."""
+        return self.slots[slot].task_class.instruction(variation, self.hides_goals)
+
+    def instructions(self) -> list[str]:
+        """Return in a sentence what the task asks for that each environment plays."""
+        pools = self.pools
+        places = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
+        return [self.instruction(slot, pools[slot][index]) for slot, index in places]
+
     @property
     def hidden_size(self) -> int:
         """See ``PrivilegedWorld``."""
