@@ -34,19 +34,39 @@ Entry = TypeVar("Entry")
 
 
 class Task(NamedTuple):
-    """One task class with one variation. `data` holds plain numbers; reading it runs no code."""
+    """One task class with one variation. `data` holds plain numbers; reading it runs no code.
+
+    Tasks are equal if class and variation are, whatever their sentences tell.
+
+    Examples:
+        >>> from bidex_meta import Benchmark
+        >>> print(Benchmark("MT1-DoorOpenOutward-v2").train_tasks[0].instruction)
+        Push both leaves of a double door, the right one to 40 and the left one to 35 degrees
+    """
 
     env_name: str
     """Name of the task class, a key of `train_classes` or `test_classes`; in suites of version 2 `CatchUnderarm-v2`."""
     data: bytes
     """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
+    instruction: str = ""
+    """What the task asks for, in a sentence that does not tell what the suite hides. A task that was made without a
+    benchmark has none."""
 
     @classmethod
     @checked_arguments
-    def from_variation(cls, env_name: Text, variation: np.ndarray | Sequence[float]) -> "Task":
+    def from_variation(cls, env_name: Text, variation: np.ndarray | Sequence[float], instruction: str = "") -> "Task":
         """Return the task of a class with this variation, shape (size,)."""
         numbers = real_numbers("variation", variation, 1)
-        return cls(env_name, numbers.astype(_NUMBERS).tobytes())
+        return cls(env_name, numbers.astype(_NUMBERS).tobytes(), instruction)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Task) and self[:2] == other[:2]
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(self[:2])
 
     @property
     def variation(self) -> np.ndarray:
@@ -209,12 +229,14 @@ class Benchmark:
         stagger: bool = True,
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
+        episodes_per_task: int = 1,
     ) -> World:
         """Make a batched world of one split.
 
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
-        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task.
+        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task. With
+        `episodes_per_task` above 1 environments of a training world draw a task for so many episodes.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
@@ -231,13 +253,16 @@ class Benchmark:
             randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training
                 worlds; or a `Randomisation` (docs/randomisation.md).
             pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
+            episodes_per_task: Consecutive episodes of an environment that play one drawn task, as in a trial
+                (docs/clients.md#trials-as-episodes); 1: as above.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         if split == OTHERS:
             return self.others.make_world(
-                "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels
-            )
+                "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels,
+                episodes_per_task
+            )  # fmt: skip
         slots = self._slots(self._checked_split(split))
         mode = checked_mode(autoreset_mode)
         evaluates = mode.name == "DISABLED"
@@ -252,7 +277,7 @@ class Benchmark:
             seed = self.seed
         if split == "train" and self.suite.train_tasks == 0:
             task_sampling = "fresh"
-        elif evaluates or self.suite.kind == "meta":
+        elif evaluates or (self.suite.kind == "meta" and episodes_per_task == 1):
             task_sampling = "fixed"
         else:
             task_sampling = "uniform"
@@ -274,19 +299,25 @@ class Benchmark:
             points=points,
             randomisation=randomisation,
             pixels=pixels,
+            episodes_per_task=episodes_per_task,
         )
         return World(slots, config)
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
         # By the class's name, so that all objects of a class have the same goals.
-        space = self._classes[entry.name].variation_space
+        task_class = self._classes[entry.name]
+        space = task_class.variation_space
         key = entry.class_name
         if entry.tasks:
             variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.of(split)]
         else:
             variations = _drawn(space, self.seed, key, split, self.suite.drawn_tasks(split))
         env_name = versioned_name(entry.name, self.suite.rules)
-        return [Task.from_variation(env_name, variation) for variation in variations]
+        hidden = self.suite.observation == "masked"
+        tasks = []
+        for variation in variations:
+            tasks.append(Task.from_variation(env_name, variation, task_class.instruction(variation, hidden)))
+        return tasks
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         if self.suite.base == "moving":

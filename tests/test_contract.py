@@ -13,6 +13,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from bidex_meta import Benchmark
+from bidex_meta.clients.trial_env import TrialWorld
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World, WorldConfig
@@ -50,6 +52,11 @@ def point_goals(mode: str) -> PointGoals:
     return PointGoals(ROWS, True, (PointClass(steps=5), PointClass("Other", 7, 0.5, 3)), autoreset_mode=mode)
 
 
+def trials(mode: str) -> TrialWorld:
+    options: dict[str, Any] = {"autoreset_mode": mode, "threads": 1, "episodes_per_task": 2}
+    return TrialWorld(Benchmark("ML4-v2").make_world("train", ROWS, "cpu", **options))
+
+
 class Kind(NamedTuple):
     """A world, made anew by its mode, and which protocol it says it keeps."""
 
@@ -78,6 +85,7 @@ KINDS = {
     "wrapped bandits": Kind(lambda _: WorldWrapper(Bandits([nearness(0.3), nearness(-0.3)], 3)), VectorWorld, BOTH[:1]),
     "wrapped ToyWorld": Kind(lambda mode: TaskWorldWrapper(ToyWorld(ROWS, mode)), TaskWorld, fixed=True),
     "wrapped ML4": Kind(lambda mode: PooledWorldWrapper(suite_world("ML4", ROWS, mode)), fixed=True),
+    "trials": Kind(trials, VectorWorld, BOTH[:1]),
 }
 CASES = [pytest.param((kind, mode), id=f"{name}-{mode}") for name, kind in KINDS.items() for mode in kind.modes]
 WARP = Kind(warp_world, fixed=True)
@@ -180,7 +188,8 @@ def test_observation_groups(case: Case) -> None:
         assert group.size == sum(where.stop - where.start for where in group.where)
         assert all(left.stop < right.start for left, right in zip(group.where, group.where[1:], strict=False))
     named = {group.name: group for group in groups}
-    assert named.keys() <= {"right_hand", "left_hand", "object", "goal", "padding", "task", "task_id", "state"}
+    known = {"right_hand", "left_hand", "object", "goal", "padding", "task", "task_id", "state", "last_step"}
+    assert named.keys() <= known
     assert ("task_id" in named) == (world.num_id_columns > 0)
     if world.num_id_columns:
         assert named["task_id"].where == (slice(d - world.num_id_columns, d),)

@@ -35,6 +35,8 @@ def register_ids() -> None:
             _register(env_id, None, f"{__name__}:make_suite_world", suite=name, split=split)
     for kind in ("mt", "ml"):
         _register(f"{NAMESPACE}/custom-{kind}-envs", None, "bidex_meta.metaworld.vector_envs:make_custom")
+    trials = "bidex_meta.clients.trial_env"
+    _register(f"{NAMESPACE}/trials", f"{trials}:TrialEnv", f"{trials}:make_trials")
     for name, version in product(registry.names(), ("", "-v2")):
         task_name = name + version
         single = "bidex_meta.clients.gymnasium_env:TaskEnv"

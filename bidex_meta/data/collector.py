@@ -145,6 +145,13 @@ class EpisodeCollector(PooledWorldWrapper):
             return
         last = np.arange(length) == length - 1
         rewards, unscaled = self._rewards[:, row, :length]
+        variation = np.zeros(0)
+        instruction = ""
+        if self._pools:
+            variation = self._pools[slot][task].copy()
+        describe = getattr(self.world, "instruction", None)
+        if describe is not None:  # worlds of other classes have no sentences
+            instruction = describe(slot, variation)
         self._sink(
             Episode(
                 observations=self._observations[row, : length + 1].copy(),
@@ -155,12 +162,13 @@ class EpisodeCollector(PooledWorldWrapper):
                 task=slot,
                 task_name=self.world.task_names[slot],
                 task_index=task,
-                variation=self._pools[slot][task].copy() if self._pools else np.zeros(0),
+                variation=variation,
                 success=success,
                 broken=unstable,
                 return_unscaled=float(unscaled.sum(dtype=np.float64)),
                 row=self.rows[row],
                 policy=self.policy,
+                instruction=instruction,
             )
         )
 

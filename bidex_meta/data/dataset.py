@@ -233,6 +233,7 @@ class Dataset:
             **{name: row[name] for name in _OF_EPISODE},
             task_name=self.metadata["tasks"][row["task"]],
             variation=variation[~np.isnan(variation)],
+            instruction=str(group.attrs.get("instruction", "")),
         )
 
     def transition_bytes(self) -> int:

@@ -28,10 +28,10 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
-    ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
-    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
-    ({class: {random, zero, expert}}, unscaled returns), ``versions``, ``commit``, and ``gymnasium_id`` of the same
-    environment, None of a suite or an altered class.
+    ``instructions``, what the class of each slot asks for; ``reward_scales``, factor on the reward by slot; ``rules``,
+    the suite's; ``hides_goals``; ``observation_groups``, [name, index ranges]; ``kind`` (``random``, ``medium``, ...),
+    ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}}, unscaled returns),
+    ``versions``, ``commit``, and ``gymnasium_id`` of the same environment, None of a suite or an altered class.
     """
     alone = source.class_name
     versions = collect_versions()
@@ -53,6 +53,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "task": alone, "object": source.object, "points": source.points,
         "base": base,
         "tasks": list(world.task_names),
+        "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
         "reward_scales": {slot.name: slot.reward_scale for slot in slots},
         "rules": rules,
         "hides_goals": source.hides_goals,

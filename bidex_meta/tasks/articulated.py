@@ -1,6 +1,7 @@
 """Articulated objects on a table: appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -19,6 +20,7 @@ from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.tasks.words import centimetres, degrees
 from bidex_meta.utils.maths import (
     conjugate,
     constant,
@@ -34,6 +36,10 @@ _SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.
 _PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
 """The pivot on the left hand's half, and the right handle's point from there on the other half, metres
 (docs/figures.md, objects)."""
+
+
+_SHUT = 0.59
+"""Angle by which the shears of target 0 are open, rad."""
 
 
 class OpenScissors(ReachTask):
@@ -79,7 +85,7 @@ class OpenScissors(ReachTask):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         super().start(draws, frozen, qpos)
-        qpos["scissors/hinge"].fill_(-0.59)
+        qpos["scissors/hinge"].fill_(-_SHUT)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         rotation = state.quaternion("scissors/quaternion")
@@ -88,10 +94,15 @@ class OpenScissors(ReachTask):
         return {"goal_pose": goal, "goal_rotation_difference": missing}
 
     def target(self, state: TaskState) -> Tensor:
-        return 5.0 * (0.59 - _missing(state))
+        return 5.0 * (_SHUT - _missing(state))
 
     def hides(self) -> tuple[Hidden, ...]:
         return (Hidden(("target_angle",), 0.04 if self.rules.wide else 0.1),)
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None:
+            return "Open shears to their goal angle with both hands"
+        return f"Open shears to {degrees(_SHUT + goal['target_angle'])} degrees with both hands"
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(_missing(state), self.hides()[0].tolerance)]
@@ -188,6 +199,13 @@ class OpenPenCap(ReachTask):
         if self.rules.wide:
             return (Hidden(("gap",), _GAP),)
         return ()
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if not self.rules.wide:
+            return self.summary
+        if goal is None:
+            return f"{self.summary}, as far as its goal"
+        return f"{self.summary} until the points on body and cap are {centimetres(goal['gap'])} apart"
 
     def errors(self, state: TaskState) -> list[Error]:
         gap = apart(state, *self.points)
@@ -287,6 +305,14 @@ class Switch(ReachTask):
         if self.rules.wide:
             return tuple(Hidden((f"switch{i}_angle",), 0.08) for i in (1, 2))
         return ()
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if not self.rules.wide:
+            return self.summary
+        if goal is None:
+            return "Press the buttons of two rocker switches to their goal angles"
+        left, right = (degrees(goal[f"switch{i}_angle"]) for i in (1, 2))
+        return f"Press the buttons of two rocker switches, the left one to {left} and the right one to {right} degrees"
 
     def errors(self, state: TaskState) -> list[Error]:
         rockers = _rockers(state)

@@ -1,13 +1,14 @@
 """The base of task classes: one scene, one variation space, one reward formula, one success test."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -306,6 +307,23 @@ class TaskClass(ABC):
     def guides(self, state: TaskState) -> list[Tensor]:
         """Return distances (m), each (n,), from hands to points; the reward of version 2 rewards small distances."""
         return []
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        """Return what a task asks for as a sentence without a full stop; ``summary`` by default.
+
+        ``goal`` holds the components of ``hides`` by name. None: the sentence must not say what they are.
+        """
+        return self.summary
+
+    def instruction(self, variation: Sequence[float] | np.ndarray | None = None, hidden: bool = False) -> str:
+        """Return the instruction of the task with a variation (variation_space.size,), or of the class for None.
+
+        With ``hidden`` the sentence does not tell what suites with hidden goals hide.
+        """
+        if variation is None or hidden:
+            return self.instruct(None)
+        names = self.variation_space.names
+        return self.instruct({names[i]: float(variation[i]) for i in self.hidden_columns()})
 
     def solved_in(self, state: TaskState) -> Tensor:
         """Return ``success``, computed once for reward and world. Shape (n,), bool."""

@@ -1,6 +1,7 @@
 """GraspAndPlace and PourWater: appendix A.2.17 (with a picture of GraspAndPlace but no section); docs/figures.md."""
 
 import math
+from collections.abc import Mapping
 
 import mujoco
 import torch
@@ -18,6 +19,7 @@ from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.tasks.words import centimetres
 from bidex_meta.utils.maths import conjugate, constant, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
 from bidex_meta.utils.validation import whole_number
 
@@ -102,6 +104,9 @@ class GraspAndPlace(ReachTask):
             return (Hidden(("goal_x", "goal_y"), 0.04),)
         return ()
 
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        return self.summary + _bucket_words(goal, self.objects[0], self.rules.wide)
+
     def errors(self, state: TaskState) -> list[Error]:
         inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
         return [inside, *_bucket_error(state)]
@@ -143,6 +148,16 @@ def _bucket_ghosts(state: TaskState) -> list[Ghost]:
     if goal is None:
         return []
     return [Ghost(goal, (0.065, 0.065, 0.06))]
+
+
+def _bucket_words(goal: Mapping[str, float] | None, bucket: SceneObject, wide: bool) -> str:
+    """Return the end of an instruction that gives the bucket's goal; empty if it has none."""
+    if not wide:
+        return ""
+    if goal is None:
+        return ", which shall stand at its goal"
+    x, y, _ = bucket.position
+    return f", which shall stand at {centimetres(x + goal['goal_x'], y + goal['goal_y'])}"
 
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
@@ -277,6 +292,9 @@ class PourWater(ReachTask):
         if self.rules.wide:
             return (Hidden(("goal_x", "goal_y"), 0.04),)
         return ()
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        return self.summary + _bucket_words(goal, _BUCKET, self.rules.wide)
 
     def errors(self, state: TaskState) -> list[Error]:
         return [at_least(self._inside(state) / self.water, 1.0 / 3.0, 1.0 / 12.0), *_bucket_error(state)]

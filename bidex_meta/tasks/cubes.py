@@ -1,6 +1,7 @@
 """Classes of two cubes: appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes."""
 
 import math
+from collections.abc import Mapping
 from itertools import chain, product
 from typing import ClassVar
 
@@ -21,6 +22,7 @@ from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join, orientation
+from bidex_meta.tasks.words import centimetres, degrees
 from bidex_meta.utils.maths import constant, multiply, norm, rotate, rotation_angle, wxyz, xyzw
 
 _RED, _BLUE = (0.85, 0.43, 0.30), (0.24, 0.52, 0.74)
@@ -81,6 +83,10 @@ def _unturned(position: Tensor) -> Tensor:
     return posed(position, constant((0.0, 0.0, 0.0, 1.0), position).expand(len(position), 4))
 
 
+_PUSHED = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
+"""Goals of PushBlock's blocks, in version 2 the middles of their ranges, metres."""
+
+
 class PushBlock(_TwoBlocks):
     """Push two blocks on a table, one with each hand, 20 cm away to their goals.
 
@@ -116,8 +122,7 @@ class PushBlock(_TwoBlocks):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Return ``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
-        goals = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
-        first, second = (constant(goal, variation).expand(len(variation), 3) for goal in goals)
+        first, second = (constant(goal, variation).expand(len(variation), 3) for goal in _PUSHED)
         if self.rules.wide:
             first = first + pad(variation[:, 6:8], (0, 1))
             second = second + pad(variation[:, 8:], (0, 1))
@@ -134,6 +139,14 @@ class PushBlock(_TwoBlocks):
         if self.rules.wide:
             return tuple(Hidden((f"goal{i}_x", f"goal{i}_y"), 0.05) for i in (1, 2))
         return ()
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None or not self.rules.wide:
+            return self.summary
+        places = []
+        for i, (x, y, _) in enumerate(_PUSHED, start=1):
+            places.append(centimetres(x + goal[f"goal{i}_x"], y + goal[f"goal{i}_y"]))
+        return f"Push the red block to {places[0]} and the blue one to {places[1]}, one with each hand"
 
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.05 if self.rules.wide else 0.1)
@@ -222,6 +235,16 @@ class StackBlock(_TwoBlocks):
             return (target, Hidden(("order",), math.inf, "sign"))
         return (target,)
 
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None and self.rules.wide:
+            return "Stack two blocks in their goal order at their goal"
+        order = "the red block on the blue one"
+        if goal is None:
+            return f"Stack {order} at their goal"
+        if goal.get("order", 1.0) < 0.0:
+            order = "the blue block on the red one"
+        return f"Stack {order} at {centimetres(goal['target_x'], goal['target_y'])}"
+
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.03)
 
@@ -299,6 +322,13 @@ class ReOrientation(TaskClass):
 
     def hides(self) -> tuple[Hidden, ...]:
         return (Hidden(("goal_u0", "goal_u1"), 0.2, "orientation"),)
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None:
+            return "Turn two cubes on the hands to their goal orientation"
+        about_x, about_y = (degrees(math.pi * goal[f"goal_u{i}"]) for i in (0, 1))
+        turn = f"{about_x} degrees about x after {about_y} degrees about y"
+        return f"Turn two cubes on the hands to the orientation of a turn by {turn}"
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(angle, 0.2) for _, angle in self._distances(state)]

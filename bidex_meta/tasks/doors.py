@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
 
 import mujoco
@@ -20,6 +21,7 @@ from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.words import degrees
 from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rotate, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
@@ -52,6 +54,7 @@ class _Door(ReachTask):
     """
 
     inward: ClassVar[bool]
+    verb: ClassVar[str]
     episode_steps = 250
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
@@ -125,6 +128,14 @@ class _Door(ReachTask):
         angles = state.frozen["leaves"]
         handles = enumerate(self._handles)
         return [Ghost(_on_leaf(base, i, angles[:, i : i + 1], handle), _POLE) for i, handle in handles]
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if not self.rules.wide:
+            return self.summary
+        if goal is None:
+            return f"{self.verb} both leaves of a double door to their goal angles"
+        right, left = (degrees(goal[f"{side}_angle"]) for side in SIDES)
+        return f"{self.verb} both leaves of a double door, the right one to {right} and the left one to {left} degrees"
 
     @abstractmethod
     def narrow_errors(self, state: TaskState) -> list[Error]:
@@ -212,6 +223,7 @@ class DoorOpenOutward(_Open):
     needs = Capacity(44, 0, 96)
     name = "DoorOpenOutward"
     summary = "Push a double door open"
+    verb = "Push"
     inward = False
 
 
@@ -224,6 +236,7 @@ class DoorCloseInward(_Close):
     needs = Capacity(38, 0, 77)
     name = "DoorCloseInward"
     summary = "Push a double door shut that stands open towards the hands"
+    verb = "Push"
     inward = True
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
@@ -247,6 +260,7 @@ class DoorOpenInward(_Open):
     needs = Capacity(40, 0, 88)
     name = "DoorOpenInward"
     summary = "Pull a double door open by its handles"
+    verb = "Pull"
     inward = True
 
 
@@ -256,4 +270,5 @@ class DoorCloseOutward(_Close):
     needs = Capacity(37, 0, 98)
     name = "DoorCloseOutward"
     summary = "Pull a double door shut by its handles"
+    verb = "Pull"
     inward = False

@@ -1,6 +1,7 @@
 """Common parts of the throwing and catching classes: eggs, goal poses, the exponential reward of equations 1 to 5."""
 
 from collections.abc import Hashable, Iterable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -19,6 +20,7 @@ from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
+from bidex_meta.tasks.words import centimetres
 from bidex_meta.utils.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
 
 RADIUS, HALF_LENGTH = 0.03, 0.04
@@ -149,6 +151,7 @@ class EggTask(TaskClass):
         self.variation_space = self._goals_within(0.03)
         self.wide_space = self._goals_within(0.06)
         self.held = held_object(object)
+        self._thing = Path(object).stem.replace("_", " ")
         if self.held is not None:
             self.needs = self.held.needs(self.needs, len(self.starts))
 
@@ -200,6 +203,24 @@ class EggTask(TaskClass):
 
     def hides(self) -> tuple[Hidden, ...]:
         return tuple(Hidden(tuple(f"goal{i}_{axis}" for axis in "xyz"), 0.03) for i in self.numbers)
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        """Return the summary with the object and its goal; success does not ask for the goal's orientation."""
+        summary = self.summary
+        if self.held is not None:
+            summary = summary.replace("an egg", f"the {self._thing}").replace(
+                "two eggs", f"two objects ({self._thing})"
+            )
+        alone = len(self.numbers) == 1
+        if goal is None:
+            place = "its goal" if alone else "their goals"
+        else:
+            points = [[goal[f"goal{i}_{axis}"] for axis in "xyz"] for i in self.numbers]
+            place = " and ".join(centimetres(*point) for point in points)
+        if not self.rules.wide:
+            return f"{summary}, to {place}"
+        held = "it" if alone else "them"
+        return f"{summary}, and hold {held} at {place}"
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(distances(state, f"object{i}", f"goal{i}")[0], 0.03) for i in self.numbers]

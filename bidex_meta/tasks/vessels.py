@@ -1,6 +1,7 @@
 """A pot, a bottle and a cup: appendix A.2.6, A.2.9 and A.2.11; docs/figures.md, classes."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from bidex_meta.tasks.reach import apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.words import centimetres, degrees
 from bidex_meta.utils.maths import constant, dot, indices, multiply, norm, rotate, rotation_angle, uprightness, xyzw
 
 _START = (0.0, -0.6, 0.465)
@@ -84,6 +86,13 @@ class LiftUnderarm(OwnObjectClass):
 
     def hides(self) -> tuple[Hidden, ...]:
         return (Hidden(("goal_x", "goal_y", "goal_height"), 0.05),)
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None:
+            return f"{self.summary}, to its goal"
+        aside = centimetres(goal["goal_x"], goal["goal_y"])
+        place = "the table's middle" if self.rules.wide else "its start"
+        return f"{self.summary}, {centimetres(goal['goal_height'])} higher than it starts and {aside} from {place}"
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(self._distance(state), 0.05)]
@@ -168,6 +177,12 @@ class BottleCap(OwnObjectClass):
         if self.rules.wide:
             return (Hidden(("cap_slide",), 0.005),)
         return ()
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if not self.rules.wide:
+            return self.summary
+        distance = "its goal distance" if goal is None else centimetres(goal["cap_slide"])
+        return f"Hold a bottle in one hand and pull its cap out by {distance} with the other"
 
     def errors(self, state: TaskState) -> list[Error]:
         slide = state["bottle/slide"][:, 0]
@@ -264,6 +279,11 @@ class SwingCup(OwnObjectClass):
 
     def hides(self) -> tuple[Hidden, ...]:
         return (Hidden(("yaw_change",), math.radians(8.0) if self.rules.wide else 0.25 * math.pi),)
+
+    def instruct(self, goal: Mapping[str, float] | None) -> str:
+        if goal is None:
+            return f"{self.summary}, to its goal angle"
+        return f"{self.summary}, by {degrees(goal['yaw_change'])} degrees counterclockwise"
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(_angle(state), self.hides()[0].tolerance)]

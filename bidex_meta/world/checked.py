@@ -5,6 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
@@ -25,6 +26,8 @@ _LARGEST_SEED = 2**128
 _LEAST = {"episodes/number": -1}
 """Of whole numbers in a state; the number of an environment's episode before its first is -1."""
 _AGAIN = "build the world with the same suite, split and num_envs."
+MOST_EPISODES = 1000
+"""Of a task before another one is drawn, or of a trial."""
 _TOLD, _LONGEST = 5, 100
 """Differences that a message names, and the most letters of one."""
 _ROWS = 11
@@ -54,6 +57,17 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
             raise unknown_name(name, str(given), known)
     if points is not None and not isinstance(points, PointsRule):
         raise BidexError(f"points: expected a PointsRule or None, got {shortened(points)}. Write PointsRule(768).")
+
+
+def episodes_per_task(given: object, task_sampling: str, mode: AutoresetMode) -> None:
+    """Raise BidexError unless the number is whole, from 1, and is 1 in a world whose environments keep their tasks."""
+    number = whole_number("episodes_per_task", given, 1, MOST_EPISODES)
+    keeps = task_sampling == "fixed" or mode == AutoresetMode.DISABLED
+    if number > 1 and keeps:
+        raise BidexError(
+            f"episodes_per_task: expected 1, because environments of this world keep their tasks, got {number}. Leave "
+            "it out, or make a training world."
+        )
 
 
 def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.device) -> Tensor:

@@ -70,7 +70,8 @@ class ObservationGroup:
 
     name: str
     """``right_hand``, ``left_hand``, ``object`` (the rest), ``goal`` (zeros where a suite hides it), ``padding``,
-    ``task`` where slots differ (in MT4: padding to three classes, the second egg to one), or ``task_id`` (one-hot).
+    ``task`` where slots differ (in MT4: padding to three classes, the second egg to one), ``task_id`` (one-hot), or
+    ``last_step`` (in worlds of trials: the last action, the last reward, and 1 if an episode ended).
     Worlds without such parts have ``state``. Other classes may have other groups: in ML4 the two splits differ."""
     where: tuple[slice, ...]
     """Index ranges in ascending order, none next to another."""

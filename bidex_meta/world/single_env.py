@@ -248,7 +248,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
     task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
     task_class.adopt(recipe.rules)
-    text = f"{task_class.summary}."
+    text = f"{task_class.instruction()}."
     return _Remade(recipe.env_name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
 
 

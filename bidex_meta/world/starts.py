@@ -35,6 +35,7 @@ class Starts:
         pool_size: Tensor | None,
         together: Together,
         task_keys: Tensor | None = None,
+        episodes_per_task: int = 1,
     ) -> None:
         """Make room for the draws.
 
@@ -46,11 +47,13 @@ class Starts:
                 keep their tasks.
             together: Does a job for each part.
             task_keys: Random keys of new tasks, (n, 2), if every episode has one; None: tasks are of the pools.
+            episodes_per_task: Consecutive episodes that play one drawn task.
         """
         self._together = together
         self._parts = parts
         self._keys = keys
         self._pool_size = pool_size
+        self._episodes_per_task = episodes_per_task
         self._draws = _OWN_DRAWS + start_draws
         num = len(keys)
         device = keys.device
@@ -139,14 +142,17 @@ class Starts:
         draws = uniform(self._keys[env_ids], episode, self._draws)
         tasks = task_index[env_ids]
         if self._pool_size is not None:
-            tasks = (draws[:, _TASK_DRAW] * self._pool_size[env_ids]).long()
+            of_task = draws
+            if self._episodes_per_task > 1:
+                of_task = uniform(self._keys[env_ids], episode // self._episodes_per_task, _TASK_DRAW + 1)
+            tasks = (of_task[:, _TASK_DRAW] * self._pool_size[env_ids]).long()
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
         """Return where in their spaces the new tasks of episodes (k,) lie, in [0, 1), (k, size); None: none are new."""
         if self._task_keys is None:
             return None
-        return uniform(self._task_keys[env_ids], episode, self._task_size)
+        return uniform(self._task_keys[env_ids], episode // self._episodes_per_task, self._task_size)
 
 
 def _repeated(env_ids: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,7 @@ from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Outcome, Slots
 from bidex_meta.world.contract import Info, Options, State, Step
 from bidex_meta.world.depth_sensor import PointsRule
+from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.graphs import CapturedStepper, SideBySide
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.hidden_parts import HiddenParts
@@ -61,6 +62,7 @@ class WorldConfig:
         pad_to: Observation entries before the task id; None: those of the widest class.
         task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n; "fresh": each
             episode draws a new task of its class's space, in DISABLED mode as "fixed" (see ``EndlessWorld``).
+        episodes_per_task: Consecutive episodes of an environment that play one task, if episodes draw tasks.
         threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.
         stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that they do not end together,
             and do not count in ``episode``. False: they begin at 0.
@@ -68,7 +70,8 @@ class WorldConfig:
         randomisation: Factors that are drawn for environments, and noise that is added; None: nothing.
         pixels: Edge of the square pictures by the classes' cameras in ``info["pixels"]``, pixels; 0: none.
 
-    Raises BidexError for an unknown sampling or observation, a seed below 0, or too large pictures.
+    Raises BidexError for an unknown sampling or observation, a seed below 0, too large pictures, or several episodes
+    per task where environments keep their tasks.
     """
 
     num_envs: int | None = None
@@ -84,11 +87,13 @@ class WorldConfig:
     points: PointsRule | None = None
     randomisation: Randomisation | None = None
     pixels: int = 0
+    episodes_per_task: int = 1
 
     def __post_init__(self) -> None:
         checked.choices(self.task_sampling, self.observation, self.points)
         checked.seed(self.seed)
         whole_number("pixels", self.pixels, 0, MOST_PIXELS)
+        checked.episodes_per_task(self.episodes_per_task, self.task_sampling, checked_mode(self.autoreset_mode))
         if self.randomisation is not None and not isinstance(self.randomisation, Randomisation):
             mend = "Write Randomisation(friction=(0.7, 1.3)), of bidex_meta.suite."
             raise BidexError(f"randomisation: expected a Randomisation, got {shortened(self.randomisation)}. {mend}")
@@ -130,6 +135,7 @@ class World(BatchedWorld):
             num_tasks=[len(slot.tasks) for slot in self.slots],
         )
         super().__init__(table, num_envs, device, config.autoreset_mode, config.stagger, config.seed)
+        self.episodes_per_task = config.episodes_per_task
         self.endless = config.task_sampling == "fresh"
         self._renews_tasks = self.endless and self.autoreset_mode != AutoresetMode.DISABLED
         if self._renews_tasks:
@@ -219,7 +225,8 @@ class World(BatchedWorld):
         task_keys = None
         if self._renews_tasks:
             task_keys = self._random_keys(", tasks")
-        self._starts = Starts(self.parts, self._keys, draws, pool_size, self._side_by_side.run, task_keys)
+        own = (draws, pool_size, self._side_by_side.run, task_keys, self.episodes_per_task)
+        self._starts = Starts(self.parts, self._keys, *own)
         self._stepper.forget()  # recordings hold the old starts and pools
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
@@ -390,6 +397,8 @@ class World(BatchedWorld):
         made |= {"observation": self._config.observation, "points": str(self.points)}
         if self.endless:
             made["tasks"] = "without number"
+        if self.episodes_per_task > 1:
+            made["episodes per task"] = str(self.episodes_per_task)
         drawn = vars(self._config.randomisation or Randomisation())
         made |= {f"randomised {name}": str(value) for name, value in drawn.items() if value != _NOTHING[name]}
         for slot in self.slots:
@@ -436,6 +445,16 @@ class World(BatchedWorld):
             for member, tasks in zip(part.group.members, part.tasks, strict=True):
                 pools[member.slot] = tasks.cpu().numpy().copy()
         return [pools[slot] for slot in range(self.num_tasks)]
+
+    def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
+        """Return in a sentence what a task of a slot asks for, without what the world hides; None: the class."""
+        return self.slots[slot].task_class.instruction(variation, self.hides_goals)
+
+    def instructions(self) -> list[str]:
+        """Return in a sentence what the task asks for that each environment plays."""
+        pools = self.pools
+        places = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
+        return [self.instruction(slot, pools[slot][index]) for slot, index in places]
 
     @property
     def hidden_size(self) -> int:

@@ -67,6 +67,10 @@ class WorldWrapper(VectorWorld):
         """See ``VectorWorld``."""
         self.world.load_state_dict(state)
 
+    def to_numpy(self, stagger: bool = False) -> "NumpyWorld":
+        """Return this world, with its wrapper, as NumPy arrays."""
+        return NumpyWorld(self, stagger)
+
     def close(self) -> None:
         """Free the wrapped world."""
         self.world.close()

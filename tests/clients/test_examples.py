@@ -5,16 +5,26 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from gymnasium.spaces import Box
+
+from bidex_meta import Benchmark
+from bidex_meta.agents import Timestep
+from bidex_meta.clients.trial_env import TrialWorld
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "sb3_ppo": ("stable_baselines3", {"steps": 512, "num_envs": 16}),
+    "sb3_recurrent_ppo": (
+        "sb3_contrib", {"suite": "ML1-wide", "steps": 128, "num_envs": 8, "rollout": 16, "rollouts": 1}
+    ),
     "rsl_rl_ppo": ("rsl_rl", {"steps": 512, "num_envs": 16}),
     "skrl_ppo": ("skrl", {"steps": 512, "num_envs": 16, "log": False}),
     "torchrl_ppo": ("torchrl", {"steps": 512, "num_envs": 16}),
     "optuna_search": ("optuna", {"suite": "MT1", "steps": 512, "trials": 1}),
-}
+}  # fmt: skip
 
 
 def example(name: str) -> ModuleType:
@@ -51,3 +61,38 @@ def test_one_file(capsys: pytest.CaptureFixture[str]) -> None:
     module = example("ppo_one_file")
     returns = module.main(module.Args(total_steps=2048, num_envs=16, env_id="bidex-meta/MT4-v1"))
     assert len(returns) > 5 and f"return {sum(returns[-100:]) / len(returns[-100:]):.2f}" in capsys.readouterr().out
+
+
+class Watching:
+    """Stands for a policy of sb3-contrib: counts its steps in its memory, and acts by what it sees."""
+
+    action_space = Box(-1.0, 1.0, (52,), np.float32)
+
+    def predict(self, seen: np.ndarray, memory: Any, begins: np.ndarray, deterministic: bool) -> tuple[np.ndarray, Any]:
+        self.seen = seen
+        if memory is None:
+            memory = (np.zeros((1, len(seen), 1)),)
+        steps = memory[0] * ~begins[:, None] + 1
+        return np.clip(seen[:, :52], -1.0, 1.0), (steps,)
+
+
+def test_a_recurrent_policy_sees_in_the_meta_test_what_it_saw_in_training() -> None:
+    pytest.importorskip("sb3_contrib")
+    policy = Watching()
+    agent = example("sb3_recurrent_ppo").RecurrentAgent(policy)
+    made = Benchmark("ML1-CatchUnderarm-v2").make_world("train", 3, "cpu", threads=1, episodes_per_task=2)
+    world = TrialWorld(made)
+    obs, _ = world.reset(seed=0)
+    agent.reset(torch.ones(3, dtype=torch.bool))
+    waits = torch.tensor([True, True, False])
+    steps = 0
+    ended = torch.zeros(3, dtype=torch.bool)
+    while not ended[2]:
+        action = agent.act(obs[:, : made.observation_size])
+        assert np.array_equal(policy.seen[:2], obs[:2].numpy())
+        new, reward, *_ = world.step(action)
+        ended = new[:, -1] > 0
+        agent.observe(Timestep(obs, action, reward, torch.zeros(3, dtype=torch.bool), ended, {}, new, waits))
+        obs = new
+        steps += 1
+    assert agent.memory[0].flatten().tolist() == [steps, steps, 0.0], "whoever waits remembers nothing"

@@ -16,6 +16,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import State
 from tests.algos.families import Passing
 from tests.data.worlds import Plain, Rough, rough, same
+from tests.world.play import suite_world
 
 pytest.importorskip("h5py", reason="needs the extra data")
 
@@ -41,6 +42,26 @@ def test_an_episode_is_a_success_by_the_worlds_rule(mode: str) -> None:
     for _ in range(20):
         recorder.step(torch.zeros(8, 2))
     assert {each.row: each.success for each in episodes} == {row: row % 4 == 0 for row in range(8)}
+
+
+@pytest.mark.parametrize("suite", ["MT1-Switch-v2", "ML1-Switch-v2"])
+def test_an_episode_has_the_sentence_of_its_task(suite: str, tmp_path: Path) -> None:
+    """Also in the file, as an attribute that Minari reads; where the suite hides its goal without the goal."""
+    world = suite_world(suite, 3)
+    writer = DatasetWriter(tmp_path)
+    episodes: list[Episode] = []
+    recorder = EpisodeCollector(world, lambda episode: (episodes.append(episode), writer.add(episode)))
+    world.stagger = False
+    recorder.reset(seed=0)
+    played = world.instructions()
+    for _ in range(int(world.max_episode_steps.max())):
+        recorder.step(torch.zeros(3, world.action_size))
+    assert [episode.instruction for episode in episodes] == played
+    assert any(letter.isdigit() for letter in played[0]) == (suite[:2] == "MT")
+    writer.commit()
+    spaces = world.single_observation_space, world.single_action_space
+    finish(tmp_path, "Switch/test-v0", *spaces, {"tasks": world.task_names, "kind": "test"})
+    assert all(map(same, open_dataset(tmp_path).episodes(), episodes))
 
 
 @settings(max_examples=25, deadline=None)

@@ -127,7 +127,7 @@ class Plain:
 def same(a: Episode, b: Episode) -> bool:
     """Whether two episodes are equal, arrays bit for bit."""
     arrays = ("observations", "actions", "rewards", "terminated", "truncated", "variation")
-    words = ("task", "task_name", "task_index", "success", "broken", "row", "policy")
+    words = ("task", "task_name", "task_index", "success", "broken", "row", "policy", "instruction")
     return (
         all(np.array_equal(getattr(a, name), getattr(b, name)) for name in arrays)
         and all(getattr(a, name) == getattr(b, name) for name in words)

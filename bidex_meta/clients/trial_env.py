@@ -1,0 +1,274 @@
+"""Trials as episodes, for any recurrent learner: `TrialEnv` is one environment, `TrialWorld` a world of them.
+
+A trial is a few episodes of one task with rewards shown, as in RL² (Duan et al. 2016). An observation is followed by
+the last action, the last reward and 1 if the last step ended an episode, all 0 at the start of a trial.
+"""
+
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Space
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from bidex_meta.benchmark import Benchmark, Task
+from bidex_meta.clients.gymnasium_ids import both_seeds, make_suite_world
+from bidex_meta.clients.needs import check_training
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.suite import SPLITS, Suite
+from bidex_meta.utils.arguments import checked_arguments
+from bidex_meta.utils.validation import whole_number
+from bidex_meta.world import World, checked
+from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
+from bidex_meta.world.episodes import Clock, check_single_reset, ended_info
+from bidex_meta.world.single_env import SuiteEnv
+from bidex_meta.world.wrapper import PooledWorldWrapper
+
+EPISODES = 3
+"""Of a trial, as in the meta-test."""
+_OF_EPISODES = ("episode", "_episode", "final_info", "_final_info")
+_SUMS = ("r", "l", "unscaled")
+_SEEDS = 2**31
+
+
+class TrialWorld(PooledWorldWrapper):
+    """A training world whose episodes are trials of `world.episodes_per_task` episodes: a `contract.VectorWorld`.
+
+    `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` goes into the other adapters, such as
+    `SB3VecEnv`. Return and length are those of the trial, success is that of its last episode. Within a trial the next
+    episode starts in the step that ends one, and neither `terminated` nor `truncated` tells of it. The trial ends when
+    its last episode does, or when physics breaks. First episodes are not shortened.
+
+    Raises BidexError for a world in another autoreset mode than SAME_STEP, or one that shows its goals.
+    """
+
+    world: World
+
+    @checked_arguments
+    def __init__(self, world: World) -> None:
+        check_training(world, stagger=False)
+        _check_hides(world.hides_goals, ", ".join(world.task_names))
+        super().__init__(world)
+        self.episodes_per_task = world.episodes_per_task
+        self.max_episode_steps = world.max_episode_steps * self.episodes_per_task
+        self.single_observation_space = _extended(world.single_observation_space, world.single_action_space)
+        self.observation_space = cast(Box, batch_space(self.single_observation_space, world.num_envs))
+        known = slice(world.observation_size, world.observation_size + world.action_size + 2)
+        self.observation_groups = (*world.observation_groups, ObservationGroup("last_step", (known,)))
+        everywhere = torch.ones(world.num_envs, dtype=torch.bool, device=world.device)
+        self._clock = Clock(world.num_envs, world.device)
+        self._last = torch.zeros(world.num_envs, world.action_size + 2, device=world.device)
+        self._sums: dict[str, Tensor] = {}
+        self._forget(everywhere)
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
+        """Start trials; see `VectorWorld.reset`."""
+        obs, info = self.world.reset(seed=seed, options=options)
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool)
+        mask = torch.as_tensor(mask, device=self.device)
+        self._forget(mask)
+        return self._begin(mask, obs, info)
+
+    def step(self, action: Tensor | np.ndarray, /) -> Step:
+        """Take actions; see `VectorWorld.step`."""
+        is_last = self._episode_of_trial() == self.episodes_per_task - 1
+        given, _ = checked.clean(checked.action(action, self.action_space.shape, self.device))
+        obs, reward, terminated, truncated, own = self.world.step(action)
+        ended = own["_final_obs"]
+        over = ended & (is_last | own["unstable"])
+        last = torch.cat((given, reward[:, None], ended[:, None].float()), dim=1)
+        # The end of a trial is not marked, because the value of its last observation is that of an episode going on.
+        final_last = torch.where(own["unstable"][:, None], self._last, last)
+        final_last[:, -1] = final_last[:, -1].masked_fill(over & ~own["unstable"], 0.0)
+        final = torch.cat((torch.where(over[:, None], own["final_obs"], obs), final_last), dim=1)
+        info = {name: value for name, value in own.items() if name not in _OF_EPISODES}
+        running = dict(own["running"])
+        for name, before in self._sums.items():
+            running[name] = running[name] + before
+        info |= {"final_obs": final, "_final_obs": over, "running": running, "episode_mask": over}
+        if _OF_EPISODES[0] in own:
+            info |= ended_info(info)
+            self._clock.stamp(info)
+        self._last = last
+        self._sums = {name: torch.where(ended, running[name], before) for name, before in self._sums.items()}
+        self._forget(over)
+        obs, more = self._begin(over, obs, info)
+        return obs, reward, terminated & over, truncated & over, more
+
+    def _episode_of_trial(self) -> Tensor:
+        return self.world.episodes.number % self.episodes_per_task
+
+    def _forget(self, mask: Tensor) -> None:
+        """Begin trials in the environments of a mask, with nothing known of the last one."""
+        self._clock.begin(mask)
+        self._last = self._last.masked_fill(mask[:, None], 0.0)
+        if not self._sums:
+            self._sums = {name: torch.zeros(self.num_envs, device=self.device) for name in _SUMS}
+            self._sums["l"] = self._sums["l"].long()
+        self._sums = {name: value.masked_fill(mask, 0) for name, value in self._sums.items()}
+
+    def _begin(self, mask: Tensor, obs: Tensor, info: Info) -> tuple[Tensor, Info]:
+        """Return observations of trials that begin with another task where one was left before its last episode."""
+        while bool((left := mask & (self._episode_of_trial() > 0)).any()):
+            obs, pictures = self.world.reset(options={"reset_mask": left})
+            info = info | pictures
+        return torch.cat((obs, self._last), dim=1), info
+
+    def state_dict(self) -> State:
+        """Return the world's state and what the trials have shown so far."""
+        trials = {"last": self._last, **self._sums}
+        return {**super().state_dict(), "trials": {name: value.clone() for name, value in trials.items()}}
+
+    def load_state_dict(self, state: State, /) -> None:
+        """Restore a `state_dict` of a world of trials that was made alike."""
+        own = {"trials": {"last": self._last, **self._sums}}
+        checked.fits(state, own)
+        super().load_state_dict(state)
+        trials = {name: value.to(self.device, copy=True) for name, value in state["trials"].items()}
+        self._last = trials.pop("last")
+        self._sums = trials
+
+
+class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment that plays a trial of a suite with hidden goals as one episode: a new task at each reset.
+
+    `suite` is a name, a file or a `Suite`; `split` is `"train"` or `"test"`; `episodes` counts those of a trial. All
+    tasks of the split are equally likely; in a suite with `tasks_per_class = 0` the train split draws new ones. `seed`
+    chooses the tasks, and the trials until `reset(seed=...)`. Without `seed` the tasks are those of seed 0, and the
+    trials differ from environment to environment. `render_mode` is None or `"rgb_array"`. `task` is the task of the
+    running trial, and `max_episode_steps` the longest trial: the sum of the time limits of its episodes.
+
+    `info` has `success`, `unscaled_reward` and `unstable`, at the end of each episode also `episode_success`, by the
+    suite's rule, and at the end of the trial `is_success`, that of its last episode. The trial ends as its last episode
+    does, or where physics breaks. Raises BidexError for an unknown suite, split or render mode, and for a suite that
+    shows its goals.
+    """
+
+    metadata = SuiteEnv.metadata
+
+    @checked_arguments
+    def __init__(
+        self, suite: str | Path | Suite, split: str = "train", episodes: int = EPISODES, seed: int | None = None,
+        render_mode: str | None = None
+    ) -> None:  # fmt: skip
+        task_seed, self._first_seed = both_seeds(seed)
+        benchmark = Benchmark(suite, task_seed)
+        _check_hides(benchmark.suite.observation == "masked", benchmark.name)
+        if split not in SPLITS:
+            raise unknown_name("split", split, SPLITS)
+        if split == "train":
+            classes = benchmark.train_classes
+            self._tasks = benchmark.train_tasks
+            self._draws_new = benchmark.suite.train_tasks == 0
+        else:
+            classes = benchmark.test_classes
+            self._tasks = benchmark.test_tasks
+            self._draws_new = False
+        self.episodes = whole_number("episodes", episodes, 1, checked.MOST_EPISODES)
+        self.render_mode = render_mode
+        self._envs = {name: env_class(render_mode) for name, env_class in classes.items()}
+        self.max_episode_steps = self.episodes * max(env.max_path_length for env in self._envs.values())
+        self.task = self._tasks[0]
+        self._env = self._envs[self.task.env_name]
+        self.action_space = self._env.action_space
+        self._num_actions = self._env.task_class.action_size
+        self.observation_space = _extended(self._env.observation_space, self.action_space)
+        self._left = 0  # episodes that the running trial has yet to end
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
+        """Start a trial of another task, with a seed the same one every time; return an observation and an empty info.
+
+        There are no options.
+        """
+        check_single_reset(seed, options)
+        if seed is None:
+            seed = self._first_seed
+        self._first_seed = None
+        super().reset(seed=seed)
+        self.task = self._drawn_task()
+        self._env = self._envs[self.task.env_name]
+        self._env.set_task(self.task)
+        self._left = self.episodes
+        return self._seen(self._begin_episode(), np.zeros(self._num_actions), 0.0, False), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Advance 1/60 s by an action (a,) in [-1, 1]; where an episode of the trial ends, begin the next one.
+
+        Raises BidexError if no trial runs.
+        """
+        if self._left == 0:
+            raise BidexError("Expected reset() before step(): no trial runs.")
+        obs, reward, terminated, truncated, info = self._env.step(action)
+        self._solved |= info["success"] > 0.0
+        ended = terminated or truncated
+        if ended:
+            info["episode_success"] = self._solved
+            self._left = 0 if info["unstable"] else self._left - 1
+        over = ended and self._left == 0
+        if over:
+            info["is_success"] = self._solved
+        elif ended:
+            obs = self._begin_episode()
+        # The end of a trial is not marked, because the value of its last observation is that of an episode going on.
+        seen = self._seen(obs, action, reward, ended and not over)
+        return seen, reward, terminated and over, truncated and over, info
+
+    def _drawn_task(self) -> Task:
+        task = self._tasks[int(self.np_random.integers(len(self._tasks)))]
+        if not self._draws_new:
+            return task
+        task_class = self._envs[task.env_name].task_class
+        variation = task_class.variation_space.sample(self.np_random, 1)[0]
+        return Task.from_variation(task.env_name, variation, task_class.instruction(variation, hidden=True))
+
+    def _begin_episode(self) -> np.ndarray:
+        self._solved = False
+        obs, _ = self._env.reset(seed=int(self.np_random.integers(_SEEDS)))
+        return obs
+
+    def _seen(self, obs: np.ndarray, action: np.ndarray, reward: float, ended: bool) -> np.ndarray:
+        applied = np.clip(np.nan_to_num(action, posinf=0.0, neginf=0.0), -1.0, 1.0)
+        return np.concatenate((obs, applied, (reward, ended)), dtype=np.float32)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (height, width, 3), uint8; None without a render mode."""
+        return self._env.render()
+
+    def close(self) -> None:
+        """Free the environments of all classes."""
+        for env in self._envs.values():
+            env.close()
+
+
+def make_trials(
+    suite: str, split: str = "train", episodes: int = EPISODES, num_envs: int = 1,
+    seed: int | None = None, benchmark_seed: int | None = None, render_mode: str | None = None, **options: Any
+) -> TrialWorld:  # fmt: skip
+    """Make the world of `gymnasium.make_vec("bidex-meta/trials", num_envs=64, suite="ML1-v2")`.
+
+    `episodes` counts those of a trial; other arguments are those of `make_suite_world`.
+    """
+    options["episodes_per_task"] = episodes
+    made = make_suite_world(suite, split, num_envs, seed, benchmark_seed, render_mode, **options)
+    return TrialWorld(cast(World, made))  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+
+
+def _extended(observation: Space, action: Space) -> Box:
+    """Return the space of observations followed by the last action, the last reward and the end of an episode."""
+    assert isinstance(observation, Box) and isinstance(action, Box)
+    low = (*observation.low, *action.low, -np.inf, 0.0)
+    high = (*observation.high, *action.high, np.inf, 1.0)
+    return Box(np.array(low, np.float32), np.array(high, np.float32))
+
+
+def _check_hides(hides: bool, name: str) -> None:
+    if not hides:
+        raise BidexError(
+            f"Expected a suite that hides its goals, for trials; {name} shows them. Name an ML suite (ML1-v2, ML5-v2, "
+            "ML20-v2, ML1-CLASS-v2 for any class) or a file with masked observations."
+        )
