@@ -16,7 +16,7 @@ RULES = tomllib.loads((ROOT / "tools" / "english.toml").read_text(encoding="utf-
 
 _HIDDEN = re.compile(r"^```.*?^```$|<!--.*?-->", re.MULTILINE | re.DOTALL)
 _GENERATED = re.compile(r"<!-- results:.*?<!-- end -->", re.DOTALL)
-_SENTENCE = re.compile(r"(?:[^.?!]|[.?!](?!\s|$)|(?<=al)\.|(?<=e\.g)\.|(?<=i\.e)\.)+[.?!]?")
+_SENTENCE = re.compile(r"(?:[^.?!]|[.?!](?!\s|$)|(?<=et al)\.|(?<=e\.g)\.|(?<=i\.e)\.)+[.?!]?")
 _NUMBER = re.compile(r"(?<![\w.:-])\d[\d,.]*(?:(?: %)? \[[^]]*\])?")
 _OBJECTS = {*RULES["objects"].split()}
 _QUESTIONS = ("what", "whether", "which", "who")
