@@ -18,6 +18,9 @@ _HIDDEN = re.compile(r"^```.*?^```$|<!--.*?-->", re.MULTILINE | re.DOTALL)
 _GENERATED = re.compile(r"<!-- results:.*?<!-- end -->", re.DOTALL)
 _SENTENCE = re.compile(r"(?:[^.?!]|[.?!](?!\s|$)|(?<=et al)\.|(?<=e\.g)\.|(?<=i\.e)\.)+[.?!]?")
 _NUMBER = re.compile(r"(?<![\w.:-])\d[\d,.]*(?:(?: %)? \[[^]]*\])?")
+_NO_QUANTITY = re.compile(
+    r"\([^()]*(?:et al\.|arXiv)[^()]*\)|\b[A-Z][a-z]+ 20\d\d\b|\b\d+\.\d+\.\d+\b"
+)  # citations, dates, versions
 _OBJECTS = {*RULES["objects"].split()}
 _QUESTIONS = ("what", "whether", "which", "who")
 
@@ -96,7 +99,7 @@ def _broken(sentence: str) -> Iterator[str]:
     """Yield the rules that a sentence of prose breaks."""
     if sentence.split()[0].lower() in _QUESTIONS and not sentence.endswith("?"):
         yield "opens with a question word"
-    if len(_NUMBER.findall(re.sub(r"\([^()]*(?:et al\.|arXiv)[^()]*\)", "", sentence))) > 2:
+    if len(_NUMBER.findall(_NO_QUANTITY.sub("", sentence))) > 2:
         yield "more than two numbers"
     clauses = re.sub(r"\([^()]*\)", "", sentence).split(";")
     if not all(_has_verb(clause) for clause in clauses if clause.strip()):
