@@ -102,6 +102,7 @@ lint: style types
 style: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/python -m tools.english
 
 types: .venv/.installed-dev
 	$(BIN)/pyright

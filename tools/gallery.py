@@ -29,19 +29,19 @@ STRIP = 5
 """Pictures per witness."""
 _HEAD = """# The task classes
 
-Pictures show the start of task 0; green is a goal. Sizes are with moving bases. d is a distance in metres, r an angle
-in radians. *left* and *right* are distances from a [hand's point](figures.md#hand-point) to its point on the object.
+Pictures show the start of task 0, with goals in green. Sizes include moving bases. In formulas, d is a distance in
+metres and r an angle in radians. *left* and *right* are distances from a [hand's point](figures.md#hand-point) to its
+point on the object.
 
 | entry | meaning |
 |---|---|
 | variation | variables that a task fixes, drawn uniformly from these ranges |
-| ML mask | task variables that affect reward or success but are hidden in ML suites. None: no need to adapt |
+| ML mask | task variables that affect reward or success but are hidden in ML suites. None: nothing to adapt to |
 | uniform actions | mean return and success |
 | witness | a reference solution: recorded actions that solve task 0 |
 
-Below come the witness (at the start, a third and two thirds of the way to the first success, at the first success and
-at the end), and three tasks of version 2: as a script has solved them, of eggs at the start. `make gallery` generates
-this page from the task classes.
+The lower pictures show the witness, from the start over the first success (fourth picture) to the end, and three tasks
+of version 2, solved by a script or (eggs) at the start. `make gallery` generates this page from the task classes.
 """
 
 

@@ -246,7 +246,7 @@ class Switch(ReachTask):
     formula = "2 - d_left - d_right + 50 (1.4 - d), d the sum of both buttons' distances to where they are pressed"
     solved = "both rockers past 80 % of their travel"
     deviations = (
-        "A button's target is its own point at full travel; the original asks for a height it cannot reach.",
+        "A button's target is its point at full travel; the original's is a height that it cannot reach.",
         "Tasks shift the housings, but do not turn them.",
     )
     episode_steps = 125

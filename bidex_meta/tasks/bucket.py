@@ -63,7 +63,7 @@ class GraspAndPlace(ReachTask):
     formula = "exp(-10 d_left) + exp(-10 d_right) + 2 exp(-10 d), d between bucket and block"
     solved = "the block's centre is inside the bucket, which is within 45 degrees of upright"
     deviations = (
-        "Success asks that the block be in the upright bucket, the original that it be within 20 cm of the bucket.",
+        "Success requires the block in the upright bucket; the original's requires it within 20 cm of the bucket.",
     )
     episode_steps = 500
     start_draws = 2 * DRAWS
@@ -199,8 +199,8 @@ class PourWater(ReachTask):
     solved = "a third of the water is in the bucket, which is within 45 degrees of upright"
     deviations = (
         "The goal sinks by 5 cm for each that the bucket is lifted: else the bucket would be tipped under the kettle.",
-        "Success counts water, the original the distance of the spout and a point below the bucket's bottom.",
-        "Twelve drops without friction by default, the paper's 30 on demand.",
+        "Success counts water; the original's measures the distance from the spout to a point below the bucket.",
+        "There are twelve drops without friction by default, or the paper's 30 as an option.",
         "The kettle weighs 1.5 kg and has a high floor and an open trough as spout.",
     )
     episode_steps = 125

@@ -61,7 +61,9 @@ class TwoCatchUnderarm(CatchUnderarm):
     summary = "Throw two eggs at once, each to the other hand"
     formula = "exp(-0.2 (50 d1 + r1)) + exp(-0.2 (50 d2 + r2)), distance and angle of each egg and its goal"
     solved = "each egg within 3 cm of its goal in the same step"
-    deviations = ("Success asks it of each egg, the original of the sum of both distances (6 cm).",)
+    deviations = (
+        "Success requires each egg to be near its goal; the original's limits the sum of both distances (6 cm).",
+    )
     starts = ((0.0, -0.39, 0.54), (0.0, -0.78, 0.54))
     goals = ((0.0, -0.79, 0.54), (0.0, -0.38, 0.54))
     floor = 0.2

@@ -100,7 +100,9 @@ class PushBlock(_TwoBlocks):
     summary = "Push two blocks to their goals, one with each hand"
     formula = "2 - d_left - d_right + 5 (0.8 - d), d the sum of both blocks' distances to their goals"
     solved = "both blocks within 10 cm of their goals"
-    deviations = ("The blocks start on the table, not in it; the original's half success for one block is left out.",)
+    deviations = (
+        "The blocks start on the table, not in it; there is no half success for one block as in the original.",
+    )
     episode_steps = 125
     solver = FAST
     table = Table((1.0, 1.0, 0.6), (0.0, 0.0, 0.3), friction=0.75, priority=1)
@@ -175,7 +177,7 @@ class StackBlock(_TwoBlocks):
     solved = "both blocks within 3 cm of their targets, block 1 on block 2"
     deviations = (
         "The printed formula names target 1 twice; here each block has its own.",
-        "Friction of block on block is 0.375 instead of 0.25, of hand on table 0.225 instead of 0.35.",
+        "Friction between blocks is 0.375 instead of 0.25; between hand and table it is 0.225 instead of 0.35.",
     )
     episode_steps = 250
     right = HandPose((0.0, 0.6, 0.7), PALM_DOWN_AWAY)
@@ -276,7 +278,7 @@ class ReOrientation(TaskClass):
     deviations = (
         "The printed formula adds the angles, which would reward larger ones; here they are subtracted.",
         "A goal lasts for the episode; the original draws a new one when it is reached.",
-        "Success asks for both cubes' turns and places; the original's for the turn of the second cube.",
+        "Success requires turn and place of both cubes; the original's only the turn of the second cube.",
         "A start within 0.5 rad of the goal is turned by half a turn: about 2 % of the starts depend on the goal.",
     )
     episode_steps = 600

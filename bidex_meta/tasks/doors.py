@@ -165,7 +165,7 @@ class _Open(_Door):
     formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
     solved = "handles more than 0.5 m apart along y, each at least 10 cm from the middle"
     deviations = (
-        "Success asks both leaves to open; the original's, handles 0.5 m apart along y, a leaf against its stop meets.",
+        "Success requires both leaves to open; the original's (handles 0.5 m apart along y) needs only one.",
         _DAMPED,
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
@@ -204,7 +204,7 @@ class _Close(_Door):
     formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
     solved = "both leaves within a tenth of their travel of shut"
     deviations = (
-        "Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",
+        "Success requires shut leaves; the original's (handles less than 0.5 m apart) accepts 60 degrees.",
         _DAMPED,
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 1.3, 1.57))

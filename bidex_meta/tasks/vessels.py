@@ -41,8 +41,8 @@ class LiftUnderarm(OwnObjectClass):
     formula = "0.2 - d_left - d_right + 3 (0.985 - d), d from the pot to its goal"
     solved = "pot within 5 cm of its goal and within 30 degrees of upright"
     deviations = (
-        "Success asks for an upright pot too; reward and the original's success count its place alone.",
-        "The pot's inertia follows from its shape (3 kg, lid 1 kg); the original's is far too large for the size.",
+        "Success also requires an upright pot; reward and the original's success depend only on its place.",
+        "The pot's inertia follows from its shape (3 kg, lid 1 kg); the original's is far too large.",
     )
     episode_steps = 500
     right = HandPose((0.0, 0.05, 0.45), PALM_UP_AWAY)
@@ -241,7 +241,7 @@ class SwingCup(OwnObjectClass):
     solved = "cup within 45 degrees of its goal and within 20 cm of its start"
     deviations = (
         "Goals lie 90 to 180 degrees from the nominal start; the original's is half a turn away.",
-        "Success asks that the cup stay near its start; reward and the original's success count its turn alone.",
+        "Success requires the cup to stay near its start; reward and the original's success only count its turn.",
     )
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
