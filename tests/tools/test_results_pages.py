@@ -11,7 +11,6 @@ from tests.pages import ROOT
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill
-from tools.pages.gained import shots_table
 from tools.pages.studies import read_studies
 from tools.pages.tables import arms_table, classes_table
 
@@ -27,33 +26,11 @@ def test_pages_of_the_repository_are_as_its_data_say() -> None:
 
 def test_every_run_of_the_data_is_read_and_small() -> None:
     data = ROOT / "results" / "data"
-    names = [file.stem for file in data.iterdir() if "-ladder-" not in file.name]
-    for name in names:
+    for name in [file.stem for file in data.iterdir()]:
         runs = [run for study in read_studies(data, name) for run in study.runs]
         file = data / f"{name}.json"
         assert {run.path for run in runs} == {Path(f"{file}:{known}") for known in json.loads(file.read_text())}
         assert file.stat().st_size < 40_000 * len(runs)
-
-
-def test_lines_of_a_ladder_stand_below_the_arms() -> None:
-    (study,) = read_studies(ROOT / "results" / "data", "ml1-v2")
-    head, _, *rows = shots_table(study)
-    assert head.endswith("| before | after 1 | after 2 | return |")
-    assert rows[0].startswith("| CatchUnderarm | icl | 3 |")
-    assert rows[-1].startswith("| CatchUnderarm | teachers that are shown the goal | 1 | – | 72 % |")
-
-
-def test_several_studies_share_a_table_with_means_over_classes() -> None:
-    both = [study for name in ("ml1-v2", "ml20-v2") for study in read_studies(ROOT / "results" / "data", name)]
-    head, _, *rows = map(cells, shots_table(*both))
-    (row,) = (row for row in rows if row[:2] == ["ML20-v2", "icl"])
-    classes = [cells(line) for line in shots_table(both[1])][2:]
-    assert head[0] == "suite" and rows[0][:3] == ["ML1-v2", "icl", "3"]
-    assert [percent(cell) for cell in row[4:7]] == pytest.approx(
-        np.mean([[percent(cell) for cell in row[4:7]] for row in classes], axis=0), abs=6e-4
-    )
-    returns = [np.mean([float(row[7].split(" → ")[i]) for row in classes]) for i in (0, 1)]
-    assert [float(value) for value in row[7].split(" → ")] == pytest.approx(returns, rel=5e-3)
 
 
 def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:

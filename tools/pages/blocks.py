@@ -20,7 +20,7 @@ from PIL import Image
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
-from tools.pages.gained import gains_table, shots_figure, shots_table
+from tools.pages.gained import gains_table
 from tools.pages.ladder import ladder_figure, ladder_table, suites_table
 from tools.pages.leaderboard import leaderboard_table, trials_table
 from tools.pages.offline import offline_table
@@ -33,7 +33,6 @@ _TABLES = {
     "table": tables.arms_table,
     "classes": tables.classes_table,
     "gains": gains_table,
-    "shots": shots_table,
     "ladder": ladder_table,
     "ladder-suites": suites_table,
     "offline": offline_table,
@@ -42,7 +41,6 @@ _TABLES = {
 _WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table, "trials": trials_table}
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
-    "shot-curves": (shots_figure, "Success against exploring episodes"),
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
@@ -56,7 +54,7 @@ _DIGEST = "Description"
 class Block:
     """The options of a block."""
 
-    study: str = ""  # Its name; of several, with commas between, one table or picture (``shots``, ``shot-curves``).
+    study: str = ""  # Its name; of several, with commas between, one table or picture (``best``, ``ladder``).
     show: str = "table"
     on: str | None = None  # Only this suite or class.
     split: str | None = None  # Only this split of meta-tests.

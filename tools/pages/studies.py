@@ -95,11 +95,6 @@ class Study:
         )
 
     @property
-    def ladders(self) -> list[Path]:
-        """Files ``STUDY-ladder-*.json`` next to the study's file (:mod:`tools.ladder`)."""
-        return sorted(self.runs[0].path.parent.glob(f"{self.name}-ladder-*.json"))
-
-    @property
     def classes(self) -> list[str]:
         """All classes of the study's arms."""
         return list(dict.fromkeys(chain.from_iterable(arm.group.classes for arm in self.arms)))
@@ -134,8 +129,6 @@ def digest_of(studies: Sequence[Study]) -> str:
     found = hashlib.sha256()
     for study in studies:
         found.update(json.dumps([run.content for run in study.runs]).encode())
-        for path in study.ladders:
-            found.update(path.read_bytes())
     return found.hexdigest()
 
 

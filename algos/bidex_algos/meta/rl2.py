@@ -85,9 +85,9 @@ PRESETS: dict[str, RL2Config] = {
     # episode, with a KL of 0.02: after 5 M steps the policy carried the egg of ML1-wide and did not throw it
     # (docs/results/ml1.md).
     "laptop": RL2Config(),
-    # For version 2 of the suites (docs/results/ladder.md), with 16 environments of each class. The discount sees a whole
-    # episode of 250 steps; small noise lets the policy hold still; the reward of a step is at most 1. Chunks of half an
-    # episode, three epochs and the narrow encoder together halved the time of an update.
+    # For version 2 of the suites (docs/results/ladder.md), with 16 environments per class. The discount sees a whole
+    # episode of 250 steps; small noise lets the policy hold still; the reward of a step is at most 1. Chunks of half
+    # an episode, three epochs and the narrow encoder together halved the time of an update.
     "v2": RL2Config(
         gamma=0.99, init_std=0.3, reward_unit=0.3, chunk=125, hidden=(128, 128), num_minibatches=4, epochs=3,
     ),

@@ -1,4 +1,4 @@
-"""``python -m tools.ladder RUN``: measure the bounds of a learner that infers hidden goals."""
+"""``python -m tools.beliefs RUN``: measure the bounds of a learner that infers hidden goals."""
 
 import json
 from pathlib import Path
@@ -27,12 +27,12 @@ _CANDIDATES = 128
 _EXACT = 0.02
 
 
-def ladder(
+def beliefs(
     run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
 ) -> None:
     """Measure success per class on unseen tasks, of a run of icl and of its actor with other knowledge of the goal.
 
-    Example: python -m tools.ladder runs/ml1-v2/ML1-v2-icl-seed0 --out results/data/ml1-v2-ladder-seed0.json
+    Example: python -m tools.beliefs runs/ML20-v2/icl/RUN
 
     Args:
         run: Folder of a run of icl.
@@ -110,4 +110,4 @@ class _ShownGoal:
 
 
 if __name__ == "__main__":
-    tyro.cli(ladder)
+    tyro.cli(beliefs)
