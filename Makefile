@@ -131,6 +131,7 @@ dist: .venv-dist/.installed
 	.venv-dist/tried/bin/python -m pip install --disable-pip-version-check -c constraints.txt torch
 	.venv-dist/tried/bin/python -m pip install --disable-pip-version-check -c constraints.txt dist/*.whl
 	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta list suites
+	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta demo --out demo.webp
 	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta run --suite MT4 --device cpu --num-envs 8 --steps 400 \
 		--learner.hidden 16 --learner.rollout-steps 8 --episodes 1 --run-dir run
 

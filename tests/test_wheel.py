@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 
@@ -18,6 +19,7 @@ from pathlib import Path
 import bidex_meta
 import bidex_algos
 from bidex_meta import Benchmark
+from bidex_meta.cli import demo, main
 from bidex_meta.utils import paths
 
 benchmark = Benchmark("ML4", seed=0)
@@ -25,6 +27,8 @@ assert list(benchmark.test_classes) == ["TwoCatchUnderarm"] and len(benchmark.tr
 world = benchmark.make_world("test", num_envs=2, device="cpu", threads=1)
 obs, _ = world.reset(seed=0)
 assert obs.shape == (2, 446)
+demo.FILM = ["--tiled", "--steps", "1", "--every", "1", "--width", "32"]
+assert main(["demo"]) == 0
 print(bidex_meta.__file__, bidex_algos.__path__[0], paths.suites_dir(), paths.assets_dir(), *sys.path, sep="\\n")
 """
 
@@ -63,6 +67,8 @@ def test_every_file_is_in_the_wheel_once(wheel: Path) -> None:
     expected |= files_of("bidex_meta")
     expected |= {name.removeprefix("algos/") for name in files_of("algos/bidex_algos")}
     assert packed == expected
+    assert {"bidex_meta/py.typed", "bidex_algos/py.typed"} <= packed
+    assert wheel.stat().st_size < 40e6
     assert len(names) == len(set(names))
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
@@ -85,7 +91,9 @@ def test_installed_wheel_runs_beside_decoys(wheel: Path, tmp_path: Path) -> None
     # -S leaves out the path files of site-packages, and with them an editable install of this checkout.
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
     path = os.pathsep.join([str(target), *sorted(libraries)])
-    lines = run("-S", "main.py", cwd=folder, PYTHONPATH=path).splitlines()
+    environment = {"PYTHONPATH": path, "DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    film, *lines = run("-S", "main.py", cwd=folder, **environment).splitlines()
+    assert Path(film) == (folder / "bidex-meta-demo.webp").resolve() and Image.open(film).n_frames == 2
     where, sys_path = [Path(line).resolve() for line in lines[:4]], [Path(line).resolve() for line in lines[4:]]
     package = (target / "bidex_meta").resolve()
     expected = [package / "__init__.py", target / "bidex_algos", package / "suites", package / "assets"]

@@ -50,6 +50,7 @@ COMMANDS: dict[str, Command] = {
     "list": Command("bidex_meta.cli.listing", "the suites, tasks, algos or objects there are"),
     "render": Command("bidex_meta.cli.render", "a picture or a film of a task, or of all of a run"),
     "play": Command("bidex_meta.cli.play_live", "a policy at work, live: in a window or in the browser"),
+    "demo": Command("bidex_meta.cli.demo", "the policy that comes with bidex-meta: live, or as a film"),
     "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
     "baseline": Command("bidex_meta.cli.baseline", "measure the references of the normalised score"),
     "validity": Command("bidex_meta.cli.validity", "whether there is something to learn about a suite's tasks"),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.cli.parsing import LookFlags, Switch, parse
+from bidex_meta.errors import BidexError
 from bidex_meta.utils import gl_backend, paths
 from bidex_meta.utils.validation import NonNegative, Port, Positive
 from bidex_meta.utils.waiting import note
@@ -56,8 +57,13 @@ def _screen(flags: PlayFlags, stage: "Stage") -> "Screen":
     if gl_backend.has_screen() and not flags.browser:
         from bidex_meta.viewer import desktop
 
-        print(desktop.KEYS, file=sys.stderr)
-        return desktop.Desktop(stage, flags.speed)
+        try:
+            window = desktop.Desktop(stage, flags.speed)
+        except BidexError as error:
+            print(error, file=sys.stderr)  # the browser needs no window system
+        else:
+            print(desktop.KEYS, file=sys.stderr)
+            return window
     from bidex_meta.viewer.browser import Browser
 
     screen = Browser(stage, flags.host, flags.port, flags.speed)

@@ -1,10 +1,11 @@
 """MuJoCo's own viewer, in a window."""
 
 import sys
+import warnings
 
 import mujoco
 
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import add_ghosts
 
@@ -31,6 +32,7 @@ class Desktop:
         self._model = stage.model()
         self._data = mujoco.MjData(self._model)
         try:
+            _check_windows()
             from mujoco.viewer import launch_passive
 
             self._viewer = launch_passive(
@@ -41,7 +43,7 @@ class Desktop:
                 hint = " On macOS start it by mjpython -m bidex_meta.cli play."
             else:
                 hint = ""
-            raise BidexError(f"No window can be opened ({error}).{hint} Add --browser.") from error
+            raise BidexError(f"No window can be opened ({one_line(error)}).{hint}") from error
         target, distance, angle = stage.camera()
         with self._viewer.lock():
             camera = self._viewer.cam
@@ -88,3 +90,14 @@ class Desktop:
     def close(self) -> None:
         """Close the window."""
         self._viewer.close()
+
+
+def _check_windows() -> None:
+    """Raise OSError if no window can be opened: MuJoCo's viewer would end the process."""
+    if not sys.platform.startswith("linux"):
+        return
+    import glfw
+
+    with warnings.catch_warnings(action="ignore"):  # GLFW warns about what is raised here
+        if not glfw.init():
+            raise OSError("GLFW finds no screen")

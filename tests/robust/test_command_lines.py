@@ -29,6 +29,7 @@ FLAGS = {
     "plot": "evaluation out",
     "report": "out",
     "render": "task out policy checkpoint suite seed steps every width height camera",
+    "demo": "out",
     "witness": "task file out camera threads",
     "baseline": "suite episodes seed threads runs out",
     "list": "",

@@ -1,5 +1,7 @@
 """The live view: what is played, the clock, shapes, and the page by a real viser."""
 
+import re
+import sys
 from types import SimpleNamespace
 
 import mujoco
@@ -159,6 +161,24 @@ def test_the_page_shows_the_row_and_obeys(stage):
         assert page._class.value == stage.names[0] and list(page._shapes) == visible(stage.model())
     finally:
         page.close()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux names its screen in the environment")
+def test_without_the_screen_that_the_environment_names_the_browser_shows_it(monkeypatch, capfd):
+    monkeypatch.setenv("DISPLAY", ":77")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["play", "--task", "CatchUnderarm", "--port", "18345", "--seconds", "0"]) == 0
+    assert re.search(r"No window can be opened .*\n(.*\n)*Open http://127.0.0.1:\d+ in", capfd.readouterr().err)
+
+
+def test_demo_plays_where_there_is_a_screen(monkeypatch):
+    played = []
+    monkeypatch.setattr(gl_backend, "has_screen", lambda: True)
+    monkeypatch.setattr("bidex_meta.cli.play_live.main", played.append)
+    monkeypatch.setattr("bidex_meta.cli.render.main", played.append)
+    assert main(["demo"]) == main(["demo", "--out", "x.webp"]) == 0
+    live, film = played
+    assert live == [] and film[0].endswith("MT20") and film[-1].endswith("/x.webp")
 
 
 def test_what_cannot_be_played_is_one_line(monkeypatch, capsys):
