@@ -151,7 +151,7 @@ def test_extras_that_pages_and_messages_name_exist() -> None:
 
 
 def _strings(path: Path) -> Iterator[str]:
-    """Every string of a module, with … in the place of the values of an f-string."""
+    """Yield every string of a module, with … in place of the values of an f-string."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.JoinedStr):
             yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
