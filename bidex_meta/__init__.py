@@ -6,8 +6,8 @@
     print(evaluate(run).success)
 
 Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...), shortens how long waiting OpenMP
-threads spin (docs/training.md#beside-other-work) and asks CUDA for 32 queues; torch and MuJoCo are loaded when a name
-first needs them.
+threads spin (docs/troubleshooting.md#slow-runs-and-poor-results) and asks CUDA for 32 queues; torch and MuJoCo are
+loaded when a name first needs them.
 """
 
 import os

@@ -1,5 +1,6 @@
 """Code in the pages: Python blocks run on tiny worlds, command lines are parsed, links lead somewhere."""
 
+import ast
 import contextlib
 import importlib
 import importlib.util
@@ -147,6 +148,26 @@ def test_extras_that_pages_and_messages_name_exist() -> None:
         for rest in re.findall(r"needs the extra (`[^.]*)", text):
             named += [name for name in re.findall(r"`+([\w-]+)`+", rest) if name not in COMMANDS]
         assert set(named) <= extras.keys(), f"{path}: {named}"
+
+
+def _strings(path: Path) -> Iterator[str]:
+    """Yield every string of a module, with … in place of the values of an f-string."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_messages_of_troubleshooting_are_in_the_code() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    messages = re.findall(r"^\| `([^`]*)` \|", page, re.MULTILINE)
+    assert len(messages) > 20
+    modules = [path for folder in ("bidex_meta", "algos") for path in (ROOT / folder).rglob("*.py")]
+    code = "\n".join(text for path in modules for text in _strings(path))
+    for message in messages:
+        parts = map(re.escape, message.split("…"))
+        assert re.search(".*".join(parts), code), f"troubleshooting.md: no message {message!r}"
 
 
 def test_the_readme_is_short() -> None:

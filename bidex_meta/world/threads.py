@@ -11,7 +11,7 @@ def one_torch_thread() -> Iterator[None]:
     """Run torch operations on one thread.
 
     The world's arrays are small: handing them to other threads costs more than it saves, above all while the engine's
-    threads want the same cores (measured on two cores, MT4, 1024 environments: see docs/results/speed.md).
+    threads want the same cores (measured on two cores, MT4, 1024 environments).
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

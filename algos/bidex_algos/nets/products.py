@@ -1,7 +1,8 @@
 """The products of layers with weights, by the faster of the two libraries that PyTorch uses on a CPU.
 
 PyTorch prefers MKL, which does not use AVX-512 on AMD's processors. On these, oneDNN is more than twice as fast with
-the same precision (docs/results/speed.md). ``torch.backends.mkldnn.flags(enabled=False)`` turns oneDNN off.
+the same precision: MT-PPO learned for 0.57 instead of 0.90 s per iteration (one core, preset ``laptop``).
+``torch.backends.mkldnn.flags(enabled=False)`` turns oneDNN off.
 """
 
 import platform
