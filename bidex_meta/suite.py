@@ -105,7 +105,7 @@ class Suite:
     """Meaning of one entry of the one-hot: a class or a listed task."""
     rules: Rules
     base: Literal["moving", "alone"]
-    """Moving bases for every class, or for each class the base that it has alone."""
+    """Moving bases for every class, or for each class the base of the class itself."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]

@@ -64,7 +64,7 @@ class Adaptation:
     max_adapt_steps: int | None = None
     """Longest episode that the agent adapts to, in steps; None: whole episodes."""
     is_per_environment: bool = True
-    """True if each environment adapts from its own episodes alone."""
+    """True if each environment adapts only from its own episodes."""
 
     @staticmethod
     def of(worlds: Worlds, config: RunConfig) -> "Adaptation":

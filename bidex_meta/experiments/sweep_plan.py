@@ -60,7 +60,7 @@ class _File(_Shared):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a plan. It trains in a process of its own, ``bidex-meta run`` with the words of this run."""
+    """A run of a plan. It trains in a separate process: ``bidex-meta run`` with the words of this run."""
 
     path: Path
     """The run's folder, which need not be there yet."""
