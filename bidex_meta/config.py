@@ -83,27 +83,27 @@ class RunConfig(Generic[LearnerSettings]):
     suite: Text | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: Text | None = None
-    """Train on this task class alone, instead of a suite; or on package.module:Class of your own (docs/own-task.md)."""
+    """Train on this single task class instead of a suite; also package.module:Class of your own (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
-    does not."""
+    """With --task: whether the hands' bases move; own: as the class itself does. In HandOver the bases are fixed, in
+    all other classes and in our suites they move."""
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
     """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
-    original; docs/points.md); 0: the states, or what the suite's file says."""
+    original; docs/points.md); 0: the states, or as the suite's file says."""
     object: Text | None = None
-    """With --task: what is thrown in place of the class's own object: a name of the shelf or the path of an MJCF file
-    (docs/objects.md)."""
+    """With --task: the object to throw in place of the class's own object: a name of the shelf or the path of an MJCF
+    file (docs/objects.md)."""
     tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
     """With --suite: train tasks of each class; 0: a new task in each episode, or in each trial of a learner that
     adapts (docs/own-suite.md); by default as the suite's file says."""
     start_from: Text | None = None
-    """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
-    one."""
+    """Begin with the policy of this run's last checkpoint (its network and observation statistics) instead of a new
+    policy."""
     algo: Text = "mtppo"
     """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
     preset: Text = "auto"
-    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, v2 for one
-    of version 2 if the learner has it, else laptop on a CPU, on a GPU paper (of maml and promp laptop there too)."""
+    """Values of the learner's options that no flag sets. auto: metaworld for Meta-World's suites; v2 for version 2 if
+    the learner has it; else laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     num_envs: Environments = UNRESOLVED
     """Environments stepped together by each process, over all tasks."""
@@ -111,9 +111,9 @@ class RunConfig(Generic[LearnerSettings]):
     """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
-    """Minutes to train for, over all resumes, at the end of an iteration; whichever is up first, these or --steps, ends
-    the training. Building the world before and evaluations, also the last one, are not counted: of short runs they can
-    take longer. None: as long as --steps take."""
+    """Minutes to train for, summed over all resumes; training ends after --minutes or --steps, whichever is reached
+    first. Building the world and evaluations are not counted; in short runs they can take longer than training. None:
+    no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
     that adapt: after two shots on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect
@@ -121,31 +121,31 @@ class RunConfig(Generic[LearnerSettings]):
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
-    """Where metrics, config and films go beside metrics.jsonl."""
+    """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
     """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of acting, with --algo bc, bcq,
-    td3bc or iql, for the suite or task that it was recorded on. Given several times: from all of them."""
+    td3bc or iql, for the suite or task that it was recorded on. If given several times: from all of them."""
     task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
-    """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
-    --algo mtppo and ppo, see --learner.demonstration-batch. Given several times: all of them."""
+    """Imitate this data set too (named as for --dataset; see `bidex-meta record demonstrations`), with a weight that
+    decays; with --algo mtppo and ppo (see --learner.demonstration-batch). If given several times: all of them."""
     teacher: Several = ()
-    """With --algo dagger, icl, mtppo and ppo: who labels what the policy comes to. scripts: the scripts of all classes
-    that have one; or the folder of a run on the same suite, or on one of its classes alone. Given several times: each
-    class takes the first that knows it."""
+    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. scripts: the
+    scripts of all classes that have one; or the folder of a run on the same suite, or on one of its classes. If given
+    several times: each class takes the first teacher that knows it."""
     record: Steps = 0
-    """Keep about this many transitions of the training as the data set replay/ in the run's folder, whole episodes of
-    some of the environments (docs/data.md). 0: none."""
+    """Keep about this many transitions of the training as the data set replay/ in the run's folder; they are whole
+    episodes of some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
     """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the mean return reaches this: of the evaluations with --evaluate-every, else of training."""
+    """End as soon as the mean return reaches this: in evaluations with --evaluate-every, otherwise in training."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as this fraction of the episodes succeeds, such as 0.8: of the evaluations with --evaluate-every,
-    else of training, whose actions explore."""
+    """End as soon as this fraction of the episodes succeeds, such as 0.8: in evaluations with --evaluate-every,
+    otherwise in training, where actions explore."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the normalised score of the evaluations reaches this; 33 is a third of the expert's. Needs
+    """End as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
     --evaluate-every."""
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
@@ -154,10 +154,10 @@ class RunConfig(Generic[LearnerSettings]):
     device: Text = "auto"
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
+    """Physics engine: C MuJoCo (CPU only) or mujoco_warp (CPU or GPU); auto: the faster one on the device."""
     threads: Threads = UNRESOLVED
-    """Threads of torch and of the physics in each process; by default one per core, shared by the processes of a
-    machine. A resumed run keeps its own."""
+    """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
+    processes. A resumed run keeps its number."""
 
     def __post_init__(self) -> None:
         check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)

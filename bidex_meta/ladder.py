@@ -1,9 +1,10 @@
 """Suites of a single class: ``MT1-Switch-v2``, ``ML1-Switch-v2``, and with fewer hidden numbers ``ML1-Switch-choice2``.
 
-``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. In a choice suite a task is one of two or
-of four, the same in both splits: both numbers of the goal are small or large, alike (two) or each for itself (four).
-In a ``-shared`` suite both numbers are one, anywhere between small and large. ``MT1-Switch-choice2`` shows the goal
-that ``ML1-Switch-choice2`` hides: a policy that is trained on it tells what adaptation can reach.
+``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. A choice suite has two or four tasks, which
+are the same in both splits. Each of the goal's two numbers is small or large: both are equally small or large with two
+tasks, and they vary independently with four. In a ``-shared`` suite both numbers have the same value, anywhere between
+small and large. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on it
+shows what adaptation can reach.
 """
 
 import re
@@ -42,12 +43,12 @@ _OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
 
 
 class Rung(NamedTuple):
-    """A step of the ladder: suites that hide about as much."""
+    """A step of the ladder: suites that hide about the same amount."""
 
     hidden: str
     """Hidden part of a task, in words."""
     budget: str
-    """Time that a learner may take. An estimate: docs/results/ladder.md has no figures of most rungs yet."""
+    """Estimate of the time that a learner needs: docs/results/ladder.md has no figures for most rungs yet."""
 
 
 RUNGS = (
@@ -71,7 +72,7 @@ class OfOneClass(NamedTuple):
 
     @property
     def shows_goals(self) -> bool:
-        """Return whether observations show the goal; then there is a train split alone."""
+        """Return whether observations show the goal; such a suite only has a train split."""
         return self.template.startswith("MT1")
 
     @property
@@ -103,7 +104,7 @@ class OfOneClass(NamedTuple):
         return tasks
 
     def _shared_tasks(self) -> list[_Task]:
-        """Return tasks evenly spaced between the small and the large value, by turns for training and for the test."""
+        """Return tasks evenly spaced between the small and the large value, alternately for training and testing."""
         first, second, small, large = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
@@ -116,7 +117,7 @@ class OfOneClass(NamedTuple):
 
 
 def rung_of(name: str, classes: Iterable[str]) -> int | None:
-    """Return the rung of a suite that hides goals by the rules of version 2, an index of ``RUNGS``; None for others."""
+    """Return the index in ``RUNGS`` of a suite that hides goals by the rules of version 2; None for other suites."""
     if name in _OF_SUITES:
         return _OF_SUITES[name]
     parts = parts_of(name)
@@ -142,7 +143,7 @@ def names_of(classes: Iterable[str]) -> list[str]:
 
 
 def parts_of(name: str) -> OfOneClass | None:
-    """Return the parts of the name of a suite of a single class; None for another suite."""
+    """Return the parts of the name of a single-class suite; None for another suite."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None

@@ -57,7 +57,7 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
 @checked_arguments
 @dataclass(frozen=True)
 class ListedTask:
-    """One task that a suite file writes out, in place of drawing it."""
+    """One task that a suite file lists, instead of drawing tasks."""
 
     name: str
     """Unique within its class, e.g. `"left"`."""
@@ -66,7 +66,7 @@ class ListedTask:
     """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
 
     def of(self, split: Split) -> bool:
-        """Return whether the task is one of a split."""
+        """Return whether the task belongs to a split."""
         return self.split in (split, "both")
 
 
@@ -105,7 +105,7 @@ class Suite:
     """Meaning of one entry of the one-hot: a class or a listed task."""
     rules: Rules
     base: Literal["moving", "alone"]
-    """Moving bases for every class, or for each class the base that it has alone."""
+    """Moving bases for every class, or for each class the base of the class itself."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
@@ -128,8 +128,8 @@ class Suite:
     def digest(self) -> str:
         """Return twelve hexadecimal digits of everything that decides tasks, rewards and observations.
 
-        The file's version does not enter. Entries with their default value do not enter either, so that a new kind of
-        entry leaves old digests as they are.
+        The digest ignores the file's version. It also ignores entries that have their default value, so that a new kind
+        of entry does not change old digests.
         """
         content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
         if self.rules.wide:
@@ -146,13 +146,13 @@ class Suite:
         return tuple(entry for entry in self.classes if split in entry.splits)
 
     def drawn_tasks(self, split: Split) -> int:
-        """Return the number of tasks in a split's pool of a class that lists none."""
+        """Return the number of tasks that a split draws for a class that lists no tasks."""
         if split == "train" and self.train_tasks:
             return self.train_tasks
         return self.tasks_per_class or 0
 
     def with_train_tasks(self, count: int | None) -> "Suite":
-        """Return the suite with another ``train_tasks``; None: as it is.
+        """Return the suite with another ``train_tasks``; None leaves the suite unchanged.
 
         Raises BidexError if a class lists its tasks, or the count is no whole number from 0 to a million.
         """
@@ -227,9 +227,9 @@ def load_suite(name_or_path: str | Path) -> Suite:
 
 
 def known_suite(name: str, more: Iterable[str] = (), kind: str = "suite") -> str:
-    """Return the suite, or the one of ``more`` names, that a name given in any case means.
+    """Return the name of a suite, or the entry of ``more``, that equals a given name in upper or lower case.
 
-    Raises BidexError if there is none, with the nearest name and a list in which suites of one class stand once.
+    Raises BidexError if there is none, with the nearest name and a list that shows suites of one class only once.
     """
     names = [*suite_names(), *more]
     folded = {known.casefold(): known for known in names}
@@ -413,7 +413,7 @@ def _check(suite: Suite) -> None:
 
 
 def _check_drawn(name: str, classes: tuple[SuiteClass, ...], count: int) -> None:
-    """Raise BidexError if a class lists its tasks: a number of drawn ones would not be the number it trains on."""
+    """Raise BidexError if a class lists its tasks, because a number of drawn tasks would then have no effect."""
     for entry in classes:
         if entry.tasks:
             raise BidexError(

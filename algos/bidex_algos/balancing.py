@@ -50,7 +50,8 @@ def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Te
 def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
     """Remove from each gradient the component that points against another task's (PCGrad, Yu et al. 2020, algorithm 1).
 
-    The other tasks are visited in cyclic instead of random order, so that all processes of a run compute the same.
+    The other tasks are visited in cyclic instead of random order, so that all processes of a run compute the same
+    result.
     Returns the sum (P,) of the projected ``gradients`` (num_tasks, P) and the share of conflicting pairs, a scalar.
     """
     count = len(gradients)
@@ -124,7 +125,10 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
 
 
 class GradientBalance(Balance):
-    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; one backward pass per task."""
+    """Combines the tasks' gradients (num_tasks, P) into one gradient (P,), with one backward pass per task.
+
+    ``combine`` also returns the share of conflicting gradients, which is logged.
+    """
 
     tag = "Policy/conflicts"
 

@@ -179,7 +179,10 @@ class Learner(Contract):
         return policy
 
     def start_from(self, policy: State) -> None:
-        """Take and keep network and statistics of another learner's policy; a BidexError if its form differs."""
+        """Copy the network and the statistics of another learner's policy, and keep the statistics fixed.
+
+        Raises BidexError if the policy has another form.
+        """
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
@@ -202,7 +205,7 @@ class Learner(Contract):
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; a BidexError if it comes from a world of another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if it comes from a world of another size."""
         self._check_size(state)
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)

@@ -116,7 +116,7 @@ class Replay:
         return self.places(row, uniform(self.filled)).flatten(1)
 
     def places(self, rows: Tensor, ages: Tensor) -> Tensor:
-        """Return indices of transitions of environments ``ages`` vector steps ago, 0: the last; int64, broadcast."""
+        """Return the indices of environments' transitions ``ages`` vector steps ago (0: the last); int64, broadcast."""
         return (self.added - 1 - ages) % self.slots * self.rows + rows
 
     def weights(self, places: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ class Replay:
         )  # fmt: skip
 
     def at(self, name: str, places: Tensor) -> Tensor:
-        """Return a stored field at ``places``, in their shape: rewards, terminated, valid, cut."""
+        """Return a stored field (rewards, terminated, valid or cut) at ``places``, in the shape of ``places``."""
         return self._steps[name].flatten(0, 1)[places]
 
     def state_dict(self) -> State:
@@ -180,7 +180,7 @@ def replay_bytes(steps: int, rows: int, observations: int, actions: int, cut_sha
 
 
 def steps_within(memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float) -> int:
-    """Return the most vector steps, up to ``steps``, that fit into ``memory`` bytes; 0 if not even one fits."""
+    """Return the largest number of vector steps, up to ``steps``, that fits into ``memory`` bytes; 0 if none fits."""
     sizes = rows, observations, actions, cut_share
     return bisect_right(range(1, steps + 1), memory, key=lambda n: replay_bytes(n, *sizes))
 
@@ -227,7 +227,7 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """Make a replay of ``asked`` vector steps, or the most that ``memory`` (10^9 bytes) holds; a BidexError if 0."""
+    """Make a replay of ``asked`` vector steps, or as many as ``memory`` (10^9 bytes) holds; raise BidexError if 0."""
     rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
     if 0 in present:

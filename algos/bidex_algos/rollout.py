@@ -12,10 +12,10 @@ from bidex_meta.world.contract import Info, VectorWorld
 
 
 class EpisodeStatistics:
-    """Fading sums over about the last ``window`` finished episodes of each task, in each process.
+    """Exponentially decaying sums over about the last ``window`` finished episodes of each task, in each process.
 
-    Few episodes end in one rollout, and often none of a slow task. ``task_id`` is the task of each environment, int64
-    (N,).
+    Few episodes end in one rollout, and often none of a task with long episodes, so the sums cover several rollouts.
+    ``task_id`` is the task of each environment, int64 (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
@@ -36,8 +36,8 @@ class EpisodeStatistics:
     def metrics(self) -> dict[str, float]:
         """Return the means of each task that has finished an episode, over all processes.
 
-        Means over tasks are added once every task has finished an episode; earlier means would cover only the fast
-        tasks.
+        Means over tasks are added once every task has finished an episode; earlier means would only cover tasks with
+        short episodes.
         """
         returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
@@ -94,7 +94,7 @@ def collect(
     world: VectorWorld, rollout: Rollout, obs: Tensor, sample: Sampler, final_value: FinalValue,
     episodes: EpisodeStatistics
 ) -> Tensor:  # fmt: skip
-    """Fill ``rollout`` from ``world``, starting at observations ``obs``; return the observations to go on from."""
+    """Fill ``rollout`` from ``world``, starting at observations ``obs``; return the observations to continue from."""
     for t in range(rollout.steps):
         action, mean = sample(obs)
         rollout.obs[t] = obs

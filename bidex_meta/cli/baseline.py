@@ -17,25 +17,25 @@ from bidex_meta.utils.validation import Few, Seed, Threads
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Measure the two ends of the normalised score: what a policy that has learned nothing gets, and the best known.
+    """Measure the two ends of the normalised score: the returns of an untrained policy and of the best known policy.
 
     Example: bidex-meta baseline random --suite MT20 --out random.json
 
-    The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts here
-    with the worst finished one of its class, elsewhere with what is stored of random actions.
+    The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts with
+    the return of the worst finished episode of its class here, and with the stored return of random actions elsewhere.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
-    """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
-    witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
-    the whole state (eight classes have one)."""
+    """random: uniform actions; zero: the action 0, which holds joints in the middle of their range and bases at rest;
+    witness: the actions that solve task 0 of a class, in all its tasks; script: a hand-written controller that sees the
+    whole state (eight classes have one)."""
     suite: str = "MT20"  # Suite whose train tasks are played.
     episodes: Few = 4  # Episodes of each task.
     seed: Seed = 0  # Seed of tasks, starts and actions.
     threads: Threads | None = None  # Threads of the physics; None: one per core.
     out: Path | None = None
-    """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
-    assets/references/ of the installation, which is not written unless this names it."""
+    """JSON file to which the results are added; its results of other classes stay. None: only print the results.
+    `evaluate` reads assets/references/ of the installation, which is only written if this flag names it."""
     json: JsonSwitch = False
 
 

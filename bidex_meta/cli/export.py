@@ -14,8 +14,8 @@ class ExportFlags:
 
     Example: bidex-meta export assets/policies/MT20 --out mt20.onnx
 
-    The running statistics of observations are inside. Policies that remember or adapt are refused. The file computes in
-    float32; how far a policy that computes in bfloat16 here differs from it is printed.
+    The file contains the running statistics of observations. Policies that remember or adapt are refused. The file
+    computes in float32; for a policy that computes in bfloat16 here, the command prints the largest difference.
     """
 
     run: RunPath  # Run folder.

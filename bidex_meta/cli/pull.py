@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _name_suite(run: RunFolder, out: Path) -> None:
-    """Make a config name the suite's file that was published with the run, by its full path."""
+    """Write the full path of the suite file that was published with the run into the run's config."""
     config = run.config()
     if config.suite is not None and config.suite in [path.name for path in run.path.glob(SUITES)]:
         run.change_config(replace(config, suite=str(out / config.suite)))

@@ -51,7 +51,7 @@ class Sheet:
         self.styles.append(style)
 
     def printed(self, width: int) -> str:
-        """Lay the table out in ``width`` terminal columns, or in more if the first two table columns need more."""
+        """Lay the table out in ``width`` terminal columns, or in more if the first two table columns need them."""
         shown = self._columns()
         left_out: list[str] = []
         for column in sorted(shown[2:], key=self._first_to_go):
@@ -296,7 +296,10 @@ def meta_test_table(title: str, found: SplitSummary) -> Sheet:
 
 
 def _shot_cells(name: str | None, by_shot: Sequence[Summary], gain: Gains | None) -> list[str]:
-    """Return the cells of a class in a meta-test, or of the mean over classes: returns have different scales."""
+    """Return the cells of a class in a meta-test, or of the mean over classes (``name`` None).
+
+    The mean only has cells for success, because the returns of different classes have different scales.
+    """
     if name is None:
         means = [(shot.aggregate or {}).get("success") for shot in by_shot]
         cells = [NONE if mean is None else _percents(mean.mean, mean.interval) for mean in means]

@@ -104,7 +104,7 @@ class TrialWorld(PooledWorldWrapper):
         return self.world.episodes.number % self.episodes_per_task
 
     def _forget(self, mask: Tensor) -> None:
-        """Begin trials in the environments of a mask, with nothing known of the last one."""
+        """Begin trials in the environments of a mask; what the previous trials have shown is erased."""
         self._clock.begin(mask)
         self._last = self._last.masked_fill(mask[:, None], 0.0)
         if not self._sums:
@@ -113,7 +113,10 @@ class TrialWorld(PooledWorldWrapper):
         self._sums = {name: value.masked_fill(mask, 0) for name, value in self._sums.items()}
 
     def _begin(self, mask: Tensor, obs: Tensor, info: Info) -> tuple[Tensor, Info]:
-        """Return observations of trials that begin with another task where one was left before its last episode."""
+        """Return the observations of trials that begin in the environments of a mask.
+
+        An environment that left a trial before its last episode is reset until a trial of another task begins.
+        """
         while bool((left := mask & (self._episode_of_trial() > 0)).any()):
             obs, pictures = self.world.reset(options={"reset_mask": left})
             info = info | pictures
@@ -125,7 +128,7 @@ class TrialWorld(PooledWorldWrapper):
         return {**super().state_dict(), "trials": {name: value.clone() for name, value in trials.items()}}
 
     def load_state_dict(self, state: State, /) -> None:
-        """Restore a `state_dict` of a world of trials that was made alike."""
+        """Restore a `state_dict` of a world of trials with the same settings."""
         own = {"trials": {"last": self._last, **self._sums}}
         checked.fits(state, own)
         super().load_state_dict(state)

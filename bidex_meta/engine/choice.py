@@ -32,7 +32,7 @@ def choose_engine(
 
 
 def known_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name, which may be missing here; BidexError unless it is the CPU or a CUDA device."""
+    """Return the device of a name, even if it is missing here; raise BidexError unless it is a CPU or CUDA device."""
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError, ValueError):
@@ -46,7 +46,7 @@ def known_device(device: str | torch.device) -> torch.device:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name, ``auto`` resolved; BidexError if this machine has no such device."""
+    """Return the device of a name, with ``auto`` resolved; raise BidexError if this machine has no such device."""
     if isinstance(device, str) and device == "auto":
         if torch.cuda.is_available():
             device = "cuda"

@@ -77,7 +77,7 @@ class CpuEngine(Engine):
 
     @property
     def batch(self) -> mujoco.batch.Batch:
-        """Return the batch of simulations; BidexError if its threads stayed in the process that made the batch."""
+        """Return the batch of simulations; raise BidexError if another process made the batch and has its threads."""
         if self._forked:
             raise BidexError(
                 "Expected a world in the process that made it, got one with engine threads in a forked child, where "

@@ -71,7 +71,7 @@ class Engine(Protocol):
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore a ``state_dict``; BidexError if its model or number of rows differs, or numbers are not finite."""
+        """Restore a ``state_dict``; raise BidexError if its model or number of rows differs, or if it is not finite."""
 
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
         """Give each simulation its own copy of some model fields: returns writable views (num, n, k), by name.

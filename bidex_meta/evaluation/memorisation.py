@@ -1,4 +1,4 @@
-"""Probes that guess a task from how its episodes begin.
+"""Probes that guess a task from the first observations of its episodes.
 
 A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
 et al. 2020, arXiv 1912.03820). There are two probes, of the task and of what it hides: the nearest neighbour among
@@ -29,10 +29,10 @@ class Memorised:
 
 
 def memorised(world: World, episodes: int = 10, seed: int = 0) -> dict[str, Memorised]:
-    """Return what first observations tell in each class of a world that has an environment for each task.
+    """Return how well probes guess tasks from first observations, by class; the world has one environment per task.
 
-    The world is reset ``episodes`` times, with starts of its own each time; probes learn from the other resets (the
-    task's name) or from the other tasks (hidden values).
+    The world is reset ``episodes`` times, each time with new starts. A probe that guesses the task's name learns from
+    the other resets. A probe that guesses the hidden values learns from the other tasks.
     """
     starts = np.stack([world.reset(seed=seed + number)[0].cpu().double().numpy() for number in range(episodes)])
     found = {}

@@ -101,7 +101,7 @@ def meta_evaluate(
         references: As in ``evaluate``.
         adapt_world: Another world for the episodes of adaptation, with the same starts and the same number of
             environments and tasks.
-        evaluated: Numbers of shots after which to evaluate (0: before the first shot); None: all.
+        evaluated: Numbers of shots after which the agent is evaluated (0: before the first shot); None: all.
 
     Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
@@ -152,7 +152,7 @@ def meta_evaluate(
 
 
 def _seed(seed: int, *key: object) -> int:
-    """Return a seed for a key, such that no two keys share their starts, not even those of neighbouring seeds."""
+    """Return a seed for a key; different keys and different seeds of the protocol give different starts."""
     digest = hashlib.sha256("/".join(map(str, ("meta-test", seed, *key))).encode()).digest()
     return int.from_bytes(digest[:4], "little")
 

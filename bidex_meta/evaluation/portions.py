@@ -1,7 +1,7 @@
 """Portions of a world's tasks, of equal size, that fit its environments, for the meta-test.
 
 Each adaptation (a trial of a task) takes one environment per rollout. The last portion is filled up with the first
-adaptations, which are played once more and not counted. So every portion groups the environments in the same way.
+adaptations, which are played once more and not counted, so that every portion groups the environments in the same way.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ def task_of_row(world: TaskWorld) -> Tensor:
 
 
 class Portions:
-    """The adaptations that are played together: those to the first ``tasks`` of each pool (None: all), in all trials.
+    """Groups of adaptations that are played together, to the first ``tasks`` of each pool (None: all), in all trials.
 
     ``rollouts`` is the number of episodes of each task in a shot; None: one in each environment of the task, with all
     tasks at once. All numbers are at least 1. The world is not changed.
@@ -71,7 +71,7 @@ class Portions:
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
     def labelled(self, episodes: Episodes, portion: int) -> Episodes:
-        """Return a portion's episodes without repeated ones; add ``adaptation``; ``task`` counts in the whole pool."""
+        """Return a portion's episodes without repeated ones; add ``adaptation``; ``task`` is the index in the pool."""
         parts = []
         for slot, adaptations in enumerate(self._adaptations):
             own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}

@@ -198,9 +198,9 @@ def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def crossed_estimate(statistic: Callable[..., float], *entries: Sequence[np.ndarray]) -> Estimate:
     """Return ``statistic`` of entries with an interval over seeds and over the tasks of each class.
 
-    An entry is a list of one table (seeds, tasks) per class. The seeds of all its classes are resampled together,
-    because they come from one run, and the tasks of a class are the same for all seeds. ``statistic`` takes such
-    entries. The interval is None if no class has more than one value.
+    An entry is a list that holds a table of shape (seeds, tasks) for each class. A seed is one run over all classes, so
+    the seeds of all tables of an entry are resampled together. All seeds play the same tasks of a class. ``statistic``
+    takes such entries. The interval is None if no class has more than one value.
     """
     value = float(statistic(*entries))
     if all(table.size < 2 for table in chain.from_iterable(entries)):

@@ -106,11 +106,12 @@ class Identified:
 
 
 def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) -> Identified:
-    """Play one exploring episode in each environment, and fit the hidden parts to its rewards.
+    """Play one exploring episode in each environment, and infer the hidden values from its rewards.
 
     ``world`` has one class, one environment per task, and is in autoreset mode DISABLED. Exploring actions are those of
-    ``explorer`` with noise; without an explorer they are rough: uniform, each held for ten steps. The fit searches the
-    class's ranges for the hidden values that explain the rewards. It knows the rest of the task.
+    ``explorer`` with noise; without an explorer they are uniform random actions, each held for ten steps. The fit
+    searches the class's ranges for the hidden values that best explain the rewards. All other values of the task are
+    given to the fit.
     """
     (part,) = world.parts
     (member,) = part.group.members

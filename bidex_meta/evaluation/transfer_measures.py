@@ -1,4 +1,4 @@
-"""Measures of transfer to a class that the initial policy was not trained on, over seeds and ready for JSON."""
+"""Measures of transfer to a class that the initial policy was not trained on, over several seeds, ready for JSON."""
 
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -1,4 +1,4 @@
-"""Tables of groups of runs that differ in the seed alone."""
+"""Tables of groups of runs that differ only in the seed."""
 
 from collections.abc import Sequence
 from itertools import chain

@@ -1,4 +1,4 @@
-"""A control of adaptation: held-out tasks, adapted to their own data and to data of other tasks."""
+"""A control of adaptation: a policy adapts to a held-out task's own data, and to data of other tasks."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -48,20 +48,20 @@ def control_runs(
     folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
     seed: int, device: str, engine: str
 ) -> ControlResult:  # fmt: skip
-    """Play all arms of runs that differ in the seed alone.
+    """Play all arms of runs that differ only in the seed.
 
     Args:
-        folders: Runs of a learner that adapts, on a suite whose classes stand in both splits.
+        folders: Runs of a learner that adapts, on a suite whose classes are in both splits.
         shots: Adaptation rounds, one after the other.
-        rollouts: Episodes of each task in a shot; None: as in training, 40 at most.
+        rollouts: Episodes of each task in a shot; None: as in training, at most 40.
         episodes: Evaluation episodes after each adaptation.
-        trials: Adaptations of each task, each from the start and to other episodes.
-        num_envs: Most environments stepped together.
+        trials: Number of adaptations to each task, each from the unadapted policy and with new episodes.
+        num_envs: Maximum number of environments stepped together.
         seed: Seed of the episodes' starts.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
 
-    Raises BidexError for runs that do not go together.
+    Raises BidexError for runs that cannot be evaluated together.
     """
     _check(folders)
     results = []

@@ -138,7 +138,7 @@ class RunMetaTest:
 
 @dataclass(frozen=True, kw_only=True)
 class FinalEvaluation:
-    """The evaluation that follows a training."""
+    """The evaluation at the end of training."""
 
     episodes: Few | None = None
     """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
@@ -156,7 +156,7 @@ class FinalEvaluation:
     hidden_rewards: Switch = False  # That evaluation is also played with its rewards hidden.
 
     def check(self, config: AnyConfig) -> None:
-        """Raise BidexError for a bad value, and if an option does not go with the learner of a resolved config."""
+        """Raise BidexError for a bad value, or for an option that the learner of a resolved config does not support."""
         check_fields(self, "run", as_flags=True)
         adapts = Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities
         if adapts:
@@ -213,7 +213,7 @@ def evaluate(
             draws), or a meta suite's ``test`` tasks.
         checkpoint: ``last``, ``best`` or a file.
         random: Whether a random policy plays the same tasks.
-        other_tasks: Whether the policy also plays as many tasks that no run was trained on.
+        other_tasks: Whether the policy also plays the same number of tasks that no run was trained on.
         episodes: Episodes of each task; None: 4, or 1 where a task fixes its start.
         num_envs: Environments stepped together, a multiple of the number of tasks; None: one per task.
         seed: Seed of the episodes' starts; training does not use the default.
@@ -276,20 +276,21 @@ def meta_test(
         suite: For an agent: name or file of a suite that hides its goals. A run has its own.
         split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), or ``auto`` for
             train and test.
-        checkpoint: Of a run: ``last``, ``best`` or a file.
+        checkpoint: For a run: ``last``, ``best`` or a file.
         shots: Adaptation rounds, one after the other; None: 2.
         rollouts: Episodes of each task in a shot; None: as in training, 40 at most, else 10.
         episodes: Evaluation episodes of each task; None: the number of rollouts.
         tasks: Tasks of each class, the first of its pool; None: 5.
-        trials: Adaptations to each task, each from the start and to other episodes; None: five or more per class.
-        num_envs: Most environments stepped together; None: 1024.
+        trials: Number of adaptations to each task, each from the unadapted agent and with new episodes; None: as many
+            as give five or more per class.
+        num_envs: Maximum number of environments stepped together; None: 1024.
         seed: Seed of the episodes' starts; training does not use the default.
         task_seed: For an agent: seed that draws the tasks, as in ``Benchmark(suite, task_seed)``; None: 0.
         hidden_rewards: Whether the evaluation episodes are also played with their rewards hidden.
         randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
-        save: Whether the result is written to the run's ``evaluation.json``; of an agent call ``result.save(path)``.
+        save: Whether the result is written to the run's ``evaluation.json``; for an agent, call ``result.save(path)``.
 
     Raises BidexError for a run without such a checkpoint or split, for learners and agents that do not adapt, and for
     suites that show their goals.

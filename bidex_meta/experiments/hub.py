@@ -32,8 +32,8 @@ Files = Mapping[str, Path | bytes]
 def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) -> dict[str, Path]:
     """Return the files of a folder that are published, by their path within it.
 
-    Raises BidexError for a link that leads out of ``root``, by default the folder itself: it would publish, or fetch,
-    a file that nobody named.
+    Raises BidexError for a link that leads out of ``root`` (by default the folder itself), because it would publish or
+    fetch a file that nobody named.
     """
     root = absolute(root or folder)
     files = {}
@@ -47,9 +47,9 @@ def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) 
 
 
 def checked(folder: Path) -> RunFolder | Dataset:
-    """Return the run or the data set in a folder, after all that is published of it was read.
+    """Return the run or the data set in a folder, after reading everything that is published of it.
 
-    Raises BidexError where ``bidex-meta evaluate`` or ``bidex-meta data info`` would.
+    Raises BidexError if ``bidex-meta evaluate`` or ``bidex-meta data info`` would raise it.
     """
     if is_file(folder / _METADATA):
         from bidex_meta.data.checking import coverage, summary
@@ -70,7 +70,7 @@ def checked(folder: Path) -> RunFolder | Dataset:
 
 
 def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes]:
-    """Return the files of a checked folder as they are published: without paths of this machine, with an own suite."""
+    """Return the files of a checked folder as published: without paths of this machine, with a user's suite file."""
     content: dict[str, Path | bytes] = dict(files)
     for name in files.keys() & {"config.json", "versions.json", "evaluation.json"}:
         found = read_json(files[name], "a file of a run")
@@ -89,7 +89,7 @@ def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes
 def new_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside ``path``, which is renamed to it once all within has succeeded.
 
-    What a killed process left is deleted. Raises BidexError where ``path`` holds something.
+    Files that a killed process left are deleted. Raises BidexError if ``path`` is not empty.
     """
     if exists(path) and not (path.is_dir() and not any(path.iterdir())):
         raise BidexError(f"{path} exists and is not empty. Name another, or delete it.")

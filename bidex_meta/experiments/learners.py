@@ -1,4 +1,4 @@
-"""The learners by name, and how one is loaded; :mod:`bidex_meta.training.learner` says what a learner is."""
+"""The learners by name, and their loading; :mod:`bidex_meta.training.learner` defines learners."""
 
 import dataclasses
 import importlib
@@ -60,7 +60,7 @@ class LearnerKind:
     presets: Mapping[str, Any]  # configs by name, all of one dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
-        """Mode of the world it trains on, for fields of its config."""
+        """Return the autoreset mode of the world that the learner trains on, for fields of its config."""
         config_type = type(next(iter(self.presets.values())))
         return self.make.autoreset_mode(config_type(**config))
 
@@ -73,7 +73,7 @@ def learner_class(name: str) -> type[Learner]:
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """Return the learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; else raise BidexError.
 
-    It may have presets of its own for the ``task`` that it shall learn alone.
+    A learner may have special presets for a single ``task``.
     """
     if is_outside(name):
         make = _from_elsewhere(name)
@@ -116,7 +116,8 @@ def _from_elsewhere(name: str) -> type[Learner]:
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
     """Return the preset's name and, in words, the reason for this preset.
 
-    ``asked`` may be ``auto``; then ``first`` (``Worlds.preset``: a preset and why) goes before what fits the device.
+    If ``asked`` is ``auto``, ``first`` (``Worlds.preset``: a preset and the reason) takes precedence over the preset
+    that fits the device.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
@@ -133,9 +134,10 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
 
 
 def resolve_device(asked: str, on_gpu: bool) -> str:
-    """``auto`` to ``cuda`` where there is one and it is of use (``Worlds.on_gpu``), else ``cpu``; others as they are.
+    """Return the device that a name means: ``auto`` is ``cuda`` if a GPU exists and ``on_gpu``, else ``cpu``.
 
-    Raises BidexError where no world runs on the device, or it is not there (for each of several processes).
+    ``on_gpu`` says whether the worlds profit from a GPU (``Worlds.on_gpu``). Other names are returned unchanged. Raises
+    BidexError for an unknown or missing device, or if there are fewer GPUs than processes.
     """
     import torch
 

@@ -25,25 +25,26 @@ _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How much an evaluation plays."""
+    """Options of a meta-test or an evaluation: its tasks, episodes and environments."""
 
     episodes: Few | None = None
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
     many as --rollouts."""
     shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, 40 at most, else 10.
-    tasks: Few | None = None  # Adapt to the first so many tasks of each class; None: 5.
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, at most 40, else 10.
+    tasks: Few | None = None  # Number of tasks of each class to adapt to, the first of its pool; None: 5.
     trials: Few | None = None
-    """Adapt to each task so often, each time from the start and to other episodes; None: once, or as often as makes
-    five adaptations of each class, since an interval over one adaptation's episodes says nothing of another."""
+    """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or as many as
+    give five adaptations per class, because the episodes of one adaptation show nothing about other adaptations."""
     num_envs: Environments | None = None
     """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
-    class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
+    class). For learners that adapt, the maximum number, which bounds memory but does not alter the protocol; None:
+    1024."""
     seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
     hidden_rewards: Switch = False  # Learners that adapt also play the evaluation episodes with their rewards hidden.
 
     def refuse_adaptation(self, algo: str) -> None:
-        """Raise BidexError if an option is given that concerns adaptation alone."""
+        """Raise BidexError if an option is given that only concerns adaptation."""
         for name in ("shots", "rollouts", "tasks", "trials"):
             number = getattr(self, name)
             if number is not None:
@@ -63,7 +64,7 @@ class Adaptation:
     max_adapt_steps: int | None = None
     """Longest episode that the agent adapts to, in steps; None: whole episodes."""
     is_per_environment: bool = True
-    """True if each environment adapts from its own episodes alone."""
+    """True if each environment adapts only from its own episodes."""
 
     @staticmethod
     def of(worlds: Worlds, config: RunConfig) -> "Adaptation":
@@ -84,7 +85,7 @@ def meta_test(
 ) -> dict[str, MetaEvaluation]:  # fmt: skip
     """Play the meta-test on some splits of worlds.
 
-    ``load`` makes a new MetaLearningAgent for each split, so that neither depends on the other.
+    ``load`` makes a new MetaLearningAgent for each split, so that the splits do not influence each other.
     """
     check_worlds(worlds, adaptation.name)
     found = {}
@@ -132,7 +133,7 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
 def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
     """Return the number of episodes of each task in a shot: as asked, else the default.
 
-    ``most`` is the largest number of environments of a class. An environment that adapts from its own episodes alone
+    ``most`` is the largest number of environments of a class. An environment that only adapts from its own episodes
     plays one episode in a shot, so there are no more episodes than environments.
     """
     rollouts = asked or adaptation.rollouts
@@ -142,10 +143,10 @@ def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Environments of a world that plays as many adaptations (tasks times trials) of each class at once as it can.
+    """Return the number of environments that plays as many adaptations of each class at once as possible.
 
-    Each takes ``rollouts`` environments, if there are so many; else it takes several rounds. ``limit`` is the number
-    of environments at most, but never fewer than one for each class.
+    There are ``adaptations`` (tasks times trials) per class. Each takes ``rollouts`` environments, or several rounds in
+    fewer environments. ``limit`` is the maximum number of environments, but each class gets at least one.
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:
@@ -156,7 +157,7 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
 
 
 def check_worlds(worlds: Worlds, name: str) -> None:
-    """Refuse worlds that show their tasks: Meta-World's, multi-task or of a class alone."""
+    """Refuse worlds that show their tasks: those of Meta-World, of multi-task suites and of single classes."""
     if not worlds.hides_goals:
         raise BidexError(
             f"{name} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite (ML1-v2, ML5-v2, ML20-v2, "

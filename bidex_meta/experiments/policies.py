@@ -1,4 +1,4 @@
-"""From a run folder to its policy: the commands' one way."""
+"""Load a run's policy from its folder, in the same way for all commands."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -22,12 +22,13 @@ from bidex_meta.worlds import Worlds, open_worlds
 
 
 def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
-    """State and environment steps of a run's checkpoint; BidexError where there is none such.
+    """Return the state and the environment steps of a run's checkpoint; raise BidexError if there is none.
 
-    Says how the run's record differs from this installation and the run's suite, unless that was ``noted`` before.
+    Differences between the run's record and this installation or the run's suite are printed, unless they were
+    ``noted`` before.
 
-    ``which`` is ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path
-    or by its name in the run's folder of checkpoints.
+    ``which`` is ``last`` (the newest), ``best`` (its state only holds the policy), or a file, by its path or by its
+    name in the run's folder of checkpoints.
     """
     loaded = _loaded(folder, which)
     if not noted:
@@ -56,7 +57,7 @@ def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
 def fitting(path: Path) -> Iterator[None]:
     """Turn errors while a checkpoint is loaded into a BidexError: the checkpoint does not fit the run's config.
 
-    A checkpoint may be of another version, or of anybody: its tensors and words can be any.
+    A checkpoint may come from another version or another author, so its tensors and texts can be anything.
     """
     try:
         yield
@@ -93,16 +94,16 @@ def policy_of(folder: RunFolder, state: Json, device: str) -> Agent:
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
-    """Return a function that makes a new policy of a run's checkpoint with each call, and the checkpoint's steps.
+    """Return a function that makes a new policy from a run's checkpoint at each call, and the checkpoint's steps.
 
-    The checkpoint is read once: a run that trains on meanwhile gives no other.
+    The checkpoint is read only once, so all calls return the same policy even if the run is still training.
     """
     state, step = checkpoint(folder, which)
     return lambda: policy_of(folder, state, device), step
 
 
 def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
-    """Say in one line how the rules that a run's policy has learned by differ from those of some worlds, if they do."""
+    """Say in one line how the rules under which a run trained differ from the rules of some worlds, if they differ."""
     with contextlib.suppress(BidexError):  # the suite's file of the run may be gone
         learned = open_worlds(folder.config().to_json())
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):

@@ -143,7 +143,7 @@ def _written(name: str | None) -> str | None:
 
 
 def _learner_config(preset: Any, config: AnyConfig, where: str) -> Any:
-    """Return the learner's settings: as they are, or a preset with the given values in the place of its own."""
+    """Return the learner's settings: unchanged, or a preset in which the given values replace the preset's values."""
     if not isinstance(config.learner, Mapping):
         return config.learner
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in config.learner.items()}

@@ -77,7 +77,7 @@ def open_datasets(names: Sequence[str]) -> list[Dataset]:
 
 
 def implied(datasets: Sequence[Dataset]) -> Json:
-    """Suite, or task, base and object, and points, of which all data sets are; empty where their metadata have none."""
+    """Return the suite (or task, base, object) and the points that all data sets share; empty without metadata."""
     forms = [tuple(dataset.metadata.get(name) or None for name in _FORM) for dataset in datasets]
     if not forms or forms[0][:2] == (None, None):
         return {}
@@ -103,7 +103,7 @@ def task_seed(datasets: Sequence[Dataset]) -> int | None:
 
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
-    """Refuses a learner and data sets that do not go together."""
+    """Refuse a learner and data sets that do not fit each other."""
     if Capability.OFFLINE not in kind.make.capabilities:
         if datasets:
             names = ", ".join(name for name in ALGOS if Capability.OFFLINE in learner_kind(name).make.capabilities)
@@ -120,7 +120,7 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
 
 
 def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
-    """Refuses, by the metadata alone, what could not be imitated: of other classes or bases, or with other goals."""
+    """Refuse demonstrations of other classes or bases, or with other goals; only metadata are read."""
     if names and Capability.IMITATES not in kind.make.capabilities:
         takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).make.capabilities)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
@@ -142,7 +142,7 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
 
 
 def _check_goals(dataset: Dataset, source: Worlds) -> None:
-    """Refuses data without the goals that the source shows; goals that it hides may be in the data."""
+    """Refuse data that hide the goals if the source shows them; data may show goals that the source hides."""
     about = dataset.metadata
     if about.get("hides_goals", source.hides_goals) == source.hides_goals:
         return
@@ -153,7 +153,7 @@ def _check_goals(dataset: Dataset, source: Worlds) -> None:
 
 
 def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
-    """Open data sets, after a line of what they are for and one for each that was recorded by other rules."""
+    """Open data sets; print their purpose, and a note for each set that was recorded under other rules."""
     datasets = open_datasets(names)
     steps = sum(dataset.num_steps for dataset in datasets)
     episodes = sum(dataset.num_episodes for dataset in datasets)

@@ -1,4 +1,4 @@
-"""Teachers of ``bidex-meta run`` (--teacher): which class learns from whom, and their policies."""
+"""Teachers of ``bidex-meta run`` (--teacher): the teacher of each class, and the teachers' policies."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,12 +25,12 @@ SCRIPTS = "scripts"
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
-    """Teachers as a config holds them: of run folders the whole path."""
+    """Return teachers as a config holds them; run folders get whole paths."""
     return tuple(name if name == SCRIPTS else run_data.whole_paths([name])[0] for name in names)
 
 
 def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None:
-    """Refuses teachers that do not go with the learner or its worlds, before anything is built."""
+    """Refuse teachers that do not fit the learner or its worlds, before anything is built."""
     if not config.teacher:
         if Capability.TAUGHT in kind.make.capabilities:
             raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
@@ -68,7 +68,7 @@ def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
 
 
 def _scripted(source: Worlds) -> set[str]:
-    """Classes with a script; raises BidexError where bases do not move."""
+    """Return the classes that have a script; raise BidexError if bases do not move."""
     if not source.moving_bases:
         raise BidexError(
             f"--teacher scripts moves the hands' bases, which are fixed in {source.name}. Add --base moving."
@@ -77,7 +77,7 @@ def _scripted(source: Worlds) -> set[str]:
 
 
 def _known_to(name: str, source: Worlds) -> set[str]:
-    """Classes that the policy of a run has learned, in the same form."""
+    """Return the classes that the policy of a run has learned, in the same form."""
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
@@ -101,7 +101,7 @@ def _known_to(name: str, source: Worlds) -> set[str]:
 
 
 def _alike(one: object, other: object) -> bool:
-    """Whether two classes are the same one, observed and controlled alike."""
+    """Return whether two classes are the same, with equal observations and actions."""
     names = ("name", "rules", "layout", "action_size", "object")
     return all(getattr(one, name, None) == getattr(other, name, None) for name in names)
 

@@ -1,4 +1,4 @@
-"""Plans of sweeps: runs with their configs, in a list or by a study file, which docs/sweeps.md explains."""
+"""Plans of sweeps: runs with their configs, from a list or a study file (docs/sweeps.md)."""
 
 import itertools
 import re
@@ -60,7 +60,7 @@ class _File(_Shared):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a plan. It trains in a process of its own, ``bidex-meta run`` with the words of this run."""
+    """A run of a plan. It trains in a separate process: ``bidex-meta run`` with the words of this run."""
 
     path: Path
     """The run's folder, which need not be there yet."""
@@ -134,7 +134,7 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """Runs to train: in a list, or by a study file."""
+    """Runs to train, from a list or a study file."""
 
     folder: Path
     """The folder of the runs' folders."""
@@ -165,8 +165,8 @@ class SweepPlan:
     def read(cls, file: str | Path, root: str | Path = "runs") -> "SweepPlan":
         """Read a study file (docs/sweeps.md): all arms with the first seed, then with the second.
 
-        ``root`` is where the folder of the study is. Raises BidexError if the file is wrong, or if two of its runs have
-        one name. Values that ``bidex-meta run`` refuses are refused by ``bidex_meta.sweep``.
+        ``root`` is the folder that contains the study's folder. Raises BidexError if the file is wrong, or if two of
+        its runs have the same name. Values that ``bidex-meta run`` refuses are refused by ``bidex_meta.sweep``.
         """
         return _read(Path(file), expanded(root))
 
@@ -238,7 +238,10 @@ def _runs(path: Path, file: _File, arms: Sequence[_Arm], folder: Path) -> Iterat
 
 
 def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, JsonObject]]:
-    """Yield every combination of the grid for an arm, without what the arm sets itself: its label, and all values."""
+    """Yield the label and all values of every combination of the grid for an arm.
+
+    Fields that the arm itself sets are left out of the grid.
+    """
     shared = _by_field(file.overrides)
     own = _by_field(arm.overrides)
     grid = {name: values for name, values in _by_field(file.grid).items() if name not in own}
@@ -249,7 +252,7 @@ def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, JsonObject]]:
 
 
 def _by_field(flags: JsonObject) -> JsonObject:
-    """Return values without nesting by the names of fields, which a file may write with hyphens, as flags are."""
+    """Return values in a flat dict by field name; a file may write names with hyphens, as flags are written."""
     return {flag.replace("-", "_"): value for flag, value in flat(flags).items()}
 
 

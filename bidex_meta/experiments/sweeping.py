@@ -72,7 +72,7 @@ class SweepResult:
 
 @checked_arguments
 def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = None) -> SweepResult:
-    """Train the runs of a plan that are not done, each in a process of its own, and evaluate each at its end.
+    """Train the unfinished runs of a plan, each in a separate process, and evaluate each run at its end.
 
     A call after an interruption goes on where the last call stopped. After Ctrl-C each run saves and stops.
 

@@ -1,4 +1,4 @@
-"""Watching a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
+"""Watching a learner while it learns: evaluations, the best policy, films. Training does not depend on them."""
 
 import math
 import random
@@ -36,7 +36,7 @@ _MOST_FILM_STEPS = 300
 
 
 def check(config: AnyConfig, worlds: Worlds) -> None:
-    """Refuse what would fail in the middle of the training: films of what has none or cannot be drawn, a logger."""
+    """Refuse settings that would fail in the middle of training: films that cannot be made, or a missing logger."""
     check_logger(config.logger)
     if config.video_every is not None:
         worlds.task_classes()
@@ -45,7 +45,7 @@ def check(config: AnyConfig, worlds: Worlds) -> None:
 
 
 class Watch:
-    """Called after each iteration, of which a resumed run has made some before; every so many it evaluates or films."""
+    """Evaluates or films every N iterations; it is called after each iteration. Resumed runs continue the count."""
 
     def __init__(
         self, config: AnyConfig, kind: LearnerKind, worlds: Worlds, folder: RunFolder, learner: Learner,
@@ -63,7 +63,7 @@ class Watch:
         self._best = folder.checkpoints.found_of_best()
 
     def __call__(self) -> dict[str, float]:
-        """Metrics of this iteration's evaluation, ``Eval/...``; none without one."""
+        """Return the metrics of this iteration's evaluation, ``Eval/...``; none if there is no evaluation."""
         self._iterations += 1
         metrics: dict[str, float] = {}
         with undisturbed(torch.device(self._device)):
@@ -74,7 +74,7 @@ class Watch:
         return metrics
 
     def close(self) -> None:
-        """Frees the worlds."""
+        """Free the worlds."""
         for world in self._worlds.values():
             world.close()
 
@@ -111,7 +111,7 @@ class Watch:
         return evaluate(policy, world, episodes, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
-        """Return the results on train tasks: test tasks must not choose the policy that is judged on them."""
+        """Return the results on train tasks, because test tasks must not select the policy that they evaluate."""
         load = partial(self._policy, self._device)
         adaptation = metatest.Adaptation.of(self._source, self._config)
         found = metatest.meta_test(self._source, adaptation, load, metatest.Options(), ["train"])["train"]
@@ -135,14 +135,14 @@ class Watch:
 
 
 def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
-    """Of an evaluation while training the tasks of each class, and the episodes of each task, by the pools' names."""
+    """Return the tasks per class and the episodes per task of an evaluation during training, by the pools' names."""
     tasks = min(TASKS, max(map(len, pools.values())))
     return tasks, math.ceil(_LEAST / (tasks * len(pools)))
 
 
 @contextmanager
 def undisturbed(device: torch.device) -> Iterator[None]:
-    """Whatever is drawn inside, the random numbers outside go on as if it had not been."""
+    """Restore the random generators afterwards, so that draws inside the block do not affect draws outside."""
     python = random.getstate()
     legacy = np.random.get_state()
     with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
@@ -152,7 +152,7 @@ def undisturbed(device: torch.device) -> Iterator[None]:
 
 
 def _metrics(found: Evaluation) -> dict[str, float]:
-    """Means over classes, and each class."""
+    """Return metrics for each class and means over classes."""
     classes = found.classes
     metrics = {
         "Eval/success_rate": float(np.mean([result.success for result in classes.values()])),
@@ -168,7 +168,7 @@ def _metrics(found: Evaluation) -> dict[str, float]:
 
 
 def _better(found: dict[str, float], best: dict[str, float]) -> bool:
-    """By success; where that is equal by the score, or the return where there is no score."""
+    """Return whether a result is better: by success, then by score (by return if there is no score)."""
     if "Eval/score" in found and "Eval/score" in best:
         second = "Eval/score"
     else:

@@ -21,9 +21,9 @@ _Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def loft(sections: Sequence[Section], low: float, high: float, power: float = 2.0) -> _Mesh:
-    """Return a closed skin through sections with ascending z, its ends rounded within ``low`` and ``high``, mm.
+    """Return a closed skin through sections with ascending z; rounded ends add ``low`` below and ``high`` above, mm.
 
-    ``power``: 2 for ellipses, more for rounded rectangles.
+    ``power`` is 2 for ellipses, and larger for rounded rectangles.
     """
     given = np.array(sections)
     z = np.concatenate([np.linspace(a, b, _ALONG, endpoint=False) for a, b in pairwise(given)])

@@ -27,10 +27,10 @@ MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
 
 
 class ForMetaWorld:
-    """One of our agents as ``metaworld.evaluation`` takes it: NumPy arrays in and out.
+    """Adapts one of our agents to ``metaworld.evaluation``, which passes and expects NumPy arrays.
 
-    ``agent`` is an Agent for ``evaluation``, a MetaLearningAgent for ``metalearning_evaluation``; ``task_of_row``
-    numbers the task of each environment from 0 on. None: each environment has its own task.
+    ``agent`` is an Agent for ``evaluation``, or a MetaLearningAgent for ``metalearning_evaluation``. ``task_of_row``
+    numbers the task of each environment from 0 on; if it is None, each environment has its own task.
     """
 
     @checked_arguments
@@ -95,10 +95,10 @@ class ForMetaWorld:
 
 
 class FromMetaWorld:
-    """An agent with NumPy arrays for Meta-World's ``metalearning_evaluation`` as ``meta_evaluate`` takes it.
+    """Adapts an agent that was written for Meta-World's ``metalearning_evaluation`` to ``meta_evaluate``.
 
-    When an episode ends, Meta-World starts the environment's next one; ours freezes it until all have ended. The agent
-    sees the frozen episode go on without reward and without an end.
+    When an episode ends, Meta-World starts the environment's next episode. Our worlds freeze the environment until all
+    episodes have ended, and the agent sees the frozen episode continue without reward and without an end.
     """
 
     @checked_arguments
@@ -148,7 +148,8 @@ class FromMetaWorld:
 class MetaWorldEnvs(VectorEnv):
     """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
-    Raises BidexError unless the world's autoreset mode is DISABLED: the class starts episodes, as success may end them.
+    Raises BidexError unless the world's autoreset mode is DISABLED, because success may end episodes and this class
+    then starts new ones.
     """
 
     @checked_arguments
@@ -210,7 +211,7 @@ class MetaWorldEnvs(VectorEnv):
         self.terminate_on_success = true_or_false("on", on)
 
     def toggle_sample_tasks_on_reset(self, on: bool) -> None:
-        """Raise BidexError when switched on: environments keep their tasks until ``sample_tasks``."""
+        """Raise BidexError when switched on, because environments keep their tasks until ``sample_tasks`` is called."""
         if on:
             raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
 

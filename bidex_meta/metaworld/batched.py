@@ -58,7 +58,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset on; BidexError for other values."""
+        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset; raise BidexError for others."""
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:

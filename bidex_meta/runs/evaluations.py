@@ -1,4 +1,4 @@
-"""The content of ``evaluation.json``: a policy's evaluation or a meta-test, read and written by this module alone.
+"""The content of ``evaluation.json``: a policy's evaluation or a meta-test, read and written only by this module.
 
 ``bidex-meta evaluate --json`` prints the same content. Unknown entries are ignored. Entries that default to None may be
 missing in a file.

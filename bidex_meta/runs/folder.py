@@ -114,12 +114,12 @@ class RunFolder:
         return Checkpoints(self.checkpoints_path)
 
     def config(self) -> RunConfig[Json]:
-        """Return the resolved config; raises BidexError if ``config.json`` cannot be read, or is not a run's."""
+        """Return the resolved config; raises BidexError if ``config.json`` cannot be read or is not a run's config."""
         return read_config(self.config_path)
 
     @property
     def again(self) -> str:
-        """Return the command that writes the run's evaluation again, for messages."""
+        """Return the command that repeats the run's evaluation, for messages."""
         return f"bidex-meta evaluate {self.path} --json > {self.evaluation_path}"
 
     @property
@@ -133,7 +133,7 @@ class RunFolder:
 
     @property
     def goal(self) -> int:
-        """Return the steps to train for; the steps done if time, a return or a score has ended the run."""
+        """Return the steps to train for, or the steps done if time, a return or a score has ended the run."""
         rows = last_rows(self.metrics_path)
         return self.config().goal(rows[-1] if rows else {"step": 0})
 

@@ -277,7 +277,7 @@ class Switch(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return base positions, the button points' targets ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
+        """Return base positions; ``goal1``, ``goal2``: buttons' target points, (n, 3); ``goal``: switch 1's pose."""
         frozen = {}
         for i, switch in enumerate(self.objects, start=1):
             position = constant(switch.position, variation).repeat(len(variation), 1)

@@ -34,12 +34,12 @@ class Solver:
     """Settings of the contact solver per class, in addition to the common profile (bidex_meta/hands/README.md).
 
     Attributes:
-        iterations: Newton iterations at most; ``line_search``: steps of a line search at most.
+        iterations: Maximum number of Newton iterations; ``line_search``: maximum number of steps of a line search.
         cone: Friction cones: an elliptic cone is exact; a pyramid costs 25 to 33 % less and slips a little.
         impratio: Stiffness of friction relative to the normal force; a higher ratio makes held objects creep less.
-        time_step: Seconds; a control step has a whole number of time steps. Contacts and limits are as stiff as it
-            allows.
-        most_condim: Dimensions of a contact at most: 4 with torsional friction (eggs and fingertips), 3 without.
+        time_step: Seconds; a control step has a whole number of time steps. Contacts and limits are as stiff as this
+            time step allows.
+        most_condim: Maximum dimension of a contact: 4 with torsional friction (eggs and fingertips), 3 without.
     """
 
     iterations: Count = 10
@@ -79,17 +79,17 @@ class TaskClass(ABC):
     A class has no state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
-        name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: what it asks for, one line.
-        formula: The printed reward; ``solved``: when it counts as solved, one line.
-        deviations: What differs from the appendix on purpose, a line each.
+        name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: the task in one line.
+        formula: The printed reward; ``solved``: the condition for success in one line.
+        deviations: Intended differences from the appendix, one line each.
         episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, if it takes longer.
         right: Start pose of the right hand; ``left`` of the left one.
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
-        start_draws: How many uniform numbers the start of an episode takes.
-        variation_space: What a task of this class freezes; an attribute or a property. With wide variation a task
-            freezes only what it hides: ``adopt`` divides ``wide_space``.
-        episode_space: What every episode draws in addition, with wide variation: the components that nothing hides.
-        wide_space: Both together, in the order that ``freeze`` reads; None: a class without version 2.
+        start_draws: Number of uniform numbers that the start of an episode takes.
+        variation_space: Components that a task of this class freezes; an attribute or a property. With wide variation
+            these are only the hidden components: ``adopt`` divides ``wide_space``.
+        episode_space: Components that every episode draws, with wide variation: those that are not hidden.
+        wide_space: Components of both spaces, in the order that ``freeze`` reads; None: a class without version 2.
         wide_solved: ``solved`` with wide variation.
         wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
         jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
@@ -99,10 +99,10 @@ class TaskClass(ABC):
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
             class says (fixed only for HandOver).
-        solver: What the class asks of the contact solver.
-        needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
-            by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
-            largest of all.
+        solver: Settings of the contact solver for this class.
+        needs: Maximum number of contacts and of constraint rows in 30,208 states under rough actions, for the fixed
+            buffers of mujoco_warp; measured with ``python -m tools.bench capacity --task NAME --steps 30000``. A class
+            that was not measured has the largest numbers of all classes.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
         depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
@@ -165,10 +165,10 @@ class TaskClass(ABC):
             self.widen()
 
     def widen(self) -> None:
-        """Use the wide variation: tasks freeze the hidden components of ``wide_space``, episodes draw the others.
+        """Use the wide variation: a task freezes the hidden components of ``wide_space``, each episode draws the rest.
 
-        A memory could otherwise tell tasks apart by where things stand. A class that hides nothing keeps all
-        components in its tasks.
+        Otherwise a policy with memory could recognise a task by the placement of its objects. A class that hides
+        nothing keeps all components in its tasks.
         """
         if self.wide_space is None:
             raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
@@ -188,8 +188,8 @@ class TaskClass(ABC):
     def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
         """Return ``freeze`` of tasks' variations (n, variation_space.size), completed by ``episode_space``.
 
-        ``draws`` in [-1, 1], (n, at least episode_space.size), are those of episodes: their starts depend on them.
-        None stands for the middle of the space: rewards, success and observations depend on the task alone.
+        ``draws`` in [-1, 1], (n, at least episode_space.size), belong to the episodes and decide their starts. None
+        stands for the middle of ``episode_space``, because rewards, success and observations depend on the task only.
         """
         space = self.episode_space
         if not space.size:
@@ -231,7 +231,8 @@ class TaskClass(ABC):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """Compute frozen values, each (n, k), for reward and observation from variations (n, variation_space.size).
 
-        With wide variation from vectors of ``wide_space``, of which only ``start`` may read what episodes draw.
+        With wide variation the variations are vectors of ``wide_space``. Then only ``start`` may read frozen values
+        that depend on components drawn per episode.
         """
 
     @abstractmethod

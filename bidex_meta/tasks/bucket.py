@@ -1,4 +1,4 @@
-"""GraspAndPlace and PourWater: appendix A.2.17 (with a picture of GraspAndPlace but no section); docs/figures.md."""
+"""GraspAndPlace (the appendix only has a picture) and PourWater (appendix A.2.17); docs/figures.md."""
 
 import math
 from collections.abc import Mapping

@@ -62,7 +62,7 @@ class _TwoBlocks(ReachTask):
         return first, second
 
     def off_by(self, state: TaskState, tolerance: float) -> list[Error]:
-        """Return ``distances`` as errors."""
+        """Return the distance of each block to its goal as an error with this tolerance."""
         return [Error(distance, tolerance) for distance in self.distances(state)]
 
     def target(self, state: TaskState) -> Tensor:

@@ -69,7 +69,7 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
 def lay_egg_on_hand(
     egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
 ) -> None:
-    """Lift an egg, or an object in a spheroid, off its palm and open the fingers that would penetrate it.
+    """Lift an egg (or the spheroid around an object) off its palm, and open the fingers that would penetrate it.
 
     The egg (n, 7) and the joint angles (n, 24) of the hand that starts at ``pose`` are written in place. Semi-axes are
     in metres.
@@ -86,11 +86,11 @@ def lay_egg_on_hand(
 def put_down(
     place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
 ) -> None:
-    """Write the start of an egg, in any orientation, or of another object, on a broad side; clear of the hand.
+    """Write the start of an egg in any orientation, or of another object on a broad side, clear of the hand.
 
-    The positions (n, 7) and the joint angles (n, 24) of the hand below are written in place. Without joints no hand is
-    below: an object that reaches further down than an egg then starts higher by the difference. Draws and noise are
-    those of ``start_egg``.
+    The positions (n, 7) and the joint angles (n, 24) of the hand below are written in place. If no joints are given, no
+    hand is below; then an object that extends further down than an egg starts higher by the difference. Draws and noise
+    are those of ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -114,17 +114,21 @@ def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
 
 
 class EggTask(TaskClass):
-    """Throw each egg to a goal pose at the other hand; all goals share an orientation, all eggs a start noise.
+    """Throw each egg to a goal pose at the other hand.
+
+    All goals of a task have the same orientation, and all eggs have the same range of start noise.
 
     Attributes:
         starts: Nominal start of each egg, world, metres: first an egg on the right hand, then one on the left.
         goals: Centre of the box of each egg's goals, world, metres.
-        position_noise: Half width of the eggs' noise at a start, m; ``joint_noise``: a share of each joint's range.
+        position_noise: Half width of the noise in the eggs' start positions, m; ``joint_noise``: that of the joint
+            angles, as a share of each joint's range.
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
         floor: The episode fails when an egg's height falls to this, metres.
-        anchors: The episode fails when a point is 0.1 m off its anchor (world, metres); by the point's sensor.
-        numbers: Ends of the names of eggs and goals.
+        anchors: Anchor of each point (world, metres), by the name of the point's sensor. The episode fails when a point
+            is 0.1 m or more from its anchor.
+        numbers: Suffixes of the names of eggs and goals.
     """
 
     formula = "exp(-0.2 (50 d + r)), d and r the distance and the angle between egg and goal"
@@ -229,7 +233,7 @@ class EggTask(TaskClass):
         return within(self.errors(state))
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return whether an egg dropped or a hand left; rewards are positive, so an early end never pays off."""
+        """Return whether an egg dropped or a hand left its anchor; rewards are positive, so an early end earns less."""
         ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
         for name, anchor in self.anchors.items():
             point = state[name]

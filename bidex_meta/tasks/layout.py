@@ -67,7 +67,7 @@ class Layout:
 
     @checked_arguments
     def range(self, name: str) -> slice:
-        """Return the index range of the named block; BidexError if there is none."""
+        """Return the index range of the named block; raise BidexError if there is none."""
         if name not in self._ranges:
             raise unknown_name("block", name, self._ranges)
         return self._ranges[name]

@@ -30,7 +30,7 @@ class TaskState:
         self.frozen = frozen
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return the values of the named sensor, shape (n, k); BidexError for an unknown one."""
+        """Return the values of the named sensor, shape (n, k); raise BidexError for an unknown sensor."""
         try:
             return self._sensors[:, self._addresses[name]]
         except KeyError:

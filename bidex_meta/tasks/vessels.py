@@ -226,12 +226,12 @@ _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 
 
 class SwingCup(OwnObjectClass):
-    """Turn a two-handled cup about the vertical, each hand at its ear.
+    """Turn a two-handled cup about the vertical axis, with one hand at each handle.
 
-    Observation: Table 28 (428). Reward: equation 13. The goal's turn is counted from the nominal start (yaw 90
-    degrees), without the task's own start turn: it lies at least 72 degrees away, so no start is a success. The
-    original's goal, half a turn away, is one end of the range. Goal position is the task's start position; the reward
-    does not read it.
+    Observation: Table 28 (428). Reward: equation 13. The goal's yaw is measured from the nominal start (yaw 90
+    degrees), not from the task's own start yaw. The goal is at least 72 degrees away, so no start is a success. The
+    original's goal, half a turn away, is one end of the range. The goal position is the task's start position; the
+    reward does not read it.
     """
 
     needs = Capacity(34, 4, 87)

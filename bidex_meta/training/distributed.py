@@ -45,12 +45,12 @@ def world_size() -> int:
 
 
 def is_main() -> bool:
-    """Return whether this is process 0, which alone writes and prints."""
+    """Return whether this is process 0, the only process that writes and prints."""
     return rank() == 0
 
 
 def own_seed(seed: int) -> int:
-    """Return a seed for this process alone (starts, sampled actions); in process 0 it is ``seed`` itself."""
+    """Return a seed for this process only (starts, sampled actions); in process 0 it is ``seed`` itself."""
     if is_main():
         return seed
     # 32 bits: torch's CPU generator reads no more, so that seed + (rank << 32) would be the same in all processes.

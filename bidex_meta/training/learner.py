@@ -28,21 +28,21 @@ class LearnerConfig(Checked):
 
     @property
     def algo(self) -> str:
-        """The learner's name in messages: that of the class, ``PPO`` of ``PPOConfig``."""
+        """Return the learner's name for messages, from the class's name: ``ppo`` for ``PPOConfig``."""
         return type(self).__name__.removesuffix("Config").lower()
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Approximate memory of a learner, where a step of an environment stores ``width`` numbers."""
+        """Estimate the bytes of memory of a learner that stores ``width`` numbers per step of an environment."""
         return 0
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Return the most bytes of experience that a checkpoint holds, such as a replay; arguments as above."""
+        """Return the maximum bytes of experience (such as a replay) in a checkpoint; arguments as in ``bytes_held``."""
         return 0
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a learner learns from beside its own experience; None: nothing of that kind."""
+    """Sources that a learner learns from in addition to its own experience; None: no such source."""
 
     data: Any = None
     """Transitions of data sets (``bidex_meta.data.joined.Joined``), for offline learners."""
@@ -64,37 +64,37 @@ NO_SOURCES = Sources()
 
 
 class Capability(StrEnum):
-    """A promise of a learner's class to the commands and to the training."""
+    """A capability of a learner's class, which the commands and the training rely on."""
 
     ADAPTS = auto()
     """Its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
     explores by its own generator, seeded equally by each call. The meta-test reads ``max_adapt_steps`` (longest episode
     of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, if there."""
     ADAPTS_INDEPENDENTLY = auto()
-    """Each environment adapts from its own episodes alone, even if several play the same task."""
+    """Each environment adapts only from its own episodes, even if several environments play the same task."""
     OFFLINE = auto()
     """It learns from data sets (``Sources.data``) and never steps the world."""
     IMITATES = auto()
     """It may take demonstrations and teachers while it learns by playing (``Sources``)."""
     TAUGHT = auto()
-    """It learns from teachers alone (``Sources.teachers``): it plays, and they label the states that it visits."""
+    """It learns only from teachers (``Sources.teachers``): it plays, and they label the states that it visits."""
     DISCOUNTS_BY_CLASS = auto()
     """It learns with a discount per class, if the world has these (``world.gammas``)."""
 
 
 class Learner(ABC):
-    """Base of all learners, of a world in the mode that :meth:`autoreset_mode` returns.
+    """Base of all learners, which train on a world in the mode that :meth:`autoreset_mode` returns.
 
-    ``config`` is an instance of the dataclass of its presets; ``seed`` is of everything random, the world's first reset
-    too. Learners that are capable of ``OFFLINE``, ``IMITATES`` or ``TAUGHT`` take a fourth argument, ``sources``.
+    ``config`` is an instance of the dataclass of its presets. ``seed`` seeds everything random, including the world's
+    first reset. Learners with capability ``OFFLINE``, ``IMITATES`` or ``TAUGHT`` take a fourth argument, ``sources``.
     """
 
     name: ClassVar[str] = "learner"
-    """Its name in messages."""
+    """The learner's name in messages."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Configs by name, all of one dataclass. ``auto``: ``laptop`` on a CPU, ``paper`` on a GPU, else the first."""
     task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """Presets where it learns a single task class, by that class; they go before those of the same name."""
+    """Presets for learning a single task class, by class; they replace presets of the same name."""
     capabilities: ClassVar[frozenset[Capability]] = frozenset()
     """Capabilities that commands and training rely on."""
     per_process: tuple[str, ...] = ()
@@ -110,12 +110,12 @@ class Learner(ABC):
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
-        """Mode of the world that it trains on."""
+        """Return the autoreset mode of the world that the learner trains on."""
         return "SAME_STEP"
 
     @classmethod
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
-        """Approximate memory; see :meth:`LearnerConfig.bytes_held`."""
+        """Estimate the memory; see :meth:`LearnerConfig.bytes_held`."""
         if isinstance(config, LearnerConfig):
             return config.bytes_held(num_envs, width)
         return 0
@@ -133,11 +133,11 @@ class Learner(ABC):
 
     @abstractmethod
     def state_dict(self) -> State:
-        """All to continue bit for bit, beside the world's state; entry ``policy`` is :meth:`policy_state_dict`."""
+        """Return all that a resumed run needs besides the world's state; ``policy`` is :meth:`policy_state_dict`."""
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restore the result of :meth:`state_dict`."""
 
     @abstractmethod
     def policy_state_dict(self) -> State:

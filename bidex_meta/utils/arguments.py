@@ -97,7 +97,7 @@ def check_attributes(kind: type, base: type, name: str) -> None:
 
 
 def check_argument(name: str, value: object, hint: object) -> None:
-    """Raise BidexError where a value is not of an annotation; ``name`` begins the message."""
+    """Raise BidexError if a value does not fit an annotation; ``name`` begins the message."""
     if _fits(value, hint):
         return
     protocols = [part for part in (hint, *get_args(hint)) if _is_protocol(part)]

@@ -1,6 +1,7 @@
 """Memory and cores that this process may use.
 
-The memory of a world, a replay or a network is checked before it is allocated: running out ends others' work.
+The memory of a world, a replay or a network is checked before it is allocated, because running out of memory may end
+other processes.
 """
 
 import math
@@ -23,7 +24,7 @@ _ROOT = Path("/")  # holds proc and sys; tests give another folder
 def usable_cores() -> int:
     """Count the cores that this process may use, by its affinity and by the CPU quota of its control groups.
 
-    A quota of one core and a half counts as two: the last thread then waits for a part of its time.
+    A quota of one and a half cores counts as two cores; one thread then waits for a part of the time.
     """
     if sys.platform == "linux":
         cores = len(os.sched_getaffinity(0))
@@ -33,7 +34,7 @@ def usable_cores() -> int:
 
 
 def available() -> int:
-    """Count the free bytes of the system (with what can be swapped), or of the control group that has fewer."""
+    """Count the free bytes of the system (including swap), or of a control group if that has fewer."""
     of_system = psutil.virtual_memory().available + psutil.swap_memory().free
     return max(0, min([of_system, *_free_of_groups()]))
 
@@ -71,9 +72,9 @@ def _cpu_quotas() -> Iterator[float]:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups of a controller, and of the groups that they lie in.
+    """Yield the folders of this process's control groups of a controller, and of their parent groups.
 
-    Inside a container the path may be the host's, of which only the last group is there, as the root folder.
+    Inside a container the path may be the host's path. Only its last group exists there, as the root folder.
     """
     root = _ROOT / "sys" / "fs" / "cgroup"
     for line in _text(_ROOT / "proc" / "self" / "cgroup").splitlines():
@@ -89,7 +90,7 @@ def _groups(controller: str) -> Iterator[Path]:
 
 
 def _numbers(path: Path) -> list[int]:
-    """Read the numbers of a file; none where it is missing, or says ``max``."""
+    """Read the numbers of a file; none if the file is missing or says ``max``."""
     words = _text(path).split()
     if all(word.lstrip("-").isdigit() for word in words):
         return [int(word) for word in words]

@@ -111,7 +111,7 @@ class HandController:
         self._held[side] = quaternion_product(turn, _numbers(now / now.norm()))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Move the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
+        """Move the hands' points towards ``right`` and ``left`` (world, metres), at most at ``speed`` (m/s)."""
         a, b = SIDES
         for _ in range(min(steps, self.steps_left)):
             self.taken += 1
@@ -120,13 +120,13 @@ class HandController:
             yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
-        """Lead the hands for one step, to the points of the right and the left hand."""
+        """Move the hands for one step towards ``points``: one for the right and one for the left hand."""
         right, left = points
         yield from self.lead(right, left, 1, speed)
 
 
 class HandActions:
-    """Computes the actions of environments of a class whose hands are led."""
+    """Computes the actions that move the hands of a class's environments as scripts ask."""
 
     def __init__(self, task: TaskClass):
         self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]

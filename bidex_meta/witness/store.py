@@ -1,4 +1,4 @@
-"""Witnesses, stored reference solutions, on disk: one file a class under ``assets/witnesses/``."""
+"""Witnesses (stored reference solutions) on disk, in one file per class under ``assets/witnesses/``."""
 
 import io
 import json

@@ -140,7 +140,7 @@ class BatchedWorld(VectorEnv, ABC):
         self.episodes = Episodes.fresh(self.num_envs, self.device)
 
     def _renew_draws(self) -> None:
-        """Draw again what was drawn ahead; called after the seed or the pools of tasks have changed."""
+        """Renew numbers that were drawn in advance; called after the seed or the pools of tasks have changed."""
 
     def _random_keys(self, purpose: str = "") -> Tensor:
         """Return the environments' keys, (n, 2), of the random numbers for one purpose."""
@@ -195,7 +195,10 @@ class BatchedWorld(VectorEnv, ABC):
         """Start the environments of a mask (``_count_episodes``) and write their observations into ``_obs``."""
 
     def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
-        """Count new episodes in the environments of a mask, of these tasks; a share of the time limit may be over."""
+        """Count new episodes in the environments of a mask.
+
+        The episodes play the tasks ``task_index``. With ``stagger`` a ``share`` of the time limit has already passed.
+        """
         self.episodes.number = self.episodes.number + mask
         self.task_index = torch.where(mask, task_index, self.task_index)
         if stagger:
@@ -222,7 +225,7 @@ class BatchedWorld(VectorEnv, ABC):
         """
 
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> Outcome:
-        """Count the step and return its outcome; of environments that are not active only success is read."""
+        """Count the step and return its outcome; for environments that are not active, only success is read."""
         obs = transition.obs
         unstable = transition.unstable | broken
         valid = active & ~unstable
@@ -264,7 +267,7 @@ class BatchedWorld(VectorEnv, ABC):
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     def _made(self) -> dict[str, str]:
-        """Return what decides the world's future beside its state, as texts by name.
+        """Return the settings that decide the world's future besides its state, as texts by name.
 
         A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out
         because a run may continue with others, and modes because an evaluation may finish episodes of training.

@@ -35,7 +35,7 @@ _ROWS = 11
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
-    """Return the number of environments; BidexError unless it is a whole number and at least that of the slots."""
+    """Return the number of environments; raise BidexError unless it is a whole number, at least one per slot."""
     number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
     if number < len(slots):
         raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
@@ -43,7 +43,7 @@ def num_envs(given: object, slots: Sequence[str]) -> int:
 
 
 def seed(given: object) -> int:
-    """Return the seed of a world; BidexError unless it is a whole number from 0 on."""
+    """Return the seed of a world; raise BidexError unless it is a whole number from 0 on."""
     return whole_number("seed", given, 0, _LARGEST_SEED)
 
 
@@ -122,9 +122,9 @@ def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> l
 
 
 def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
-    """Raise BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
+    """Raise BidexError if a saved state has other names, types or shapes than the own one, or non-finite numbers.
 
-    The entry ``made`` of a world's state must be equal. ``inside``: where in a larger state both stand.
+    The entry ``made`` of a world's state must be equal. ``inside`` is the path of both states in a larger state.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         if isinstance(given, Mapping):
@@ -148,7 +148,7 @@ def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
 
 
 def _check_made(given: object, own: Mapping[str, str]) -> None:
-    """Raise BidexError, naming the differences, where a state's world was made otherwise."""
+    """Raise BidexError, naming the differences, if a state comes from a world with other settings."""
     there = given if isinstance(given, Mapping) else {}
     told: dict[str, str] = {}
     count = 0
@@ -186,8 +186,8 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
     """Call a class's methods once, for a few rows of its first task and sensors that all read 0.
 
-    ``sensors`` has the engine's precision and device; ``observed``: whether ``observe`` is called too. Raises
-    BidexError with class, method, the expected and the returned where a method returns something else.
+    ``sensors`` has the engine's precision and device; ``observed`` says whether ``observe`` is called too. Raises
+    BidexError if a method returns something else than expected; the message names class, method and both values.
     """
     task = scene.task
     name = type(task).__name__
@@ -219,10 +219,10 @@ def own_numbers(
     unstable: Callable[[], Tensor] | None = None,
     rows: Tensor | slice = slice(None),
 ) -> None:
-    """Raise BidexError where a method of the user's own class gave numbers that are not finite in sound environments.
+    """Raise BidexError if a user's own class returned numbers that are not finite in environments with sound physics.
 
-    ``values`` by name, each (n, ...), are of these ``rows`` of what ``unstable`` gives: broken physics, bool (num,).
-    Shipped classes are not looked at: their formulas are tested.
+    ``values`` by name, each (n, ...), belong to these ``rows`` of ``unstable``, which returns the environments with
+    broken physics, bool (num,). Shipped classes are not checked, because their formulas are tested.
     """
     if type(task).__module__.startswith("bidex_meta."):
         return

@@ -24,7 +24,7 @@ POINT_ENTRIES = {"points": 3, "kind_points": 4}
 class PointsRule:
     """Observations with a cloud of ``count`` points (the original: 768) in place of the objects' state.
 
-    ``kinds``: whether each has a fourth entry: 1 object, 0 hand, -1 fixture.
+    ``kinds`` says whether each point has a fourth entry: 1 for an object, 0 for a hand, -1 for a fixture.
     """
 
     count: int = 768
@@ -36,12 +36,12 @@ class PointsRule:
 
     @property
     def entries(self) -> int:
-        """Entries of an observation that a cloud takes, point after point."""
+        """Number of observation entries of a cloud; the entries of each point are adjacent."""
         return self.count * POINT_ENTRIES[self.group]
 
     @property
     def group(self) -> str:
-        """Name of their observation group: ``points``, or ``kind_points`` where a point has four entries."""
+        """Name of the cloud's observation group: ``points``, or ``kind_points`` if a point has four entries."""
         return "kind_points" if self.kinds else "points"
 
 
@@ -59,7 +59,7 @@ class DepthSensor:
         self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
 
     def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Zero the hidden entries of observations (n, d) and fill in clouds, in place; bodies' poses as of Cloud."""
+        """Zero hidden entries of observations (n, d) and fill in clouds, in place; bodies' poses are as for Cloud."""
         values.index_fill_(1, self._hidden, 0.0)
         values[:, self._columns] = self._cloud(position, rotation).flatten(1)
 
@@ -70,7 +70,7 @@ _OF_HANDS = tuple(f"{side}/" for side in SIDES)
 def privileged_columns(scene: Scene) -> list[int]:
     """Return the ascending indices of the observation's entries that show an object's pose or motion.
 
-    Every sensor that is not a hand's is replaced by NaN; entries that become NaN depend on one.
+    Every sensor that does not belong to a hand is replaced by NaN; entries that become NaN depend on such a sensor.
     """
     task = scene.task
     layout = scene.task.layout
@@ -85,7 +85,7 @@ def privileged_columns(scene: Scene) -> list[int]:
 
 
 def _without_objects(scene: Scene) -> TaskState:
-    """Return the nominal start of the middle of the variation space, objects' sensors NaN, of one environment."""
+    """Return a state (one environment) at the nominal start of the middle task, with NaN for objects' sensors."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.start_qpos[: scene.model.nq]
     mujoco.mj_forward(scene.model, data)

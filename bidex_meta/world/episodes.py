@@ -158,7 +158,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
 def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
     """Return the environments that ``reset`` starts, bool (num_envs,): those of ``reset_mask``, else all.
 
-    Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and where
+    Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and if
     torch's default precision is not single.
     """
     check_precision()
@@ -185,7 +185,7 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
 
 
 def checked_seed(seed: object, mask: Tensor) -> int:
-    """Return the seed of a reset; BidexError unless it is a whole number from 0 on and all environments start."""
+    """Return the seed of a reset; raise BidexError unless it is a whole number from 0 on and the reset is full."""
     number = whole_number("seed", seed, 0)
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")

@@ -26,7 +26,7 @@ class Record(Protocol):
     """Records work as ``cuda_graph`` does."""
 
     def __call__(self, work: Callable[[], Result], /) -> tuple[Callable[[], None], Result]:
-        """Return a function that repeats the work in the same memory, and the tensors that it then leaves there."""
+        """Return a function that repeats the work in the same memory, and the tensors that will hold its results."""
         ...
 
 
@@ -41,8 +41,8 @@ def cuda_graph(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
 class GraphCache:
     """Recorded stretches of work by key, over one state.
 
-    A stretch is recorded with the tensors that its closures hold at that time: ``forget`` after changing any but the
-    state and the inputs.
+    A stretch is recorded with the tensors that its closures hold at that time. Call ``forget`` after replacing any of
+    these tensors other than the state and the inputs.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class GraphCache:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all recordings; stretches run plainly again for a while."""
+        """Drop all recordings; the next runs of each stretch are neither recorded nor replayed."""
         self._state: dict[str, Tensor] = {}
         self._runs: dict[Hashable, int] = {}
         self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], object]] = {}
@@ -106,7 +106,7 @@ def fresh(result: Result) -> Result:
 
 
 class Stepper(Protocol):
-    """Runs the stretches of a world's step that read no number on the host."""
+    """Runs stretches: parts of a world's step that read no number on the host."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """Run a method of the world on tensors whose shapes never change, and return what it returns.
@@ -116,16 +116,16 @@ class Stepper(Protocol):
         ...
 
     def keep(self, result: Result) -> Result:
-        """Return what a run returned such that no later run overwrites it."""
+        """Return the result of a run in memory that no later run overwrites."""
         ...
 
     def forget(self) -> None:
-        """Drop what was remembered of earlier runs: something that the methods read was replaced."""
+        """Drop the records of earlier runs, after something that the methods read was replaced."""
         ...
 
 
 class EagerStepper:
-    """Runs each stretch as it is."""
+    """Runs each stretch directly, without recording it."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """See ``Stepper``."""
@@ -168,7 +168,7 @@ class SideBySide:
     """Runs jobs one after the other on a CPU, at the same time on a GPU."""
 
     def __init__(self, jobs: int, device: torch.device) -> None:
-        """``jobs``: the most at a time."""
+        """``jobs`` is the maximum number of jobs that run at the same time."""
         several = device.type == "cuda" and jobs > 1
         if several:
             self._streams = [torch.cuda.Stream(device) for _ in range(jobs)]
@@ -176,10 +176,11 @@ class SideBySide:
             self._streams = []
 
     def run(self, jobs: Sequence[Callable[[], None]]) -> None:
-        """Do the jobs.
+        """Run the jobs.
 
-        On CUDA what comes after in the caller's stream waits for them all, and they for what came before, in a
-        recording too, where they become branches of the graph. What they read must live until this ends.
+        On CUDA the jobs wait for earlier work in the caller's stream, and later work in that stream waits for all jobs.
+        In a recording the jobs become branches of the graph. Tensors that the jobs read must exist until this call
+        ends.
         """
         if not self._streams:
             for job in jobs:

@@ -1,4 +1,4 @@
-"""Domain randomisation of a world: draws, and their way into models, actions and observations.
+"""Domain randomisation of a world: random draws, and their effect on models, actions and observations.
 
 A draw depends only on seed, slot, environment and episode; noise and pushes also depend on the elapsed steps.
 """
@@ -24,9 +24,9 @@ class Randomiser:
     """Draws for the environments of a world."""
 
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
-        """``deviation``: of the observations' noise, (n, width), or of none of their columns.
+        """``deviation`` holds the standard deviations of the observations' noise, (n, width), or no columns.
 
-        Raises BidexError where an object's size shall vary that is a mesh.
+        Raises BidexError if the size of an object that is a mesh shall vary.
         """
         self._rule = rule
         self._parts = parts
@@ -45,7 +45,7 @@ class Randomiser:
 
     @property
     def remembered(self) -> int:
-        """Return the number of actions that are remembered, the last one among them; 0 without delay."""
+        """Return the number of actions that are remembered, including the last one; 0 without delay."""
         most = self._rule.action_delay[1]
         return most + 1 if most else 0
 
@@ -83,7 +83,7 @@ class Randomiser:
     def lift(self, starts: Sequence[Tensor], mask: Tensor) -> None:
         """Lift larger objects in the starts of a mask's environments (of each part, see ``Starts.take``), in place.
 
-        Otherwise they would begin within the surface that they lie on.
+        Otherwise these objects would start inside the surface that they lie on.
         """
         if "object_size" in self.drawn:
             for models, start in zip(self._models, starts, strict=True):

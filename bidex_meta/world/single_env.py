@@ -215,7 +215,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
         Returns observation (d,), float32, reward, terminated (what was to be held is lost; with `terminate_on_success`
         also success), truncated (time is up, or physics broke), and info. In version 2 nothing is a success before the
-        episode ends, so that `terminate_on_success` shortens no episode. Raises BidexError where no episode runs.
+        episode ends, so that `terminate_on_success` shortens no episode. Raises BidexError if no episode runs.
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")

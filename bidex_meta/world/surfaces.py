@@ -51,7 +51,7 @@ def area(model: mujoco.MjModel, geom: int) -> float:
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
     """Return points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
 
-    ``offset``, (2,) in [0, 1), is where the even numbers begin.
+    ``offset``, (2,) in [0, 1), is the start of the sequence of ``even_numbers``.
     """
     size = np.asarray(model.geom_size[geom], dtype=np.float64)
     kind = int(model.geom_type[geom])
@@ -200,10 +200,11 @@ _BURIED = 5e-4
 
 @dataclass(frozen=True)
 class Surfaces:
-    """P points fixed to bodies, those of a body side by side.
+    """P points that are fixed to bodies; the points of a body are adjacent.
 
-    Bodies that carry points, ascending, and where each body's points end, (k,); points, metres, and outward unit
-    normals in the body's frame, (P, 3); their kinds (FIXTURE, HAND or OBJECT) and geoms, (P,).
+    ``bodies`` (k,) are the bodies with points, ascending, and ``ends`` (k,) the index after each body's last point.
+    ``points`` (metres) and outward unit ``normals`` are (P, 3), in the body's frame. ``kinds`` (FIXTURE, HAND or
+    OBJECT) and ``geoms`` are (P,).
     """
 
     bodies: np.ndarray

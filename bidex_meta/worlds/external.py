@@ -38,7 +38,7 @@ class Foreign(Worlds):
             raise BidexError(f"Suites of our own draw their tasks, got {name}. Leave --tasks-per-class out.")
 
     def _check(self, split: str, rows: int) -> None:
-        """Refuse another split than train, engines but C MuJoCo on the CPU, and more than fits into memory."""
+        """Refuse any split but train, any engine but C MuJoCo on the CPU, and worlds that do not fit into memory."""
         if split != "train":
             raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
         if not self.device.startswith("cpu") or self.engine == "warp":

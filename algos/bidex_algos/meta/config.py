@@ -22,23 +22,24 @@ class MetaConfig(LearnerConfig):
     init_std: Positive = 0.8  # Standard deviation of the actions at the start; part of what is adapted.
     std_range: tuple[Positive, Positive] = (0.1, 1.5)  # Bounds of the standard deviation of the actions.
     tasks_per_class: Count = 3
-    """Tasks of each class in a meta-batch, drawn anew for each; fewer where a class has fewer. The class's rows are
-    split over them: that many rollouts has each."""
+    """Tasks of each class in a meta-batch, drawn again for each meta-batch; fewer if a class has fewer. The class's
+    environments are divided among these tasks, and each environment plays one rollout."""
     max_adapt_steps: Count | None = None  # Longest episode that is played to adapt; None: whole episodes.
     slice_steps: Count | None = None
-    """Adapt on so many steps of running episodes, as Bi-DexHands did, instead of whole ones; None: whole ones."""
+    """Adapt on this many steps of running episodes, as Bi-DexHands did; None: on whole episodes."""
     inner_steps: Count = 1  # Adaptation steps before the outer objective is measured.
     inner_learning_rate: Positive = 0.1  # Size of an adaptation step.
     adapted: Adapted = "all"
-    """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020)."""
+    """Parameters that an adaptation step moves: all, or only the output layer of the mean (ANIL, Raghu et al. 2020)."""
     step_sizes: StepSizeKind = "fixed"
-    """Whether the outer step learns sizes of the inner one, from inner_learning_rate on: of each tensor (layer,
-    MAML++), of each weight (Meta-SGD), or of none (fixed)."""
+    """Inner step sizes that the outer step learns, starting from inner_learning_rate: one per tensor (layer, MAML++),
+    one per weight (Meta-SGD), or none (fixed)."""
     step_size_rate: Positive = 0.01
-    """Adam's step size for these, as shares of inner_learning_rate. A trust region moves them with all else."""
+    """Adam's step size for these inner step sizes, relative to inner_learning_rate. A trust region moves them together
+    with all other parameters."""
     advantage_scale: Literal["std", "variance"] = "std"
-    """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
-    inner step depends on the scale of the rewards."""
+    """Divisor of the advantages in each task. With the variance, as in garage and Meta-World's baselines, the inner
+    step depends on the scale of the rewards."""
     first_order: bool = False  # Leave out the second derivatives of the inner step.
     gamma: Fraction = 0.95  # Discount per step.
     lam: Fraction = 1.0  # Trace decay of the advantage estimate.

@@ -146,9 +146,10 @@ class PEARL(MTSAC):
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
-        """Sum the evidence of the first ``episodes`` (M,) of a trial (0: the previous one) of environments (M,).
+        """Estimate the sum of the evidence in the first ``episodes`` (M,) episodes of a trial, (M, 2 * latent).
 
-        The sum is estimated from ``context`` random transitions of these episodes: (M, 2 * latent).
+        ``rows`` (M,) are environments. ``trial`` (M,) is 0 for an environment's previous trial and 1 for its running
+        trial. The estimate uses ``context`` random transitions of these episodes.
         """
         begin = self.bounds[trial, rows, 0]
         end = self.bounds[trial, rows, episodes]
@@ -203,9 +204,9 @@ class PEARL(MTSAC):
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Return the environments' task numbers over all classes, (N,); a BidexError if no environment plays some task.
+    """Return the environments' task numbers over all classes, (N,); raise BidexError if a task has no environment.
 
-    New tasks in each episode are refused too.
+    Worlds that draw new tasks in each episode are refused too.
     """
     if getattr(world, "endless", False):
         raise BidexError(

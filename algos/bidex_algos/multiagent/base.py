@@ -34,7 +34,7 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 
 
 def keep_partition(config: Networks) -> None:
-    """Replace the path of a partition file by its content, for checkpoints; a BidexError if it is no partition."""
+    """Replace the path of a partition file by its content, for checkpoints; raise BidexError if it is no partition."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
     object.__setattr__(config, "agents", partition_line(vars(config)["agents"]))

@@ -47,7 +47,7 @@ MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 
 @dataclass(frozen=True)
 class Inputs:
-    """Describes the networks' reading of an observation, before weights exist; a ``BidexError`` names a missing group.
+    """Describes how networks read an observation, before weights exist; raises ``BidexError`` for a missing group.
 
     Groups enter unchanged, through an encoder, or, if ``hidden``, not at all. Groups in ``unscaled`` are not
     normalised.
@@ -141,7 +141,7 @@ class TaskEmbedding(nn.Module):
         self.vectors = nn.Parameter(torch.randn(tasks, size, generator=generator))
 
     def forward(self, one_hot: Tensor) -> Tensor:
-        """Return the vectors of the tasks."""
+        """Return the vectors (..., size) of one-hots (..., tasks)."""
         if self.unit:
             vectors = nn.functional.normalize(self.vectors, dim=1)
         else:

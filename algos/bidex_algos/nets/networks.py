@@ -22,7 +22,7 @@ MakeNetwork = Callable[..., Any]
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
-    """Return whether hidden layers run in bfloat16; auto: on CUDA, or a CPU with AMX tiles or AVX-512's BF16."""
+    """Return whether hidden layers run in bfloat16; auto: yes on CUDA, or on a CPU with AMX tiles or AVX-512's BF16."""
     if setting != "auto":
         return setting == "on"
     if device.type == "cuda":
@@ -38,10 +38,10 @@ def autocast(device: torch.device, enabled: bool) -> torch.autocast:
 
 
 class Headed(nn.Module):
-    """A network whose output layer is ``head``, on :meth:`features`.
+    """A network that applies the output layer ``head`` to :meth:`features`.
 
-    The features follow an enclosing autocast. The output layer is always float32, because bfloat16 would round a mean
-    of 1 by 0.004, enough to move the likelihood ratio of 52 actions.
+    An enclosing autocast decides the precision of the features. The output layer is always float32, because bfloat16
+    would round a mean of 1 by 0.004, enough to move the likelihood ratio of 52 actions.
     """
 
     head: nn.Linear

@@ -76,7 +76,7 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
-    """Add a PointNet for unscaled clouds; a BidexError if the config has no ``point_widths``."""
+    """Add a PointNet for unscaled clouds; raise BidexError if the config has no ``point_widths``."""
     options = vars(config)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)

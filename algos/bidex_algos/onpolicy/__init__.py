@@ -1,1 +1,1 @@
-"""Learners that learn from the latest rollout of the present policy."""
+"""Learners that only learn from the latest rollout of the current policy."""

@@ -59,7 +59,7 @@ def gaussian_step(
     parameters: list[nn.Parameter], distribution: Callable[[], tuple[Tensor, Tensor]], keep_bounds: Callable[[], None],
     b: Any, gain: Tensor, old_log_std: Tensor, own_kl: Tensor, config: Any, max_kl: float
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Take a trust-region step of a Gaussian on samples ``b``, up the ratio times ``gain`` (B,).
+    """Take a trust-region step of a Gaussian policy on samples ``b`` that increases ratio times ``gain`` (B,).
 
     Returns scalars to be logged.
     """
@@ -84,9 +84,9 @@ def gaussian_step(
 def kl_from_itself(
     distribution: Callable[[Tensor], tuple[Tensor, Tensor]], weights: Tensor, rows: int, stride: int
 ) -> Tensor:
-    """Return this process's part of the policy's mean KL from itself, over every ``stride``-th sample.
+    """Return this process's part of the mean KL divergence of the policy from itself, over every ``stride``-th sample.
 
-    The value is 0; its curvature is the Fisher matrix.
+    The divergence is 0, but its second derivative is the Fisher matrix.
     """
     sample = torch.arange(len(weights), device=weights.device)
     # The samples are steps by rows. Each later step starts at a later row; otherwise some rows would never be taken.

@@ -33,7 +33,7 @@ class HeldObject:
 
     Attributes:
         low: Lower corner of the box around its colliding geoms; ``high`` is the upper one.
-        geoms: Number of its geoms that collide.
+        geoms: Number of the object's geoms that collide.
         centres: Balls whose convex hull holds these geoms: their centres, (k, 3), with ``radii``, (k,).
     """
 
@@ -78,8 +78,9 @@ class HeldObject:
     def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
         """Lay the object on a broad side: its shortest extent along a palm's normal, turned about the normal at random.
 
-        Its positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2), give the turn and
-        the lower of the two sides. Without a start pose of the hand the palm is taken as level.
+        The object's positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2), give the
+        turn and which of the two sides faces down. If the hand's start pose is not given, the palm is assumed to be
+        level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
         half = 0.5 * math.pi * draws[:, 0]
@@ -105,7 +106,8 @@ class HeldObject:
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
         """Lift the object off its palm, open the fingers that would penetrate it and lay the thumb flat.
 
-        Its positions (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in place.
+        The object's positions (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in
+        place.
         """
         quaternion = xyzw(constant(pose.quaternion, place))
         inverse = conjugate(quaternion)

@@ -53,7 +53,7 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
 
 
 def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Return the model of a specification; BidexError if MuJoCo refuses it or its numbers are not finite."""
+    """Return the model of a specification; raise BidexError if MuJoCo refuses it or its numbers are not finite."""
     try:
         model = spec.copy().compile()
     except ValueError as error:
@@ -64,7 +64,7 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def set_contacts(spec: mujoco.MjSpec) -> None:
-    """Give geoms the softness and the margin that the world's time steps need; friction stays the file's."""
+    """Give geoms the softness and the margin that the world's time steps need; the file's friction is kept."""
     for geom in spec.geoms:
         geom.solref[:2] = _SOLREF
         geom.solimp[:3] = _SOLIMP
@@ -78,7 +78,7 @@ def colliding(model: mujoco.MjModel) -> int:
 
 
 def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
-    """Return the number of geoms that collide; BidexError for none, more than ``most``, or too much friction."""
+    """Return the number of colliding geoms; raise BidexError for 0, more than ``most``, or too much friction."""
     geoms = colliding(model)
     if not 0 < geoms <= most:
         raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Mend it.")

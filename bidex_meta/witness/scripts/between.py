@@ -1,7 +1,7 @@
-"""Steps that policies share which carry an object between both hands, one on either side of it along y.
+"""Steps of the policies that carry an object between both hands, one on either side of it along y.
 
-Everything is a function of the present state, and changes little when the state does: a policy without memory can learn
-it, and one that comes late or drops the object continues from there.
+Every step is a function of the present state, and changes little when the state changes little. A policy without memory
+can therefore learn the steps, and a policy that is late or drops the object can continue.
 """
 
 import math
@@ -88,7 +88,7 @@ class Between:
         return self._points(x, y, z, half)
 
     def leave(self) -> tuple[Point, Point]:
-        """Return points at which the hands let go of the object, and then go up."""
+        """Return the hands' points for letting go of the object and then going up."""
         x, y, _ = self.middle
         return self._points(x, y, self._rise(self.take.high), self.apart)
 
@@ -103,13 +103,13 @@ class Between:
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
 
     def _close(self) -> float:
-        """Return half the distance to which the hands are led to hold the object firmly."""
+        """Return half the target distance of the hands that holds the object firmly."""
         return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
-        """Return middle and half distance of the hands on their way to the object.
+        """Return the hands' middle point and half their distance for taking the object.
 
-        They go from above to both sides of the object, then closer until it is held.
+        The hands go from above to both sides of the object, then closer together until they hold it.
         """
         take = self.take
         x, y, height = self.middle
@@ -121,7 +121,7 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Return middle and half distance of the hands: up first, then over the place, then down."""
+        """Return the hands' middle point and half their distance to carry the object up, over the goal, and down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)

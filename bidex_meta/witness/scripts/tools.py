@@ -1,4 +1,4 @@
-"""Scripted policies for switches, pen and scissors, in closed loop on what the task asks for."""
+"""Scripted closed-loop policies for switches, pen and scissors; they read the task's goal."""
 
 import math
 
@@ -48,7 +48,7 @@ def _button(hands: HandController, name: str) -> Tensor:
 
 
 def _tip(hands: HandController, side: str, target: Tensor, height: float, finger: str = "mf") -> Point:
-    """Return the hand's point that puts a finger's last joint ``height`` metres above a target."""
+    """Return where the hand's point must be for a finger's last joint to be ``height`` metres above a target."""
     goal = target + torch.tensor([0.0, 0.0, height], dtype=target.dtype)
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
@@ -73,7 +73,7 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Return the hand's point on its way down to an end of the pen, around it, and then ``way`` along it."""
+    """Return where the hand's point goes next: down to an end of the pen, and once ``closed``, ``way`` along it."""
     end = hands.where(_ENDS[side]).clone()
     at = hands.at(side)
     end[0] -= 0.008
