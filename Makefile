@@ -16,12 +16,13 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c co
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint style types tests format docs dist clean
+.PHONY: help run quick results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint style types tests format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make run       train PPO on a door of version 2 for MINUTES=$(MINUTES) and compare it with a random policy"
 	@echo "make test      format, lint, types, tests (what CI runs)"
+	@echo "make quick     unit tests in less than a minute"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
@@ -43,7 +44,13 @@ test: style
 	@$(MAKE) --no-print-directory -j 2 types tests
 
 # Hundreds of tests start a process: it reads compiled modules, even where the environment forbids writing them.
-tests test-all test-parity: export PYTHONDONTWRITEBYTECODE :=
+quick tests test-all test-parity: export PYTHONDONTWRITEBYTECODE :=
+
+# Tests without physics that end within a minute on two free cores.
+QUICK := tests/utils tests/runs tests/test_suite.py tests/test_imports.py tests/evaluation/test_scores.py tests/evaluation/test_statistics.py
+
+quick: .venv/.installed-dev
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup $(QUICK)
 
 tests: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup

@@ -184,6 +184,21 @@ def test_the_documentation_is_short() -> None:
     assert sum(words.values()) <= 17_000, sorted(words.items(), key=lambda item: -item[1])[:8]
 
 
+def test_workflows_call_make_targets_and_use_supported_pythons() -> None:
+    text = "".join(path.read_text() for path in (ROOT / ".github" / "workflows").glob("*.yml"))
+    targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert targets
+    called = {*re.findall(r"make ([\w-]+)", text), *re.findall(r"target: \[(.*)\]", text)[0].split(", ")}
+    assert called <= set(targets[1].split()) and {"test", "docs", "dist", "bench", "test-all"} <= called
+    supported = set(re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text()))
+    assert set(re.findall(r'"(3\.\d+)"', text)) <= supported
+
+
+def test_commits_are_checked_by_the_pinned_ruff() -> None:
+    revision = re.search(r"ruff-pre-commit\n +rev: v(.*)", (ROOT / ".pre-commit-config.yaml").read_text())
+    assert revision and f"\nruff=={revision[1]}\n" in (ROOT / "constraints.txt").read_text()
+
+
 @pytest.fixture
 def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     spec = importlib.util.spec_from_file_location("site_build", ROOT / "docs" / "site" / "build.py")
