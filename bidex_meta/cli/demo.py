@@ -17,7 +17,7 @@ FILM = ["--tiled", "--steps", "160", "--every", "8", "--width", "160"]
 class DemoFlags:
     """Show the policy that comes with bidex-meta in the twenty classes of MT20.
 
-    Example: bidex-meta demo
+    Example: bidex-meta demo --out demo.webp
 
     With a screen this is bidex-meta play. Without one, or with --out, it writes a film.
     """

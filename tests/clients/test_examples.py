@@ -1,14 +1,18 @@
-"""The examples, as written, for a few iterations."""
+"""The examples, as written, for a few iterations; the notebooks with smaller settings."""
 
 import importlib.util
+import os
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import nbformat
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from nbclient import NotebookClient
 
 from bidex_meta import Benchmark
 from bidex_meta.agents import Timestep
@@ -25,6 +29,16 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "torchrl_ppo": ("torchrl", {"steps": 512, "num_envs": 16}),
     "optuna_search": ("optuna", {"suite": "MT1", "steps": 512, "trials": 1}),
 }  # fmt: skip
+NOTEBOOKS = {
+    "quickstart": {
+        "STEPS = 400_000": "STEPS = 2100",
+        "num_envs=1024": 'num_envs=8, learner={"hidden": [8], "epochs": 1, "num_minibatches": 1}',
+        "--steps 240": "--steps 4",
+    },
+    "meta_rl": {"TASKS = 20": "TASKS = 2", "num_envs=50": "num_envs=1"},
+}
+"""Per notebook: its settings and the smaller ones of the test."""
+MOST_STORED = 400_000  # bytes of a notebook with its outputs
 
 
 def example(name: str) -> ModuleType:
@@ -37,6 +51,7 @@ def example(name: str) -> ModuleType:
 
 def test_every_example_is_run_here() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == {*RUNS, "ppo_one_file"}
+    assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == NOTEBOOKS.keys()
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -96,3 +111,27 @@ def test_a_recurrent_policy_sees_in_the_meta_test_what_it_saw_in_training() -> N
         obs = new
         steps += 1
     assert agent.memory[0].flatten().tolist() == [steps, steps, 0.0], "whoever waits remembers nothing"
+
+
+def shown(cell: nbformat.NotebookNode) -> list[list[str]]:
+    """The kinds of a cell's pictures and tables; how much it prints depends on the machine."""
+    return [sorted(output.data) for output in cell.outputs if output.output_type != "stream"]
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebook(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = EXAMPLES / f"{name}.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert path.stat().st_size < MOST_STORED
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "stored outputs are of one run"
+    for setting, smaller in NOTEBOOKS[name].items():
+        (cell,) = (cell for cell in code if setting in cell.source)
+        cell.source = cell.source.replace(setting, smaller)
+    stored = [shown(cell) for cell in code]
+    packages = (str(EXAMPLES.parent), str(EXAMPLES.parent / "algos"), os.environ.get("PYTHONPATH", ""))
+    monkeypatch.setenv("PATH", os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"])))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # tests share the cores
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, packages)))
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert [shown(cell) for cell in code] == stored
