@@ -49,7 +49,7 @@ class Task(NamedTuple):
     data: bytes
     """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
     instruction: str = ""
-    """What the task asks for, in a sentence that does not tell what the suite hides. A task that was made without a
+    """A sentence that says what to do, without what the suite hides. A task that was made without a
     benchmark has none."""
 
     @classmethod
@@ -236,7 +236,7 @@ class Benchmark:
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
         suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
         tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task. With
-        `episodes_per_task` above 1 environments of a training world draw a task for so many episodes.
+        `episodes_per_task` above 1 environments of a training world keep each drawn task for that number of episodes.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by

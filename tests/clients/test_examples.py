@@ -110,7 +110,7 @@ def test_a_recurrent_policy_sees_in_the_meta_test_what_it_saw_in_training() -> N
         agent.observe(Timestep(obs, action, reward, torch.zeros(3, dtype=torch.bool), ended, {}, new, waits))
         obs = new
         steps += 1
-    assert agent.memory[0].flatten().tolist() == [steps, steps, 0.0], "whoever waits remembers nothing"
+    assert agent.memory[0].flatten().tolist() == [steps, steps, 0.0], "a waiting environment keeps an empty memory"
 
 
 def shown(cell: nbformat.NotebookNode) -> list[list[str]]:
