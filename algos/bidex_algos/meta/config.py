@@ -85,6 +85,6 @@ UNSEEN: Options = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, 
 # For version 2 of the suites (docs/results/ladder.md), from scratch or from a policy of MT-PPO's preset v2. The
 # discount sees a whole episode of 250 steps; small noise lets the policy hold still, as success asks. The same
 # step size changes a narrow distribution more. From a blind policy of a door (seed 1000), one inner step of 0.05 lost
-# return in ProMP's meta-batches (six or seven episodes per task). With 15 episodes per task, two steps of 0.02 raised the
-# return from 147 to 165, and two steps of 0.01 raised it to 157.
+# return in ProMP's meta-batches (six or seven episodes per task). With 15 episodes per task, two steps of 0.02 raised
+# the return from 147 to 165, and two steps of 0.01 raised it to 157.
 V2: Options = TUNED | {"gamma": 0.99, "init_std": 0.3, "step_sizes": "layer", "inner_learning_rate": 0.02}
