@@ -66,7 +66,8 @@ _SHARES = ("blind", "named", "identified", "uniform", "zero", "held", "witness",
 
 
 def _cells(name: str, row: Json) -> list[str]:
-    shares = ("" if row[key] is None else f"{100 * row[key]:.1f} %" for key in _SHARES)
+    shares = ["" if row[key] is None else f"{100 * row[key]:.1f} %" for key in _SHARES]
+    shares[_SHARES.index("named")] += f" ({100 * row['chance']:.0f} %)"
     if row["alignment"] is None:
         rank = ""
     else:

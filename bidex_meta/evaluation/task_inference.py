@@ -1,7 +1,8 @@
 """Validity of a task class: the best success without knowing its hidden parts, and whether rewards identify them.
 
 Blind ceiling and identifiability need no policy. They assume that the hidden parts are drawn independently and
-uniformly, as in ``TaskClass.variation_space``. The alignment of return and success is computed from policies' results.
+uniformly, as in ``TaskClass.variation_space``; ``listed_ceiling`` is for suites that list their tasks. The alignment of
+return and success is computed from policies' results.
 """
 
 import math
@@ -79,6 +80,26 @@ def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
         best = max(candidates, key=lambda centre: _solved(part, choosing[:, columns], centre))
         share *= _solved(part, scoring[:, columns], best)
     return share
+
+
+def listed_ceiling(task: TaskClass, tasks: np.ndarray) -> float:
+    """Compute the largest share of the given tasks (n, size) that one final state solves; 1 if nothing is hidden.
+
+    The candidates are each task's own goal and the points midway between two goals, where the goals of listed tasks
+    overlap most. All hidden parts of a task must be solved together, so goals that vary together stay together.
+    """
+    space = task.variation_space
+    values = torch.from_numpy(tasks)
+    first, second = torch.triu_indices(len(values), len(values))
+    candidates = 0.5 * (values[first] + values[second])
+    best = 0.0
+    for candidate in candidates.unique(dim=0):
+        solved = torch.ones(len(values), dtype=torch.bool)
+        for part in task.hides():
+            columns = [space.names.index(name) for name in part.names]
+            solved &= distances(part, values[:, columns], candidate[columns]) < part.tolerance
+        best = max(best, float(solved.double().mean()))
+    return best
 
 
 def _solved(part: Hidden, values: Tensor, centre: Tensor) -> float:

@@ -12,7 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.memorisation import memorised
 from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import ClassResult
-from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability
+from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability, listed_ceiling
 from bidex_meta.experiments.policies import load_policy, say_other_rules
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
@@ -38,6 +38,13 @@ def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
     return rows
 
 
+def blind_share(slot: Slot, worlds: Worlds) -> float:
+    """Return the success that a policy can have at best without knowing which of the suite's tasks it plays."""
+    if worlds.suite is not None and any(entry.name == slot.name and entry.tasks for entry in worlds.suite.classes):
+        return listed_ceiling(slot.task_class, slot.tasks)
+    return blind_ceiling(slot.task_class, seed=worlds.seed)
+
+
 def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Json]:
     """Return the row of each class of a split."""
     world = worlds.world(split)
@@ -56,7 +63,7 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
         untrained = {name: found[name].success if name in found else None for name in (*_NOTHING, "witness")}
         rows[slot.name] = {
             "hidden": hidden,
-            "blind": blind_ceiling(slot.task_class, seed=worlds.seed),
+            "blind": blind_share(slot, worlds),
             **identified,
             **untrained,
             **asdict(starts[slot.name]),

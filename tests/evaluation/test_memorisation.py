@@ -59,3 +59,13 @@ def test_what_is_the_same_in_every_episode_counts_for_nothing() -> None:
         pools=(np.zeros((TASKS, 1)),), reset=lambda seed: (torch.ones(TASKS, 3), {}),
     )  # fmt: skip
     assert memorised(world)["Reach"].named == 1 / TASKS
+
+
+def test_a_class_with_few_tasks_gets_as_many_guesses_as_one_with_many() -> None:
+    resets = []
+    world: Any = SimpleNamespace(
+        task_names=("Reach",), slot_env_ids=(slice(0, 4),), task_index=torch.arange(4), pools=(np.zeros((4, 1)),),
+        reset=lambda seed: (torch.ones(4, 3), resets.append(seed)),
+    )  # fmt: skip
+    memorised(world)
+    assert len(resets) == 125

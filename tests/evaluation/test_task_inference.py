@@ -9,10 +9,13 @@ import pytest
 from bidex_meta import Benchmark
 from bidex_meta.cli import main
 from bidex_meta.evaluation.results import ClassResult
-from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability
+from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability, listed_ceiling
+from bidex_meta.experiments import suite_validity
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.aligned import Error
+from bidex_meta.world import World
+from bidex_meta.worlds import WorldsConfig, open_worlds
 from tests.tasks.worlds import scene_of, world_of
 
 
@@ -34,6 +37,24 @@ def test_a_blind_ceiling_is_not_biased_by_its_choice() -> None:
     found = np.array([blind_ceiling(task, 1000, seed) for seed in range(10)])
     error = found.std() / np.sqrt(len(found))
     assert error < 0.002 and abs(found.mean() - 0.2) < 3.0 * error
+
+
+@pytest.mark.parametrize(
+    ("suite", "share"),
+    [("ML1-Switch-choice2", 0.5), ("ML1-DoorOpenOutward-choice4", 0.25), ("ML1-DoorOpenOutward-shared", 0.44)],
+)
+def test_the_ceiling_of_listed_tasks_knows_which_goals_they_have(suite: str, share: float) -> None:
+    """Of 50 angles over 0.7 rad, 22 lie within 0.15 rad of one angle: they are 0.014 rad apart."""
+    benchmark = Benchmark(suite)
+    (task,) = benchmark.task_classes("test").values()
+    tasks = np.stack([each.variation for each in benchmark.test_tasks])
+    assert listed_ceiling(task, tasks) == pytest.approx(share)
+    hidden = [name for part in task.hides() for name in part.names]
+    columns = [task.variation_space.names.index(name) for name in hidden]
+    assert listed_ceiling(task, tasks[:1]) == 1.0
+    apart = tasks.copy()
+    apart[:, columns] = np.linspace(0.0, 100.0, len(tasks))[:, None]
+    assert listed_ceiling(task, apart) == pytest.approx(1.0 / len(tasks)), "a state midway solves neither"
 
 
 @pytest.mark.parametrize("name", ["CatchUnderarm", "BottleCap"])
@@ -59,6 +80,15 @@ def test_the_command_measures_a_suite_and_replays_witnesses(tmp_path: Path) -> N
     assert row["solved"] == script[0] >= 0.5 > misled[0] and script[1] > misled[1]
     aligned = row["alignment"]
     assert aligned["rank"] > 0.8 and aligned["solved"] > aligned["unsolved"] >= row["policies"]["zero"][1]
+
+
+@pytest.mark.parametrize(("suite", "share"), [("ML1-BottleCap-v2", 0.2), ("ML1-Switch-choice4", 0.25)])
+def test_validity_asks_a_suite_how_it_makes_its_tasks(suite: str, share: float) -> None:
+    worlds = open_worlds(WorldsConfig(suite=suite, threads=1))
+    world = worlds.world("test")
+    assert isinstance(world, World)
+    assert suite_validity.blind_share(world.slots[0], worlds) == pytest.approx(share, abs=0.01)
+    world.close()
 
 
 def result(returns: list[float], successes: list[float]) -> ClassResult:

@@ -79,14 +79,14 @@ def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
 
 
 def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None:
-    rows = {"Door": {"hidden": ["left_angle"], "blind": 0.25, "named": None, "identified": 1.0}}
+    rows = {"Door": {"hidden": ["left_angle"], "blind": 0.25, "named": 0.264, "chance": 0.25, "identified": 1.0}}
     (tmp_path / "validity").mkdir()
     (tmp_path / "validity" / f"{SUITE}.json").write_text(json.dumps({"classes": rows}))
     runs = learners()
     runs[0].path = tmp_path / "data" / "ladder.json"
     study: Any = SimpleNamespace(split=None, runs=runs)
     row = cells(list(suites_table(study))[2])
-    assert row == [SUITE, "left_angle", "25.0 %", "", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
+    assert row == [SUITE, "left_angle", "25.0 %", "26.4 % (25 %)", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
     runs[0].path = tmp_path / "elsewhere" / "data" / "ladder.json"
     assert cells(list(suites_table(study))[2])[:5] == [SUITE, "", "", "", ""]
 

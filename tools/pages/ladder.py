@@ -17,6 +17,7 @@ from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluat
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study
 from tools.pages.tables import mean_and_range, table
+from tools.pages.validity import share_cell
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,9 +88,11 @@ def suites_table(*studies: Study) -> Iterator[str]:
         classes = _classes(file)
         hidden = sorted({part for row in classes for part in row["hidden"]})
         cells = [suite, ", ".join(hidden)]
-        for figure in _VALIDITY:
+        means = {}
+        for figure in (*_VALIDITY, "chance"):
             known = [row[figure] for row in classes if row.get(figure) is not None]
-            cells.append(f"{np.mean(known):.1%}".replace("%", " %") if known else "")
+            means[figure] = float(np.mean(known)) if known else None
+        cells += [share_cell(means, figure) for figure in _VALIDITY]
         for line in (BLIND, SHOWN):
             cells.append(mean_and_range(100.0 * lines[line].last[:, 0], ".3g", " %") if line in lines else "")
         rows.append(cells)

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.files import Json
 
 _SHARES = {
     "blind": "blind at best",
@@ -26,7 +27,7 @@ def validity_table(suite: str, data: Path) -> list[str]:
     lines = [f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |"]
     lines.append("|---|---|" + "---|" * (len(_SHARES) + 2))
     for name, row in classes.items():
-        cells = [_percent(row.get(key)) for key in _SHARES]
+        cells = [share_cell(row, key) for key in _SHARES]
         if (aligned := row["alignment"]) is None:
             cells += ["", ""]
         else:  # the rank correlation, and the mean return of successes versus the most that a failing policy gets
@@ -35,6 +36,14 @@ def validity_table(suite: str, data: Path) -> list[str]:
     means = (_mean([row.get(key) for row in classes.values()]) for key in _SHARES)
     ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
     return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
+
+
+def share_cell(row: Json, figure: str) -> str:
+    """Return a figure of a class as a percentage, empty if it was not measured; next to ``named`` stands its chance."""
+    cell = _percent(row.get(figure))
+    if figure == "named" and cell:
+        cell += f" ({100 * row['chance']:.0f} %)"
+    return cell
 
 
 def _mean(values: list[float | None]) -> float | None:
