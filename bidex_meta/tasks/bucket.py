@@ -204,6 +204,7 @@ class PourWater(ReachTask):
         "The kettle weighs 1.5 kg and has a high floor and an open trough as spout.",
     )
     episode_steps = 125
+    wide_steps = 400  # the script takes 130 steps to pour, 100 to put the kettle down and 120 to carry the bucket
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
     start_draws = 2 * DRAWS

@@ -129,8 +129,8 @@ def test_each_script_solves_its_class(name: str) -> None:
 
 
 SOLVED = (
-    "BottleCap", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "OpenPenCap", "OpenScissors", "PushBlock",
-    "StackBlock", "SwingCup", "Switch",
+    "BottleCap", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "OpenPenCap", "OpenScissors", "PourWater",
+    "PushBlock", "StackBlock", "SwingCup", "Switch",
 )  # fmt: skip
 
 

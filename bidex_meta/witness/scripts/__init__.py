@@ -10,7 +10,8 @@ from bidex_meta.witness.scripts.blocks import push_blocks
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.carrying import carry_egg
 from bidex_meta.witness.scripts.placing import place_in_bucket
-from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
+from bidex_meta.witness.scripts.pots import lift_underarm
+from bidex_meta.witness.scripts.pouring import pour_water
 from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
