@@ -32,7 +32,7 @@ from bidex_meta.suite import Suite, load_suite
 from bidex_meta.utils.validation import parse
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import COUNTS, FINDER, SMALL, points
-from tests.fakes import SLOT_NAMES, SLOT_TASKS, change, run_config
+from tests.fakes import SLOT_NAMES, SLOT_TASKS, change, run_config, trained_run
 from tests.pages import ROOT
 from tools.pages.leaderboard import leaderboard_table
 
@@ -449,3 +449,14 @@ def test_runs_that_nobody_else_could_play_are_refused(toy_suite, tmp_path: Path,
     assert "trained on mine.toml. The leaderboard is of shipped suites" in told
     change(run, suite="MT4", points=16)
     assert "saw clouds of points" in refused("submit", run, "--out", tmp_path, *TUNED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["rl2", "varibad", "pearl", "maml", "promp"])
+def test_every_learner_that_adapts_is_played_and_repeated(algo: str, tmp_path: Path, shown, few_resamples) -> None:
+    run = trained_run(algo)
+    shown("submit", run, "--out", tmp_path, "--episodes", 1, "--device", "cpu", *TUNED)
+    entry = read_entry(tmp_path / f"ML1-{algo}.json")
+    assert entry.track == "reward-only" and len(entry.new.shots) == 3 and entry.new.rollouts > 0
+    again = shown("submit", "--check", tmp_path / f"ML1-{algo}.json", run, "--device", "cpu")
+    assert again.splitlines()[-1].endswith(": equal")
