@@ -151,6 +151,23 @@ class Suite:
             return self.train_tasks
         return self.tasks_per_class or 0
 
+    def task_names(self, split: Split) -> dict[str, list[str]]:
+        """Return the names of the tasks of each slot of a split: those that the file lists, else numbers.
+
+        A slot is a class, or a listed task if each has an entry of its own in the one-hot.
+        """
+        drawn = list(map(str, range(self.drawn_tasks(split))))
+        pools = {}
+        for entry in self.split_classes(split):
+            listed = [task.name for task in entry.tasks if task.of(split)]
+            pools[entry.name] = listed or [*drawn]
+        if self.task_id == "class":
+            return pools
+        slots: dict[str, list[str]] = {}
+        for name, pool in pools.items():
+            slots |= {f"{name}/{task}": [task] for task in pool}
+        return slots
+
     def with_train_tasks(self, count: int | None) -> "Suite":
         """Return the suite with another ``train_tasks``; None leaves the suite unchanged.
 

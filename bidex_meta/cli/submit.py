@@ -1,61 +1,94 @@
 """``bidex-meta submit``: write an entry of the leaderboard, of runs or of a meta-test that was played elsewhere."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bidex_meta.cli.parsing import Device, RunPaths, parse
-from bidex_meta.cli.tables import meta_test_table, print_table
-from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.leaderboard import Track, read_entry, read_trial_entry, success_iqm
-from bidex_meta.experiments.submitting import submit, submit_trials
+from bidex_meta.cli.tables import Sheet, percent, print_table
+from bidex_meta.errors import EXIT_FAILED, BidexError, shortened
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL
+from bidex_meta.evaluation.leaderboard import AdaptationTrack, read_entry, success_iqm
+from bidex_meta.experiments.submitting import check, submit, submit_agent
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Few
 
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write the leaderboard's entry of runs, played on their suite's tasks and on as many others, or of a meta-test.
+    """Write the leaderboard's entry of runs, which play their own and as many new tasks, or of a meta-test.
 
-    Example: bidex-meta submit runs/MT20/mtppo/*
+    Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
     The runs differ in nothing but the seed. A meta-test of an agent that is no run is taken as it is, not verified.
     """
 
     runs: RunPaths  # Run folders, a seed each.
+    tuning: str | None = None  # Settings that you tried before you chose these, times seeds of each; 1x1: no others.
+    check: Path | None = None  # Play the runs of this entry again and compare; writes nothing.
     evaluation: Path | None = None  # Instead of runs: the file of a meta-test, from meta_test(agent, suite).save(FILE).
-    track: Track | None = None
+    track: AdaptationTrack | None = None
     """Training of the agent of --evaluation: reward-only (rewards of its own episodes) or privileged (also teachers,
     hidden parts of tasks or rewards of other goals)."""
     name: str | None = None  # Name on the leaderboard; None: the algorithm, or the agent's class.
     out: Path = Path("results/leaderboard")  # Folder of entries.
-    episodes: Few = 1  # Of each task.
+    episodes: Few | None = None  # Of each task; None: 1, of learners that adapt 10 after each shot.
     device: Device = "auto"
 
 
 def main(arguments: Sequence[str]) -> None:
     """Check, play, write, print."""
     flags = parse(SubmitFlags, arguments, "submit")
-    if flags.evaluation is not None:
-        _submit_trials(flags, flags.evaluation)
-        return
-    if not flags.runs:
-        raise BidexError("Expected run folders to submit, got none. Name them: bidex-meta submit runs/MT20/mtppo/*")
-    if flags.track is not None:
-        raise BidexError("--track is for --evaluation. Leave it out.")
-    folders = [RunFolder.open(path) for path in flags.runs]
-    path = submit(folders, flags.out, name=flags.name, episodes=flags.episodes, device=flags.device)
-    entry = read_entry(path)
-    own, others = (success_iqm(entry.success(part)).text(100.0, " %") for part in (entry.own, entry.others))
-    print(f"{path}: success, IQM {own}, on other tasks {others}")
-
-
-def _submit_trials(flags: SubmitFlags, evaluation: Path) -> None:
-    """Write the entry of a meta-test and print its table."""
-    if flags.runs:
+    if flags.runs and flags.evaluation is not None:
         raise BidexError("Expected run folders or --evaluation, got both. Submit them apart.")
-    path = submit_trials(evaluation, flags.out, name=flags.name, track=flags.track)
-    entry = read_trial_entry(path)
-    title = f"{entry.name} on {entry.evaluation.suite}, {entry.track}, not verified"
-    print_table(meta_test_table(title, entry.evaluation.splits["test"]))
-    print(path)
+    if not flags.runs and flags.evaluation is None:
+        raise BidexError("Expected run folders to submit, got none. Name them: bidex-meta submit runs/MT20/mtppo/*")
+    if flags.track is not None and flags.evaluation is None:
+        raise BidexError("--track is for --evaluation: a run's track comes from its learner. Leave it out.")
+    if flags.check is not None:
+        _check(flags, flags.check)
+        return
+    tuning = _tuning(flags.tuning)
+    if flags.evaluation is not None:
+        path = submit_agent(flags.evaluation, flags.out, name=flags.name, track=flags.track, tuning=tuning)
+    else:
+        path = submit(
+            _folders(flags), flags.out, name=flags.name, tuning=tuning, episodes=flags.episodes,
+            device=flags.device,
+        )  # fmt: skip
+    entry = read_entry(path)
+    success = success_iqm(entry.result).text(100.0, " %")
+    print(f"{path}: {entry.track}, success on new tasks, IQM {success}{'' if entry.verified else ', not verified'}")
+
+
+def _tuning(text: str | None) -> tuple[int, int]:
+    """Return the numbers of settings and seeds that the submitter states."""
+    numbers = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text or "")
+    if numbers is None:
+        raise BidexError(
+            "--tuning: expected the number of settings that you tried before you chose these, times the seeds of each, "
+            f"got {shortened(text) if text else 'none'}. Say for example --tuning 12x1, or 1x1 if you tried no others."
+        )
+    return int(numbers[1]), int(numbers[2])
+
+
+def _folders(flags: SubmitFlags) -> list[RunFolder]:
+    return [RunFolder.open(path) for path in flags.runs]
+
+
+def _check(flags: SubmitFlags, path: Path) -> None:
+    """Repeat an entry, print what is not equal and the verdict; exit code 1 if something differs."""
+    if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
+        raise BidexError("--check takes an entry, its runs and --device, and all else from the entry. Leave it out.")
+    found = check(path, _folders(flags), flags.device)
+    table = Sheet(["task", "outcome", "success", "again"], "Results that are not equal")
+    for each in found.classes:
+        if each.outcome != EQUAL:
+            table.add(each.name, each.outcome, percent(each.recorded.success), percent(each.again.success))
+    if table.rows:
+        print_table(table)
+    verdict = {EQUAL: "equal", DIFFERS: "different"}.get(found.outcome, "within the interval")
+    print(f"{path}: {verdict}{''.join(f', {name} differs' for name in found.different)}")
+    if found.outcome == DIFFERS:
+        raise SystemExit(EXIT_FAILED)

@@ -13,7 +13,7 @@ from bidex_meta.runs.evaluations import ClassSummary, Interval
 EQUAL = "equal"
 WITHIN = "within"
 DIFFERS = "differs"
-_BITS = ("success", "mean_return", "length", "episodes", "tasks", "unstable")
+_BITS = ("success", "mean_return", "length", "episodes", "tasks", "unstable", "solved")
 _MEASURES = 2  # success and return
 
 

@@ -1,71 +1,115 @@
 """The leaderboard: one file per entry in one schema, and the statistics that rank entries.
 
 Interquartile mean, performance profile and probability of improvement are those of Agarwal et al. 2021 (arXiv
-2108.13264). Intervals resample seeds, and the tasks of each class. So a single seed has an interval too.
+2108.13264). Intervals resample runs, and the tasks of each class. So a single run has an interval too.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, to_builtins
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.evaluation.results import MANY_TASKS
 from bidex_meta.evaluation.statistics import (
     Estimate,
+    bootstrap,
     crossed_estimate,
+    estimate_from,
     iqm,
     probability_of_improvement,
     share_above,
 )
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import Aggregate, MetaTestEvaluation, parse_evaluation
-from bidex_meta.suite import METAWORLD_SUITES, load_suite, suite_names
+from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation
+from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
 from bidex_meta.utils.files import portable, read_json
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole, parse
 
 PROFILE = (0.1, 0.5, 0.9)  # Success rates at which a performance profile is read.
-FORMAT = 2
+FORMAT = 3
+SHOTS = 2  # of a meta-test: a trial has three episodes
+TASKS = 20  # of a class in a meta-test, the first of its pool
+MULTI_TASK = "multi-task"
+_FIRST_SEED = 2**30
+"""The least evaluation seed: seeds of training are small, so that no run trains on the tasks of an evaluation."""
 _TASKS_OF_METAWORLD = 50
-_ROUNDING = 1e-4  # of stored rates
-_USUAL_WIDTH = 1.96  # standard deviations of half an interval of 95 %
-_NO_MEAN = Aggregate(np.inf, None, np.inf)
+_MOST_EPISODES = 1000  # of a task after a shot, over all trials
+_ROUNDING = 1e-6  # of stored rates
 _Interval = tuple[Fraction, Fraction]
 _Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
 _Commit = Annotated[str, Meta(pattern=r"^[0-9a-f]{7,40}\+?$")]
-_Physics = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$")]
+_Identity = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$")]
 _Version = Annotated[str, Meta(max_length=100, pattern=r"^[0-9][\w.+]*$")]
+
+AdaptationTrack = Literal["reward-only", "privileged"]
+"""The training of an agent that adapts: rewards of its own episodes alone; or also teachers, hidden parts of tasks, or
+rewards of other goals."""
+Track = Literal["multi-task", "reward-only", "privileged"]
 
 
 @dataclass(frozen=True)
 class ClassRow:
-    """The results of a class in an entry."""
+    """The results of a class."""
 
     success: Fraction
-    interval: _Interval | None  # 95 %, of the mean over seeds and tasks; None with a single value
-    tasks: Annotated[list[Annotated[list[Fraction], Meta(min_length=1)]], Meta(min_length=1)]
-    """Success in each task, one list per seed."""
+    interval: _Interval | None  # 95 %, of the mean over runs and tasks; None with a single episode
+    solved: Annotated[list[Annotated[list[Whole], Meta(min_length=1)]], Meta(min_length=1)]
+    """Successful episodes of each task, one list per run."""
 
 
 Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 
 
 @dataclass(frozen=True)
+class Part:
+    """The results on tasks of one kind."""
+
+    trials: Few  # adaptations to each task, each with ``episodes`` of the entry
+    rollouts: Whole  # exploration episodes of each task in a shot; 0 for a policy that does not adapt
+    shots: Annotated[list[Classes], Meta(min_length=1)]  # after 0, 1, ... shots
+
+    def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
+        """Return success (runs, units) in each class after a shot; ``episodes`` are those of an adaptation."""
+        return [_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
+
+
+@dataclass(frozen=True)
 class Conditions:
-    """Conditions in which ``submit`` has played an entry's episodes."""
+    """Conditions of the evaluation."""
 
     device: _Name
     engine: Literal["auto", "c", "warp"]
     threads: Count | None
     num_envs: Count | None
     packages: dict[str, _Version | None]
-    physics: _Physics | None
+    physics: _Identity | None
     suite_version: Whole | None
-    suite_digest: _Physics | None = None
+    suite_digest: _Identity | None
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """The submitter's statement of the search for settings."""
+
+    trials: Count  # settings that were tried
+    seeds: Count  # of each
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """Digests of everything that the results come from; lists have one item per run."""
+
+    weights: list[_Digest]  # of the policies, see ``weights_digest``
+    config: list[_Digest]
+    code: _Commit | None  # that evaluated; + if files differed from the commit; None: not from a repository
+    evaluation: _Digest  # of all other content of the entry
 
 
 @dataclass(frozen=True)
@@ -78,42 +122,188 @@ class Stated:
     commit: list[_Commit | None]  # that trained; + if files differed from the commit
 
 
-@dataclass(frozen=True)
-class Entry:
-    """Runs that differ only in the seed, and their verified results; lists have one item per run."""
+@dataclass(frozen=True, kw_only=True)
+class _Listed:
+    """The fields of every entry."""
 
+    verified: ClassVar[bool]
+    """Whether ``submit`` has played the episodes."""
     format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
     name: _Name
     suite: _Name
-    version: Whole | None  # of the suite's file
+    track: Track
+    tuning: Tuning
+    seed: Seed  # of starts; of a run also of new tasks
+    episodes: Few  # of each task after each adaptation
+    new: Part
+    """Results on tasks that the seed draws; of an agent that is no run, on test tasks."""
+    conditions: Conditions
+    receipt: Receipt
+
+    @property
+    def runs(self) -> int:
+        """Return the number of runs; an agent that is no run counts as one."""
+        return max(1, len(self.receipt.weights))
+
+    @property
+    def result(self) -> list[np.ndarray]:
+        """Return the success (runs, units) in each class by which entries are ranked: on new tasks, at the end."""
+        return self.new.tables(self.episodes)
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """Return the parts by name."""
+        return {"new": self.new}
+
+    def summaries(self) -> dict[str, ClassSummary]:
+        """Return what a repetition compares: the results of each run, part, shot and class. They have no returns."""
+        found = {}
+        for where, part, shot, name, row in self._rows():
+            episodes = self.episodes * part.trials
+            for run, solved in enumerate(row.solved):
+                own = class_row([solved], episodes)
+                found[f"{name} ({where}, shot {shot}, run {run})"] = ClassSummary(
+                    success=own["success"], success_interval=own["interval"], mean_return=0.0, solved=solved,
+                    episodes=episodes * len(solved), tasks=len(solved)
+                )  # fmt: skip
+        return found
+
+    def _rows(self) -> Iterator[tuple[str, Part, int, str, ClassRow]]:
+        for where, part in self.parts.items():
+            for shot, classes in enumerate(part.shots):
+                yield from ((where, part, shot, name, row) for name, row in classes.items())
+
+    def _faults(self) -> Iterator[str]:
+        """Yield the contradictions within an entry and to its suite."""
+        conditions = self.conditions
+        if missing := {"bidex-meta", "mujoco"} - conditions.packages.keys():
+            yield f"conditions.packages: expected {min(missing)} to be there"
+        suite = _suite(self.suite)
+        if suite is None:
+            identity = (None, None)
+        else:
+            trained_on = suite.with_train_tasks(self._train_tasks())
+            identity = (trained_on.version, trained_on.digest)
+        if (conditions.suite_version, conditions.suite_digest) != identity:
+            yield f"conditions: expected {self.suite} as it is here, version {identity[0]}, digest {identity[1]}"
+        if self.track != MULTI_TASK and (suite is None or "test" not in suite.splits):
+            yield f"track: {self.suite} has no test tasks to adapt to"
+        for where, part in self.parts.items():
+            yield from (f"{where}.{fault}" for fault in self._faults_of(part, self._pools(where)))
+
+    def _faults_of(self, part: Part, pools: Mapping[str, int]) -> Iterator[str]:
+        """Yield the contradictions within a part whose classes have ``pools`` tasks."""
+        adapts = self.track != MULTI_TASK
+        shots = SHOTS + 1 if adapts else 1
+        if len(part.shots) != shots:
+            yield f"shots: expected {shots} of the track {self.track}, got {len(part.shots)}"
+        if adapts != (part.rollouts > 0):
+            yield f"rollouts: expected {'some' if adapts else 'none'} of the track {self.track}, got {part.rollouts}"
+        if not adapts and part.trials > 1:
+            yield f"trials: expected 1 of the track {self.track}, got {part.trials}"
+        episodes = self.episodes * part.trials
+        if episodes > _MOST_EPISODES:
+            yield f"trials: expected at most {_MOST_EPISODES} episodes of a task, got {episodes}"
+            return
+        for shot, classes in enumerate(part.shots):
+            if list(classes) != list(pools):
+                yield f"shots[{shot}]: expected the classes {', '.join(pools)}, got {', '.join(classes)}"
+                return
+            for name, row in classes.items():
+                faults = _faults_of(row, self.runs, self._tasks(pools[name]), episodes)
+                yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
+
+    def _pools(self, where: str) -> dict[str, int]:
+        """Return the number of tasks of each class of a part."""
+        suite = _suite(self.suite)
+        if suite is None:
+            return dict.fromkeys(METAWORLD_SUITES[self.suite], _TASKS_OF_METAWORLD)
+        if where == "own":
+            suite = suite.with_train_tasks(self._train_tasks())
+        if where == "own" or self.track == MULTI_TASK:
+            split = "train"
+        else:
+            split = "test"
+        return {slot: len(tasks) for slot, tasks in suite.task_names(split).items()}
+
+    def _train_tasks(self) -> int | None:
+        """Return the number of train tasks per class, if it is not the suite's."""
+        return None
+
+    def _tasks(self, pool: int) -> range:
+        """Return the numbers of tasks that may be played of a pool."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry(_Listed):
+    """Runs that differ only in the seed, and their verified results; lists have one item per run."""
+
+    verified = True
     algorithm: _Name
-    weights: Annotated[list[_Digest | None], Meta(min_length=1)]
-    """Digests of the policies, see ``weights_digest``; None for a run whose checkpoint was not kept."""
+    train_tasks: Whole | None  # per class; 0: new ones in each episode or trial; None: as many as the suite has
     steps: list[Count]  # of the checkpoints
-    episodes: Few  # of each task
-    own: Classes  # results on the suite's own tasks
-    others: Classes  # on as many tasks of each class that no run trained on
-    verified: Conditions
+    own: Part
+    """Results on the tasks of the suite's train split, as the runs' seeds draw them."""
     stated: Stated
 
-    def success(self, classes: Classes) -> list[np.ndarray]:
-        """Return the success in each class's tasks, (seeds, tasks)."""
-        return [np.array(row.tasks) for row in classes.values()]
+    @property
+    def parts(self) -> dict[str, Part]:
+        """Return the parts by name."""
+        return {"new": self.new, "own": self.own}
+
+    def _train_tasks(self) -> int | None:
+        return self.train_tasks
+
+    def _tasks(self, pool: int) -> range:
+        tasks = pool if self.track == MULTI_TASK else min(pool, TASKS)
+        return range(tasks, tasks + 1)
+
+    def _faults(self) -> Iterator[str]:
+        """Yield the contradictions within an entry and to its suite."""
+        receipt = self.receipt
+        named = {"steps": self.steps, "receipt.weights": receipt.weights, "receipt.config": receipt.config}
+        named |= {f"stated.{name}": value for name, value in vars(self.stated).items() if isinstance(value, list)}
+        for name, values in named.items():
+            if len(values) != self.runs:
+                yield f"{name}: expected {self.runs} values, one per run, got {len(values)}"
+        if len({*receipt.weights}) < len(receipt.weights):
+            yield "receipt.weights: expected another policy of each run, got one twice"
+        if len({*self.stated.seeds}) < len(self.stated.seeds):
+            yield "stated.seeds: expected each seed once"
+        seed = evaluation_seed(receipt.weights)
+        if self.seed != seed:
+            yield f"seed: expected {seed}, which comes from the weights, got {self.seed}"
+        yield from super()._faults()
 
 
-Track = Literal["reward-only", "privileged"]
-"""The training of an agent that adapts: rewards of its own episodes alone; or also teachers, hidden parts of tasks, or
-rewards of other goals."""
+@dataclass(frozen=True, kw_only=True)
+class AgentEntry(_Listed):
+    """A meta-test of an agent that is no run, in ``trials/`` of the folder of entries. Nothing in it is verified."""
+
+    verified = False
+    track: AdaptationTrack
+    agent: _Name  # its class
+    task_seed: Seed
+
+    def _tasks(self, pool: int) -> range:
+        return range(1, pool + 1)
+
+    def _faults(self) -> Iterator[str]:
+        """Yield the contradictions within an entry and to its suite."""
+        receipt = self.receipt
+        if receipt.weights or receipt.config or receipt.code:
+            yield "receipt: expected no weights, config and code of an agent that was played elsewhere"
+        yield from super()._faults()
 
 
-@dataclass(frozen=True)
-class TrialEntry:
-    """A meta-test that was played elsewhere, in ``trials/`` of the folder of entries. Nothing in it is verified."""
+AnyEntry = Entry | AgentEntry
 
-    format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
-    name: _Name
-    track: Track
-    evaluation: MetaTestEvaluation
+
+def evaluation_seed(weights: Iterable[str]) -> int:
+    """Return the seed of an evaluation, from the digests of the policies that it plays."""
+    digest = hashlib.sha256("/".join(("bidex-meta evaluation", *sorted(weights))).encode()).digest()
+    return _FIRST_SEED + int.from_bytes(digest[:8], "little") % _FIRST_SEED
 
 
 def entry_name(suite: str, name: str) -> str:
@@ -121,171 +311,176 @@ def entry_name(suite: str, name: str) -> str:
     return f"{suite}-{name}.json".replace(" ", "-").replace("/", "-")
 
 
-def read_entry(path: Path) -> Entry:
+def sealed(content: Json, kind: type[Entry] | type[AgentEntry], where: str) -> Json:
+    """Return the content of a new entry with the digest of its evaluation.
+
+    Raises BidexError, which begins with ``where``, if the leaderboard does not take the entry.
+    """
+    content = {**content, "receipt": {**content["receipt"], "evaluation": "0" * 32}}
+    entry = parse(content, kind, where, exact=True)
+    _check(entry, where)
+    return {**content, "receipt": {**content["receipt"], "evaluation": _digest_of(entry)}}
+
+
+def read_entry(path: Path) -> AnyEntry:
     """Read an entry; raise BidexError if the file cannot be read, does not fit the schema, or contradicts itself."""
     content = read_json(path, "an entry of the leaderboard")
-    entry = parse(content, Entry, str(path), exact=True)
+    entry = parse(content, AgentEntry if path.parent.name == "trials" else Entry, str(path), exact=True)
+    _check(entry, str(path))
+    name = entry_name(entry.suite, entry.name)
     if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
-    for fault in _faults(entry, path):
-        raise BidexError(f"{path}: {fault}. Submit it anew.")
+        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+    if path.name != name:
+        raise BidexError(f"{path}: expected a file named {name}. Submit it anew.")
+    if entry.receipt.evaluation != _digest_of(entry):
+        raise BidexError(f"{path}: receipt.evaluation: expected the digest of the content. Submit it anew.")
     return entry
 
 
-def read_trial_entry(path: Path) -> TrialEntry:
-    """Read an entry of an agent; raise BidexError as :func:`read_entry` does."""
-    content = read_json(path, "an entry of the leaderboard")
-    entry = parse(content, TrialEntry, str(path))
-    if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
-    parse_evaluation(content["evaluation"], f"{path}: evaluation")
-    check_trials(entry.evaluation, str(path))
-    if path.name != entry_name(entry.evaluation.suite or "", entry.name):
-        raise BidexError(f"{path}: expected a file named SUITE-NAME.json of its entries. Submit it again.")
-    return entry
+def _check(entry: AnyEntry, where: str) -> None:
+    """Raise BidexError, which begins with ``where``, for the first contradiction in an entry."""
+    try:
+        fault = next(entry._faults(), None)
+    except BidexError as error:  # of a suite that is not here, or not so
+        raise BidexError(f"{where}: {error}") from None
+    if fault is not None:
+        raise BidexError(f"{where}: {fault}. Submit it anew.")
 
 
-def check_trials(evaluation: MetaTestEvaluation, where: str) -> None:
-    """Raise BidexError, which begins with ``where``, for a meta-test that the leaderboard does not take."""
-    again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
-    if evaluation.agent is None or evaluation.suite is None:
-        raise BidexError(f"{where}: expected a meta-test of an agent that is no run, got no agent or suite. {again}")
-    if evaluation.suite not in suite_names():
-        raise BidexError(f"{where}: expected a shipped suite, got {evaluation.suite}: nobody else can play it.")
-    suite = load_suite(evaluation.suite)
-    if evaluation.conditions.suite_digest != suite.digest or evaluation.randomisation is not None:
-        raise BidexError(f"{where}: expected {suite.name} as it is here, without randomisation, got another. {again}")
-    test = evaluation.splits.get("test")
-    if test is None or len(test.by_shot) != 3 or not test.rewards_shown:
-        raise BidexError(f"{where}: expected test tasks after 0, 1 and 2 shots, with rewards shown. {again}")
-    names = {entry.name for entry in suite.split_classes("test")}
-    for shot in test.by_shot:
-        rates = [row.success for row in shot.classes.values()]
-        mean = ((shot.aggregate or {}).get("success") or _NO_MEAN).mean
-        if shot.classes.keys() != names or max(rates) > 1.0 or min(rates) < 0.0:
-            raise BidexError(f"{where}: expected success in [0, 1] of {', '.join(sorted(names))}. {again}")
-        if abs(mean - np.mean(rates)) > _ROUNDING:
-            raise BidexError(
-                f"{where}: expected the mean of its classes, {np.mean(rates):.4f}, got {mean:.4f}. {again}"
-            )
+def read_entries(folder: Path) -> dict[Path, AnyEntry]:
+    """Read all entries in a folder and its ``trials/``; raise BidexError if one is refused or a policy is in two."""
+    entries = {path: read_entry(path) for path in sorted((*folder.glob("*.json"), *folder.glob("trials/*.json")))}
+    check_apart(entries)
+    return entries
 
 
-def check_apart(entries: Mapping[Path, Entry]) -> None:
-    """Raise BidexError if one policy is in two entries."""
+def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
+    """Raise BidexError if one policy is in two entries, of any suites."""
     known: dict[str, Path] = {}
     for path, entry in entries.items():
-        for digest in filter(None, entry.weights):
+        for digest in entry.receipt.weights:
             if digest in known:
                 raise BidexError(f"{path} has a run of {known[digest]}: their weights are equal. Keep one of them.")
             known[digest] = path
 
 
-def _faults(entry: Entry, path: Path) -> Iterator[str]:
-    """Yield the contradictions within an entry."""
-    runs = len(entry.weights)
-    stated = entry.stated
-    if path.name != entry_name(entry.suite, entry.name):
-        yield f"expected a file named {entry_name(entry.suite, entry.name)}"
-    for name, values in (("steps", entry.steps), *vars(stated).items()):
-        if isinstance(values, list) and len(values) != runs:
-            yield f"{name}: expected {runs} values, as many as weights, got {len(values)}"
-    digests = [digest for digest in entry.weights if digest is not None]
-    if len({*digests}) < len(digests):
-        yield "weights: expected another policy of each run, got one twice"
-    if len({*stated.seeds}) < len(stated.seeds):
-        yield "stated.seeds: expected each seed once"
-    if entry.version != entry.verified.suite_version:
-        yield f"version: expected {entry.verified.suite_version} as in verified, got {entry.version}"
-    if missing := {"bidex-meta", "mujoco"} - entry.verified.packages.keys():
-        yield f"verified.packages: expected {min(missing)} to be there"
-    tasks = tasks_of_suite(entry.suite, entry.version)
-    for part, classes in (("own", entry.own), ("others", entry.others)):
-        names = list(tasks if tasks is not None else entry.own)
-        if list(classes) != names:
-            yield f"{part}: expected the classes {', '.join(names)}, got {', '.join(classes)}"
-        for name, row in classes.items():
-            where = f"{part}.{name}"
-            if tasks is None:
-                wanted = len(entry.own[name].tasks[0])
-            else:
-                wanted = tasks[name]
-            yield from (f"{where}.{fault}" for fault in _faults_of(row, runs, wanted, entry.episodes))
+def agent_part(evaluation: MetaTestEvaluation, where: str) -> tuple[int, Part]:
+    """Return the evaluation episodes of each task, and the results on test tasks, of an agent's meta-test.
+
+    Raises BidexError, which begins with ``where``, for a meta-test that the leaderboard does not take.
+    """
+    again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
+    if evaluation.agent is None or evaluation.suite is None:
+        raise BidexError(f"{where}: expected a meta-test of an agent that is no run, got no agent or suite. {again}")
+    if evaluation.randomisation is not None:
+        raise BidexError(f"{where}: expected {evaluation.suite} without randomisation, got another. {again}")
+    test = evaluation.splits.get("test")
+    if test is None or len(test.by_shot) != SHOTS + 1 or not test.rewards_shown:
+        raise BidexError(f"{where}: expected test tasks after 0, 1 and 2 shots, with rewards shown. {again}")
+    episodes = test.before.episodes_per_task or 1
+    shots = []
+    for shot in test.by_shot:
+        classes = {}
+        for name, row in shot.classes.items():
+            if row.solved is None:
+                raise BidexError(f"{where}: expected the successes of each task of {name}, got none. {again}")
+            classes[name] = parse(class_row([row.solved], episodes * test.trials), ClassRow, f"{where}: {name}")
+            if abs(classes[name].success - row.success) > _ROUNDING:
+                raise BidexError(
+                    f"{where}: {name}: expected the mean of its tasks, {classes[name].success:.4f}, got "
+                    f"{row.success:.4f}. {again}"
+                )
+        shots.append(classes)
+    return episodes, Part(test.trials, test.rollouts, shots)
 
 
-def _faults_of(row: ClassRow, runs: int, tasks: int, episodes: int) -> Iterator[str]:
-    """Yield the contradictions within a class of ``runs`` runs and ``tasks`` tasks."""
-    counts = [len(of_run) for of_run in row.tasks]
-    if counts != [tasks] * runs:
-        yield f"tasks: expected {tasks} values of each of {runs} runs, got {counts}"
-        return
-    rates = np.array(row.tasks)
-    successes = rates * episodes
-    if np.abs(successes - successes.round()).max() > _ROUNDING * episodes:
-        yield f"tasks: expected shares of {episodes} episodes"
-    mean = rates.mean()
-    if abs(mean - row.success) > _ROUNDING:
-        yield f"success: expected the mean of its tasks, {mean:.4f}, got {row.success:.4f}"
-    if (row.interval is None) != (rates.size < 2):
-        yield f"interval: expected {'none' if rates.size < 2 else 'one'} of {rates.size} values"
-    elif row.interval is not None:
-        low, high = row.interval
-        usual = _USUAL_WIDTH * _deviation(rates)
-        if not low - _ROUNDING <= mean <= high + _ROUNDING:
-            yield f"interval: expected one that holds {mean:.4f}, got {low:.4f} to {high:.4f}"
-        elif abs((high - low) / 2 - usual) > 0.1 * usual + 1.0 / rates.size:
-            yield f"interval: expected about {mean:.3f} ± {usual:.3f}, got {low:.4f} to {high:.4f}"
+def class_row(solved: list[list[int]], episodes: int) -> Json:
+    """Return the results of a class, ready for JSON, from the successful ones of ``episodes`` of each task, per run."""
+    mean = _mean(_table(solved, episodes))
+    return {"success": mean.value, "interval": mean.interval, "solved": solved}
 
 
-def _deviation(rates: np.ndarray) -> float:
-    """Return the standard deviation of the mean of rates (seeds, tasks) if both seeds and tasks are resampled."""
-    seeds = rates.mean(axis=1, keepdims=True)
-    tasks = rates.mean(axis=0, keepdims=True)
-    rest = rates - seeds - tasks + rates.mean()
-    return float(np.sqrt(seeds.var() / len(rates) + tasks.var() / rates.shape[1] + rest.var() / rates.size))
+def _table(solved: list[list[int]], episodes: int) -> np.ndarray:
+    """Return success (runs, units): the units are tasks, or episodes if there are few tasks (``MANY_TASKS``)."""
+    counts = np.array(solved)
+    if counts.shape[1] >= MANY_TASKS:
+        return counts / episodes
+    table = []
+    for run, of_run in enumerate(counts):
+        outcomes = (np.arange(episodes) < of_run[:, None]).ravel()
+        # Runs are resampled together, so that successes of two runs must not stand side by side.
+        table.append(np.random.default_rng(run).permutation(outcomes))
+    return np.array(table, dtype=float)
 
 
-def tasks_of_suite(name: str, version: int | None) -> dict[str, int] | None:
-    """Return the number of train tasks of each class; None for a suite that is not shipped in this version."""
+def _mean(table: np.ndarray) -> Estimate:
+    """Return the mean of a table (runs, units), with an interval over both."""
+    if table.size < 2:
+        return Estimate(float(table.mean()), None)
+
+    def means(runs: np.ndarray, units: np.ndarray) -> np.ndarray:
+        return table[runs[:, :, None], units[:, None]].mean(axis=(1, 2))
+
+    return estimate_from(float(table.mean()), bootstrap(means, [(len(table),), (table.shape[1],)]))
+
+
+def _digest_of(entry: AnyEntry) -> str:
+    """Return the digest of all content of an entry but the digest itself."""
+    content = to_builtins(replace(entry, receipt=replace(entry.receipt, evaluation="")))
+    return content_digest(content)
+
+
+def content_digest(content: Json) -> str:
+    """Return 32 hexadecimal digits that identify content of JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _suite(name: str) -> Suite | None:
+    """Return a shipped suite, or None for one of Meta-World's; raise BidexError for another name."""
     if name in METAWORLD_SUITES:
-        return dict.fromkeys(METAWORLD_SUITES[name], _TASKS_OF_METAWORLD)
+        return None
     if name not in suite_names():
-        return None
-    suite = load_suite(name)
-    if suite.version != version:
-        return None
-    counts = {}
-    for suite_class in suite.split_classes("train"):
-        listed = sum(task.of("train") for task in suite_class.tasks)
-        counts[suite_class.name] = listed or suite.drawn_tasks("train")
-    return counts
+        raise BidexError(f"expected a shipped suite, got {name}: nobody else can play it. Submit a run on another.")
+    return load_suite(name)
 
 
-def class_rows(evaluations: Sequence[Evaluation]) -> Json:
-    """Return the classes of an entry from one evaluation per seed, ready for JSON."""
-    rows = {}
-    for name in evaluations[0].classes:
-        results = [evaluation.classes[name] for evaluation in evaluations]
-        tasks = np.array([result.task_means(result.successes) for result in results])
-        mean = crossed_estimate(lambda tables: tables[0].mean(), [tasks])
-        rows[name] = {"success": mean.value, "interval": mean.interval, "tasks": tasks.round(4).tolist()}
-    return rows
+def _faults_of(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
+    """Yield the contradictions within a class of ``runs`` runs, ``tasks`` tasks and ``episodes`` of each."""
+    counts = {len(of_run) for of_run in row.solved}
+    if len(row.solved) != runs or len(counts) != 1 or min(counts) not in tasks:
+        yield f"solved: expected {tasks[-1]} values of each of {runs} runs, got {[*map(len, row.solved)]}"
+        return
+    if max(map(max, row.solved)) > episodes:
+        yield f"solved: expected at most {episodes} episodes of a task"
+        return
+    expected = class_row(row.solved, episodes)
+    if abs(expected["success"] - row.success) > _ROUNDING:
+        yield f"success: expected the mean of its tasks, {expected['success']:.4f}, got {row.success:.4f}"
+    given = row.interval
+    wanted = expected["interval"]
+    if given is None or wanted is None:
+        apart = given is not wanted
+    else:
+        apart = max(abs(given[0] - wanted[0]), abs(given[1] - wanted[1])) > _ROUNDING
+    if apart:
+        yield f"interval: expected that of its tasks, {wanted}, got {given}"
 
 
 def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:
-    """Return the interquartile mean of success over seeds and classes of tables (seeds, tasks), one per class."""
+    """Return the interquartile mean of success over runs and classes of tables (runs, units), one per class."""
     return crossed_estimate(lambda tables: float(iqm(success_rates(tables).ravel())), tables)
 
 
 def profile(tables: Sequence[np.ndarray], rate: float) -> float:
-    """Return the share of seeds and classes that succeed in more than ``rate`` of their tasks."""
+    """Return the share of runs and classes that succeed in more than ``rate`` of their tasks."""
     return share_above(success_rates(tables), rate)
 
 
 def improvement(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> Estimate:
-    """Return the probability that a seed of ``a`` has more success in a class than a seed of ``b``."""
+    """Return the probability that a run of ``a`` has more success in a class than a run of ``b``."""
     return crossed_estimate(lambda a, b: probability_of_improvement(success_rates(a), success_rates(b)), a, b)
 
 
 def success_rates(tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Return success rates (seeds, classes)."""
+    """Return success rates (runs, classes)."""
     return np.stack([table.mean(axis=1) for table in tables], axis=1)

@@ -73,6 +73,12 @@ class ClassResult:
         _, task = np.unique(self.tasks, return_inverse=True)
         return np.bincount(task, values) / np.bincount(task)
 
+    @property
+    def solved(self) -> list[int]:
+        """Return the number of successful episodes of each task, by rising number of the task."""
+        _, task = np.unique(self.tasks, return_inverse=True)
+        return np.bincount(task, self.successes).astype(int).tolist()
+
     def summary(self) -> ClassSummary:
         """Return the results without the single episodes."""
         return ClassSummary(
@@ -80,7 +86,7 @@ class ClassResult:
             success_once=self.once, success_at_end=self.at_end,
             mean_return=self.mean_return, return_interval=estimate(mean, self.drawn(self.returns)).interval,
             length=float(self.lengths.mean()), score=self.score, episodes=self.episodes,
-            tasks=len(np.unique(self.tasks)), unstable=self.unstable,
+            tasks=len(np.unique(self.tasks)), unstable=self.unstable, solved=self.solved,
         )  # fmt: skip
 
 

@@ -1,76 +1,154 @@
 """Entries of the leaderboard, verified by playing the runs."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import FORMAT, Track, check_trials, class_rows, entry_name, read_entry
+from bidex_meta.evaluation.leaderboard import (
+    FORMAT,
+    MULTI_TASK,
+    SHOTS,
+    TASKS,
+    AdaptationTrack,
+    AgentEntry,
+    Entry,
+    Track,
+    agent_part,
+    class_row,
+    content_digest,
+    entry_name,
+    evaluation_seed,
+    read_entries,
+    read_entry,
+    sealed,
+)
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments.conditions import check_worlds_of, conditions
-from bidex_meta.experiments.learners import learner_kind, resolve_device
+from bidex_meta.experiments.learners import learner_class, resolve_device
+from bidex_meta.experiments.metatest import Adaptation, Options, check_worlds, meta_test
 from bidex_meta.experiments.policies import checkpoint, fitting, policy_of
 from bidex_meta.runs import RunFolder, training_seconds
-from bidex_meta.runs.atomic import check_writable, write_json
+from bidex_meta.runs.atomic import Json, check_writable, write_json
 from bidex_meta.runs.checkpoints import weights_digest
-from bidex_meta.runs.evaluations import Conditions, MetaTestEvaluation, evaluation_json, read_evaluation
+from bidex_meta.runs.evaluations import MetaTestEvaluation, read_evaluation
 from bidex_meta.runs.provenance import check_alike
+from bidex_meta.runs.versions import git_state
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
-from bidex_meta.utils.files import exists
+from bidex_meta.utils.files import exists, portable
 from bidex_meta.utils.plugins import short_name
+from bidex_meta.utils.validation import parse
 from bidex_meta.world.threads import set_up_torch
-from bidex_meta.worlds import open_worlds
+from bidex_meta.worlds import Worlds, open_worlds
+
+_EPISODES = 1  # default number of each task
+_EPISODES_OF_TRIALS = 10  # default number of each task after each adaptation
+_FACTS = ("suite", "track", "algorithm", "train_tasks", "steps")
 
 
-def submit(folders: Sequence[RunFolder], out: Path, *, name: str | None, episodes: int, device: str) -> Path:
-    """Play runs on their own and on unseen tasks, write the leaderboard's entry, and return its path.
+@dataclass(frozen=True)
+class _Run:
+    """A run that is submitted."""
+
+    folder: RunFolder
+    config: RunConfig[Json]
+    state: Json  # of its checkpoint
+    steps: int
+    weights: str  # their digest
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of :func:`check`."""
+
+    classes: Sequence[Agreement]
+    """Recorded and repeated success by class, part, shot and run."""
+    different: Sequence[str]
+    """Names of other fields of the entry that are not those of the runs."""
+
+    @property
+    def outcome(self) -> str:
+        """Return the worst outcome of ``bidex_meta.evaluation.agreement``."""
+        outcomes = {each.outcome for each in self.classes}
+        if self.different or DIFFERS in outcomes:
+            return DIFFERS
+        return WITHIN if WITHIN in outcomes else EQUAL
+
+
+def submit(
+    folders: Sequence[RunFolder], out: Path, *, name: str | None, tuning: tuple[int, int], episodes: int | None,
+    device: str
+) -> Path:  # fmt: skip
+    """Play runs on their own and on new tasks, write the leaderboard's entry, and return its path.
+
+    Runs of learners that adapt play a meta-test of three episodes per trial. The seed of all starts and of the new
+    tasks comes from the digests of the policies.
 
     Args:
         folders: Runs that differ in the seed alone.
         out: Folder of the entries.
         name: The runs' name on the leaderboard; None: the algorithm.
-        episodes: Episodes of each task.
+        tuning: Number of settings that were tried, and of seeds of each.
+        episodes: Episodes of each task, after each adaptation if there are any; None: 1, with adaptation 10.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 
     Raises BidexError for runs that cannot form one entry, and if there is an entry of this name or of equal weights.
     """
-    configs = [folder.config() for folder in folders]
-    _check(folders, configs)
-    first = configs[0]
-    worlds = open_worlds(first.to_json())
-    check_alike(folders)
-    for folder in folders:
-        check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
-    weights = _weights(folders)
-    name = name or short_name(first.algo)
-    suite = worlds.short_name
-    path = _new(out / entry_name(suite, name))
-    for known in sorted(out.glob("*.json")):
-        if twice := {*weights} & {*read_entry(known).weights}:
-            run = folders[weights.index(twice.pop())].path
-            raise BidexError(f"{run} stands in {known}: their weights are equal. Leave it out, or delete that entry.")
-    facts = [_facts(folder) for folder in folders]
-    played = [_play(folder, config, episodes, device) for folder, config in zip(folders, configs, strict=True)]
-    verified = played[0][3]
-    stated = {
-        "seeds": [config.seed for config in configs], "hours": [row[0] for row in facts], "device": facts[0][1],
-        "commit": [row[2] for row in facts],
-    }  # fmt: skip
-    entry = {
-        "format": FORMAT, "name": name, "suite": suite, "version": verified.suite_version, "algorithm": first.algo,
-        "weights": weights, "steps": [row[2] for row in played], "episodes": episodes,
-        "own": class_rows([row[0] for row in played]), "others": class_rows([row[1] for row in played]),
-        "verified": asdict(verified), "stated": stated,
-    }  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, entry)
+    runs = _read(folders)
+    config = runs[0].config
+    name = name or short_name(config.algo)
+    path = _new(out / entry_name(open_worlds(config.to_json()).short_name, name))
+    for known, entry in read_entries(out).items():
+        for run in runs:
+            if run.weights in entry.receipt.weights:
+                raise BidexError(
+                    f"{run.folder.path} stands in {known}: their weights are equal. Leave it out, or delete that entry."
+                )
+    track = _track_of(runs)
+    if track is None:
+        raise BidexError(
+            f"{runs[0].folder.path} started from a run that is not here, but its training decides the track. Put "
+            f"{portable(config.start_from)} there."
+        )
+    content = _played(runs, track, episodes, device)
+    content |= {"name": name, "tuning": {"trials": tuning[0], "seeds": tuning[1]}}
+    _write(path, sealed(content, Entry, str(path)))
     return path
 
 
-def submit_trials(file: Path, out: Path, *, name: str | None, track: Track | None) -> Path:
+def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
+    """Play the runs of an entry again, by the entry's seed, and compare.
+
+    Raises BidexError if the runs are not those of the entry.
+    """
+    entry = read_entry(path)
+    if not isinstance(entry, Entry):
+        raise BidexError(f"{path} is of an agent that is no run: nobody can play it. Name an entry of runs.")
+    weights = entry.receipt.weights
+    runs = _read(folders)
+    found = [run.weights for run in runs]
+    if sorted(found) != sorted(weights):
+        raise BidexError(f"{path} is of other runs: expected weights {', '.join(weights)}, got {', '.join(found)}.")
+    runs.sort(key=lambda run: weights.index(run.weights))
+    track = _track_of(runs) or entry.track  # the run that it started from may not be here
+    content = _played(runs, track, entry.episodes, device)
+    content |= {"name": entry.name, "tuning": asdict(entry.tuning)}
+    again = sealed(content, Entry, str(path))
+    repeated = parse(again, Entry, str(path))
+    different = [name for name in _FACTS if getattr(repeated, name) != getattr(entry, name)]
+    if repeated.receipt.config != entry.receipt.config:
+        different.append("receipt.config")
+    return Check(agreements(entry.summaries(), repeated.summaries()), different)
+
+
+def submit_agent(
+    file: Path, out: Path, *, name: str | None, track: AdaptationTrack | None, tuning: tuple[int, int]
+) -> Path:  # fmt: skip
     """Write the leaderboard's entry of a meta-test of somebody's agent, and return its path.
 
     The agent is not here, so nothing is verified.
@@ -80,13 +158,14 @@ def submit_trials(file: Path, out: Path, *, name: str | None, track: Track | Non
         out: Folder of the entries.
         name: The agent's name on the leaderboard; None: its class.
         track: The kind of its training.
+        tuning: Number of settings that were tried, and of seeds of each.
 
     Raises BidexError for another evaluation, without a track, and if there is an entry of this name.
     """
     found = read_evaluation(file, "meta_test(agent, suite).save(file)")
     if not isinstance(found, MetaTestEvaluation):
         raise BidexError(f"{file}: expected a meta-test, got an evaluation of a policy. Submit its run instead.")
-    check_trials(found, str(file))
+    episodes, part = agent_part(found, str(file))
     if track is None:
         raise BidexError(
             "--track: expected reward-only (trained by rewards of its own episodes) or privileged (by teachers, hidden "
@@ -94,9 +173,189 @@ def submit_trials(file: Path, out: Path, *, name: str | None, track: Track | Non
         )
     name = name or found.agent or ""
     path = _new(out / "trials" / entry_name(found.suite or "", name))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"format": FORMAT, "name": name, "track": track, "evaluation": evaluation_json(found)})
+    content = {
+        "format": FORMAT, "name": name, "suite": found.suite, "track": track, "agent": found.agent,
+        "tuning": {"trials": tuning[0], "seeds": tuning[1]}, "seed": found.seed, "task_seed": found.task_seed,
+        "episodes": episodes, "new": asdict(part), "conditions": asdict(found.conditions),
+        "receipt": {"weights": [], "config": [], "code": None},
+    }  # fmt: skip
+    _write(path, sealed(content, AgentEntry, str(file)))
     return path
+
+
+def _track_of(runs: Sequence[_Run]) -> Track | None:
+    """Return the track of runs, from their learner's class and what they learned from; None if nobody can tell."""
+    if Capability.ADAPTS not in learner_class(runs[0].config.algo).capabilities:
+        return MULTI_TASK
+    privileged = [_was_privileged(run.config) for run in runs]
+    if True in privileged:
+        return "privileged"
+    if None in privileged:
+        return None
+    return "reward-only"
+
+
+def _was_privileged(config: RunConfig) -> bool | None:
+    """Return whether a run, or the run that it started from, had more than the rewards of its own episodes.
+
+    That is what the learner's class states, teachers, data sets, or a suite that shows the goals. The result is None if
+    the run that it started from is not here.
+    """
+    seen = set[str]()
+    while True:
+        if learner_class(config.algo).privileges or config.teacher or config.demonstrations or config.dataset:
+            return True
+        if not open_worlds(config.to_json()).hides_goals:
+            return True
+        if config.start_from is None:
+            return False
+        try:
+            if config.start_from in seen:
+                return None
+            seen.add(config.start_from)
+            config = RunFolder.open(config.start_from).config()
+        except BidexError:
+            return None
+
+
+def _read(folders: Sequence[RunFolder]) -> list[_Run]:
+    """Return runs with their policies; raise BidexError if the runs cannot form one entry."""
+    configs = [folder.config() for folder in folders]
+    for folder, config in zip(folders, configs, strict=True):
+        if config.suite is None:
+            raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
+        if config.suite.endswith(".toml"):
+            raise BidexError(
+                f"{folder.path} trained on {portable(config.suite)}. The leaderboard is of shipped suites."
+            )
+        if config.points:
+            raise BidexError(f"{folder.path} saw clouds of points, which {config.suite} does not show. Leave it out.")
+        if run_kind(config) != run_kind(configs[0]):
+            raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
+    if len({config.seed for config in configs}) < len(configs):
+        raise BidexError("Two of the runs have one seed. Name each seed once.")
+    worlds = open_worlds(configs[0].to_json())
+    if Capability.ADAPTS in learner_class(configs[0].algo).capabilities:
+        check_worlds(worlds, configs[0].algo)
+    check_alike(folders)
+    for folder in folders:
+        check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
+    runs: dict[str, _Run] = {}
+    for folder, config in zip(folders, configs, strict=True):
+        state, steps = checkpoint(folder, noted=True)
+        with fitting(folder.path):
+            policy = state["learner"]["policy"]
+            digest = weights_digest(policy)
+        if digest in runs:
+            raise BidexError(
+                f"{folder.path} and {runs[digest].folder.path} have equal weights: they are one run. Name it once."
+            )
+        runs[digest] = _Run(folder, config, {"learner": {"policy": policy}}, steps, digest)
+    return list(runs.values())
+
+
+def _played(runs: Sequence[_Run], track: Track, episodes: int | None, device: str) -> Json:
+    """Play runs and return the content of their entry, without its name, tuning and seal."""
+    first = runs[0].config
+    if episodes is None:
+        episodes = _EPISODES if track == MULTI_TASK else _EPISODES_OF_TRIALS
+    seed = evaluation_seed(run.weights for run in runs)
+    worlds = [_worlds(run.config, seed, device) for run in runs]
+    parts = {}
+    for place, name in enumerate(("own", "new")):
+        played = []
+        for run, of_run in zip(runs, worlds, strict=True):
+            say(f"{run.folder.path}: playing {'its own' if name == 'own' else 'new'} tasks.")
+            set_up_torch(run.config.threads)
+            if track == MULTI_TASK:
+                played.append(_judged(run, of_run[place], episodes, seed))
+            else:
+                adaptation = Adaptation.of(of_run[0], run.config)
+                played.append(_adapted(run, of_run[place], adaptation, ("train", "test")[place], episodes, seed))
+        parts[name] = _part(played, episodes)
+    stated = [_facts(run) for run in runs]
+    return {
+        "format": FORMAT, "suite": worlds[0][0].short_name, "track": track, "algorithm": first.algo,
+        "train_tasks": first.tasks_per_class, "steps": [run.steps for run in runs], "seed": seed,
+        "episodes": episodes, **parts, "conditions": asdict(conditions(worlds[0][0])),
+        "stated": {
+            "seeds": [run.config.seed for run in runs], "hours": [row[0] for row in stated],
+            "device": stated[0][1], "commit": [row[2] for row in stated],
+        },
+        "receipt": {
+            "weights": [run.weights for run in runs],
+            "config": [content_digest(portable(run.config.to_json())) for run in runs],
+            "code": _commit(git_state(Path(__file__).parent)),
+        },
+    }  # fmt: skip
+
+
+def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
+    """Return the worlds of a run's own tasks, and those of as many tasks as the suite has, which ``seed`` draws."""
+    config = stored.to_json()
+    config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
+    return open_worlds(config), open_worlds({**config, "task_seed": seed, "tasks_per_class": None})
+
+
+@dataclass(frozen=True)
+class _Played:
+    """The episodes of a run on tasks of one kind."""
+
+    by_shot: Sequence[Evaluation]
+    trials: int = 1
+    rollouts: int = 0
+
+
+def _judged(run: _Run, worlds: Worlds, episodes: int, seed: int) -> _Played:
+    """Play the episodes of a policy that does not adapt."""
+    world = worlds.world("train")
+    found = worlds.judge(
+        policy_of(run.folder, run.state, worlds.device), world, worlds.protocol("train", episodes, seed)
+    )
+    world.close()
+    return _Played([found])
+
+
+def _adapted(run: _Run, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int) -> _Played:
+    """Play a meta-test."""
+    # An agent that adapts by its own episodes explores in as many environments as it is judged in.
+    rollouts = episodes if adaptation.is_per_environment else None
+    options = Options(shots=SHOTS, tasks=TASKS, episodes=episodes, rollouts=rollouts, seed=seed)
+    load = partial(policy_of, run.folder, run.state, worlds.device)
+    found = meta_test(worlds, adaptation, load, options, [split])[split]
+    return _Played(found.by_shot, found.protocol.trials, found.rollouts)
+
+
+def _part(played: Sequence[_Played], episodes: int) -> Json:
+    """Return the results of all runs on tasks of one kind, ready for JSON."""
+    first = played[0]
+    shots = []
+    for evaluations in zip(*(of_run.by_shot for of_run in played), strict=True):
+        classes = {}
+        for name in evaluations[0].classes:
+            solved = [evaluation.classes[name].solved for evaluation in evaluations]
+            classes[name] = class_row(solved, episodes * first.trials)
+        shots.append(classes)
+    return {"trials": first.trials, "rollouts": first.rollouts, "shots": shots}
+
+
+def _facts(run: _Run) -> tuple[float, str, str | None]:
+    """Return the hours of training, the device, and the commit that trained."""
+    versions = run.folder.versions()
+    config = run.config
+    if config.device.startswith("cuda"):
+        gpus = set(versions.get("gpus") or [])
+    else:
+        gpus = set()
+    device = ", ".join(gpus) or f"{config.device}, {config.threads} thread{'s' * (config.threads != 1)}"
+    return round(training_seconds(run.folder.metrics()) / 3600.0, 3), device, _commit(versions.get("git"))
+
+
+def _commit(git: Json | None) -> str | None:
+    """Return a commit in short, with + if files differed from it; None without one."""
+    if not git or not git.get("commit"):
+        return None
+    return git["commit"][:10] + "+" * bool(git.get("dirty"))
 
 
 def _new(path: Path) -> Path:
@@ -107,61 +366,6 @@ def _new(path: Path) -> Path:
     return path
 
 
-def _check(folders: Sequence[RunFolder], configs: Sequence[RunConfig]) -> None:
-    """Raise BidexError if the runs cannot form one entry."""
-    for folder, config in zip(folders, configs, strict=True):
-        if config.suite is None:
-            raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
-        if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
-            raise BidexError(f"{config.algo} adapts to tasks, and runs that adapt are not taken (yet).")
-        if run_kind(config) != run_kind(configs[0]):
-            raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
-    if len({config.seed for config in configs}) < len(configs):
-        raise BidexError("Two of the runs have one seed. Name each seed once.")
-
-
-def _weights(folders: Sequence[RunFolder]) -> list[str]:
-    """Return the digests of the runs' policies; raise BidexError if two are equal, whatever their configs say."""
-    digests: dict[str, Path] = {}
-    for folder in folders:
-        state, _ = checkpoint(folder, noted=True)
-        with fitting(folder.path):
-            digest = weights_digest(state["learner"]["policy"])
-        if digest in digests:
-            raise BidexError(f"{folder.path} and {digests[digest]} have equal weights: they are one run. Name it once.")
-        digests[digest] = folder.path
-    return list(digests)
-
-
-def _facts(folder: RunFolder) -> tuple[float, str, str | None]:
-    """Return the hours of training, the device, and the commit that trained."""
-    versions = folder.versions()
-    config = folder.config()
-    git = versions.get("git") or {}
-    commit = git.get("commit") and git["commit"][:10] + "+" * bool(git.get("dirty"))
-    if config.device.startswith("cuda"):
-        gpus = set(versions.get("gpus") or [])
-    else:
-        gpus = set()
-    device = ", ".join(gpus) or f"{config.device}, {config.threads} thread{'s' * (config.threads != 1)}"
-    return round(training_seconds(folder.metrics()) / 3600.0, 3), device, commit
-
-
-def _play(
-    folder: RunFolder, stored: RunConfig, episodes: int, device: str
-) -> tuple[Evaluation, Evaluation, int, Conditions]:
-    """Return the evaluations on own and on other tasks, the policy's steps, and the conditions."""
-    config = stored.to_json()
-    config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
-    worlds = open_worlds(config)
-    others = worlds.others
-    set_up_torch(stored.threads)
-    state, steps = checkpoint(folder, noted=True)
-    policy = policy_of(folder, state, config["device"])
-    found = []
-    for where, what in ((worlds, "its own tasks"), (others, "others")):
-        say(f"{folder.path}: playing {what}.")
-        world = where.world("train")
-        found.append(where.judge(policy, world, where.protocol("train", episodes)))
-        world.close()
-    return found[0], found[1], steps, conditions(worlds)
+def _write(path: Path, content: Json) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)

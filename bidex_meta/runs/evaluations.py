@@ -67,6 +67,7 @@ class ClassSummary(msgspec.Struct, frozen=True, kw_only=True):
     episodes: Whole | None = None
     tasks: Few | None = None
     unstable: Whole | None = None  # episodes that ended because the physics broke
+    solved: list[Whole] | None = None  # successful episodes of each task, by rising number of the task
 
 
 Classes = Annotated[dict[str, ClassSummary], Meta(min_length=1)]

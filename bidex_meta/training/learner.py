@@ -97,6 +97,8 @@ class Learner(ABC):
     """Presets for learning a single task class, by class; they replace presets of the same name."""
     capabilities: ClassVar[frozenset[Capability]] = frozenset()
     """Capabilities that commands and training rely on."""
+    privileges: ClassVar[tuple[str, ...]] = ()
+    """Information, in words, that a learner that adapts has in training besides the rewards of its own episodes."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     environments_per_class: int | None = None

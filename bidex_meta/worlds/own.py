@@ -49,16 +49,7 @@ class OwnSuite(Worlds):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the names that the file lists, else numbers; see ``Worlds``."""
-        of_split = cast(Split, split)
-        drawn = list(map(str, range(self.suite.drawn_tasks(of_split))))
-        classes = self.suite.split_classes(of_split)
-        pools = {c.name: [task.name for task in c.tasks if task.of(of_split)] or [*drawn] for c in classes}
-        if self.suite.task_id == "class":
-            return pools
-        listed: dict[str, list[str]] = {}
-        for name, pool in pools.items():
-            listed |= {f"{name}/{task}": [task] for task in pool}
-        return listed
+        return self.suite.task_names(cast(Split, split))
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """See ``Worlds``."""

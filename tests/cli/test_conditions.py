@@ -85,7 +85,10 @@ def test_a_run_whose_worlds_have_changed_is_neither_resumed_nor_submitted_nor_co
 ) -> None:
     edited(run, name)
     before = (run / "config.json").read_text()
-    for words in (["run", "--resume", run, "--steps", "192"], ["submit", run, "--out", tmp_path / "board"]):
+    for words in (
+        ["run", "--resume", run, "--steps", "192"],
+        ["submit", run, "--out", tmp_path / "board", "--tuning", "1x1"],
+    ):
         assert f"The worlds of {run} have changed: {TEXTS[name]}" in refused(*words)
     assert (run / "config.json").read_text() == before
     with pytest.raises(ValueError, match="other worlds than its evaluation's"):

@@ -10,13 +10,14 @@ import torch
 
 from bidex_meta import BidexError, load_suite, meta_test
 from bidex_meta.agents import TrialAgent
-from bidex_meta.evaluation.leaderboard import read_trial_entry
+from bidex_meta.evaluation.leaderboard import AgentEntry, read_entry
 from bidex_meta.evaluation.trial_agents import AdaptingTrialAgent
 from bidex_meta.runs.evaluations import read_evaluation
+from bidex_meta.suite import Suite
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import COUNTS
 from tests.points import SPEED, Finder
-from tools.pages.leaderboard import trials_table
+from tools.pages.leaderboard import leaderboard_table
 
 pytestmark = pytest.mark.usefixtures("finder")
 SMALL = {"split": "test", "rollouts": 2, "device": "cpu"}
@@ -147,6 +148,7 @@ def test_refusals_are_one_line(agent, suite, options, expected) -> None:
 def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file of a meta-test whose classes are those of the suite."""
     pools = {split: {"TwoCatchUnderarm": [""] * counts["Near"]} for split, counts in COUNTS.items()}
+    monkeypatch.setattr(Suite, "task_names", lambda suite, split: pools[split])
     monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
     made = OwnSuite.world
 
@@ -164,15 +166,19 @@ def result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_submitted_agent_is_not_verified_and_says_how_it_was_trained(result: Path, shown, refused) -> None:
     out = result.parent / "leaderboard"
     words = ["submit", "--evaluation", result, "--out", out, "--name", "scout"]
+    assert "--tuning: expected the number" in refused(*words, "--track", "reward-only")
+    words += ["--tuning", "3x1"]
     assert "--track: expected reward-only" in refused(*words)
     assert "not verified" in shown(*words, "--track", "reward-only")
-    entry = read_trial_entry(out / "trials" / "ML4-scout.json")
-    assert (entry.name, entry.track, entry.evaluation.agent) == ("scout", "reward-only", "Scout")
-    head, _, row = trials_table("ML4", result.parent / "data")
-    assert "after 2" in head and row.startswith("| scout | reward-only |") and row.endswith("| not verified |")
+    entry = read_entry(out / "trials" / "ML4-scout.json")
+    assert isinstance(entry, AgentEntry) and not entry.verified
+    assert (entry.name, entry.track, entry.agent, entry.tuning.trials) == ("scout", "reward-only", "Scout", 3)
+    title, _, head, _, row, *_ = leaderboard_table("ML4", result.parent / "data")
+    assert title == "**ML4, adaptation, reward only**" and "after 2" in head
+    assert row.startswith("| 1 | scout (not verified) |") and "| 3 × 1 |" in row
     assert "There is" in refused(*words, "--track", "privileged")
     assert "got both" in refused(*words, result.parent, "--track", "privileged")
-    assert not list(trials_table("ML1", result.parent / "data"))
+    assert not list(leaderboard_table("ML1", result.parent / "data"))
 
 
 EDITS = {
@@ -180,7 +186,11 @@ EDITS = {
     "success above 1": lambda found: found["splits"]["test"]["by_shot"][2]["classes"]["TwoCatchUnderarm"].update(
         success=1.5
     ),
-    "another mean": lambda found: found["splits"]["test"]["by_shot"][2]["aggregate"]["success"].update(mean=0.9),
+    "another mean": lambda found: found["splits"]["test"]["by_shot"][2]["classes"]["TwoCatchUnderarm"].update(
+        success=0.123
+    ),
+    "no single tasks": lambda found: found["splits"]["test"]["by_shot"][2]["classes"]["TwoCatchUnderarm"].pop("solved"),
+    "randomised": lambda found: found.update(randomisation={"friction": 0.1}),
     "another suite": lambda found: found["conditions"].update(suite_digest="0" * 12),
     "no test tasks": lambda found: found["splits"].update(train=found["splits"].pop("test")),
     "a suite of one's own": lambda found: found.update(suite="mine"),
@@ -193,5 +203,5 @@ def test_another_evaluation_is_refused(edit: str, result: Path, refused) -> None
     found = json.loads(result.read_text())
     EDITS[edit](found)
     result.write_text(json.dumps(found))
-    told = refused("submit", "--evaluation", result, "--track", "privileged", "--out", result.parent)
+    told = refused("submit", "--evaluation", result, "--track", "privileged", "--out", result.parent, "--tuning", "1x1")
     assert str(result) in told and len(told.splitlines()) == 1

@@ -1,8 +1,11 @@
-"""The leaderboard: its statistics on known numbers, its files, and a submission that is played."""
+"""The leaderboard: its statistics on known numbers, its files, and submissions that are played."""
 
+import copy
 import json
+import random
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +14,34 @@ import pytest
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import leaderboard, statistics
-from bidex_meta.evaluation.leaderboard import check_apart, improvement, profile, read_entry, success_iqm
+from bidex_meta.evaluation.leaderboard import (
+    AgentEntry,
+    Entry,
+    class_row,
+    evaluation_seed,
+    improvement,
+    profile,
+    read_entry,
+    sealed,
+    success_iqm,
+)
+from bidex_meta.experiments import submitting
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
-from tests.cli.conftest import SMALL
+from bidex_meta.suite import Suite, load_suite
+from bidex_meta.utils.validation import parse
+from bidex_meta.worlds.own import OwnSuite
+from tests.cli.conftest import COUNTS, FINDER, SMALL, points
+from tests.fakes import SLOT_NAMES, SLOT_TASKS, change, run_config, trained_run
 from tests.pages import ROOT
 from tools.pages.leaderboard import leaderboard_table
 
 SHIPPED = sorted((ROOT / "results" / "leaderboard").glob("*.json"))
+TUNED = ["--tuning", "12x1"]
 
 
 def classes(*rates: float, tasks: int = 10) -> list[np.ndarray]:
-    """One seed that solves these shares of its tasks."""
+    """One run that solves these shares of its tasks."""
     return [np.array([[1.0] * round(rate * tasks) + [0.0] * (tasks - round(rate * tasks))]) for rate in rates]
 
 
@@ -39,139 +58,405 @@ def test_measures_of_known_numbers() -> None:
 
 def test_an_interval_of_a_single_value_is_none() -> None:
     assert success_iqm(classes(1.0, tasks=1)).interval is None
+    assert class_row([[1]], 1)["interval"] is None
+
+
+def test_intervals_resample_tasks_and_of_few_tasks_episodes() -> None:
+    low, high = class_row([[1] * 8 + [0] * 8], 1)["interval"]
+    usual = 1.96 * np.sqrt(0.25 / 16)
+    assert (high - low) / 2 == pytest.approx(usual, rel=0.15)
+    low, high = class_row([[20, 20], [20, 20]], 40)["interval"]
+    assert (high - low) / 2 == pytest.approx(1.96 * np.sqrt(0.25 / 160), rel=0.25), (
+        "episodes of two runs are independent"
+    )
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_entries_fit(path: Path) -> None:
     entry = read_entry(path)
-    for row in (*entry.own.values(), *entry.others.values()):
-        assert row.success == pytest.approx(np.mean(row.tasks), abs=1e-3)
+    for part in entry.parts.values():
+        for row in part.shots[-1].values():
+            assert row.success == pytest.approx(np.mean(row.solved) / entry.episodes / part.trials, abs=1e-3)
     assert path.name.startswith(f"{entry.suite}-")
 
 
-def test_digests_of_shipped_policies_are_those_of_their_entries() -> None:
+def test_digests_of_shipped_policies_are_those_of_the_runs() -> None:
     """Both policies are stored in half precision, the runs had single precision."""
-    for file, run in (("MT20-dagger", "assets/policies/MT20"), ("MT20-mtppo", "results/MT20-mtppo-seed0")):
+    for run in ("assets/policies/MT20", "results/MT20-mtppo-seed0"):
         loaded = RunFolder.open(ROOT / run).checkpoints.load()
         assert loaded is not None
         digest = weights_digest(loaded[0]["learner"]["policy"])
-        assert digest == read_entry(ROOT / "results" / "leaderboard" / f"{file}.json").weights[0]
         policy = {"weights": {name: w.float() for name, w in loaded[0]["learner"]["policy"]["weights"].items()}}
         assert weights_digest(policy) == digest
 
 
-def _nudged(entry: dict[str, Any], *place: Any) -> Any:
-    for name in place:
-        entry = entry[name]
-    return entry
+def test_the_seed_comes_from_the_weights_alone() -> None:
+    weights = ["0" * 32, "1" * 32]
+    assert evaluation_seed(weights) == evaluation_seed(weights[::-1]) == evaluation_seed(iter(weights))
+    seeds = {evaluation_seed([f"{number:032x}"]) for number in range(100)}
+    assert len(seeds) == 100 and min(seeds) >= 2**30 and max(seeds) < 2**31
 
 
-# Each changes one thing of an entry, whose first class is HandOver.
-EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
-    "more success": lambda e: e["own"]["HandOver"].update(success=1.0),
-    "more success, its interval too": lambda e: e["own"]["HandOver"].update(success=1.0, interval=[1.0, 1.0]),
-    "a rate above 1": lambda e: e["own"]["HandOver"].update(success=1.01),
-    "a task that is solved by half": lambda e: _nudged(e, "own", "HandOver", "tasks", 0).__setitem__(0, 0.5),
-    "a task more": lambda e: _nudged(e, "own", "HandOver", "tasks", 0).append(1.0),
-    "a task less": lambda e: _nudged(e, "others", "HandOver", "tasks", 0).pop(),
-    "other tasks": lambda e: e["own"]["HandOver"].update(tasks=[[1.0] * 50]),
-    "an interval elsewhere": lambda e: e["own"]["HandOver"].update(interval=[0.0, 0.1]),
-    "a narrow interval": lambda e: e["own"]["HandOver"].update(interval=[e["own"]["HandOver"]["success"]] * 2),
-    "no interval": lambda e: e["own"]["HandOver"].update(interval=None),
-    "a text as a rate": lambda e: e["own"]["HandOver"].update(success="1"),
-    "a class left out": lambda e: (e["own"].pop("PourWater"), e["others"].pop("PourWater")),
-    "a class left out of the others": lambda e: e["others"].pop("PourWater"),
-    "a class of another name": lambda e: e["own"].update(Juggling=e["own"].pop("PourWater")),
-    "two classes in each other's place": lambda e: _swap(e["own"]),
-    "a seed twice": lambda e: e["stated"].update(seeds=[0, 0]),
-    "a seed more": lambda e: e["stated"].update(seeds=[0, 1]),
-    "a run counted twice": lambda e: _twice(e),
-    "another digest's form": lambda e: e.update(weights=["0123"]),
-    "negative hours": lambda e: e["stated"].update(hours=[-1.0]),
-    "hours of more runs": lambda e: e["stated"].update(hours=[0.1, 0.1]),
-    "a commit that is none": lambda e: e["stated"].update(commit=["main"]),
-    "a device with markup": lambda e: e["stated"].update(device="H100 | **best**"),
-    "no steps": lambda e: e.update(steps=[0]),
-    "a fraction of an episode": lambda e: e.update(episodes=0.5),
-    "more episodes than were played": lambda e: e.update(episodes=0),
-    "another version": lambda e: e.update(version=2),
-    "another suite": lambda e: e.update(suite="MT4"),
-    "another name": lambda e: e.update(name="best"),
-    "an entry of one's own": lambda e: e.update(stars=5),
-    "hours as if they were verified": lambda e: e["verified"].update(hours=[0.284]),
-    "physics that are no digest": lambda e: e["verified"].update(physics="real"),
-    "no version of MuJoCo": lambda e: e["verified"]["packages"].pop("mujoco"),
-    "a number as a version": lambda e: e["verified"]["packages"].update(mujoco=4),
-    "a path of a machine": lambda e: e["verified"].update(device="/home/me/gpu"),
-    "an older format": lambda e: e.update(format=1),
-}
+KINDS = {"multi-task": "MT5-v2", "reward-only": "ML5-v2", "agent": "ML1-Switch-choice2"}
 
 
-def _swap(classes: dict[str, Any]) -> None:
-    classes["HandOver"], classes["PourWater"] = classes.pop("PourWater"), classes.pop("HandOver")
+@pytest.fixture
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "RESAMPLES", 100)
 
 
-def _twice(entry: dict[str, Any]) -> None:
-    """One run as two seeds, in every list."""
-    entry["weights"] *= 2
-    entry["steps"] *= 2
-    entry["stated"] |= {"seeds": [0, 1], "hours": entry["stated"]["hours"] * 2, "commit": entry["stated"]["commit"] * 2}
-    for row in (*entry["own"].values(), *entry["others"].values()):
-        row["tasks"] *= 2
+def _part(suite: Suite, split: str, adapts: bool, runs: int, rate: float, generator: np.random.Generator) -> dict:
+    shots = []
+    trials = 2 if adapts else 1
+    for shot in range(3 if adapts else 1):
+        rows = {}
+        for name, pool in suite.task_names(split).items():  # type: ignore[arg-type]
+            tasks = min(len(pool), 20) if adapts else len(pool)
+            solved = generator.binomial(3 * trials, rate * (1 + shot) / 3 if adapts else rate, (runs, tasks)).tolist()
+            rows[name] = class_row(solved, 3 * trials)
+        shots.append(rows)
+    return {"trials": trials, "rollouts": 4 if adapts else 0, "shots": shots}
 
 
-@pytest.mark.parametrize("edit", EDITS)
-def test_an_edited_entry_is_refused(edit: str, tmp_path: Path) -> None:
-    path = tmp_path / "MT20-mtppo.json"
-    content = json.loads((ROOT / "results" / "leaderboard" / path.name).read_text())
+def made(kind: str, name: str = "mine", rate: float = 0.5, runs: int = 2, first: int = 0) -> dict[str, Any]:
+    """The content of a valid entry; runs of other ``first`` have other weights."""
+    suite = load_suite(KINDS[kind])
+    adapts = kind != "multi-task"
+    generator = np.random.default_rng(first)
+    weights = [f"{first + number:032x}" for number in range(runs)]
+    content: dict[str, Any] = {
+        "format": leaderboard.FORMAT, "name": name, "suite": suite.name, "tuning": {"trials": 12, "seeds": 1},
+        "track": "reward-only" if adapts else kind, "episodes": 3, "seed": evaluation_seed(weights),
+        "new": _part(suite, "test" if adapts else "train", adapts, 1 if kind == "agent" else runs, rate, generator),
+        "conditions": {
+            "device": "cpu", "engine": "c", "threads": 1, "num_envs": None, "physics": "0123456789ab",
+            "packages": {"bidex-meta": "0.3.0", "mujoco": "4.0.0"}, "suite_version": suite.version,
+            "suite_digest": suite.digest,
+        },
+    }  # fmt: skip
+    if kind == "agent":
+        receipt = {"weights": [], "config": [], "code": None}
+        return sealed({**content, "agent": "Scout", "task_seed": 3, "receipt": receipt}, AgentEntry, "made")
+    content |= {
+        "algorithm": "rl2" if adapts else "mtppo", "train_tasks": None, "steps": [1000] * runs,
+        "own": _part(suite, "train", adapts, runs, rate, generator),
+        "stated": {"seeds": list(range(runs)), "hours": [0.5] * runs, "device": "H100", "commit": [None] * runs},
+        "receipt": {"weights": weights, "config": weights, "code": "0123456789+"},
+    }  # fmt: skip
+    return sealed(content, Entry, "made")
+
+
+def place_of(folder: Path, kind: str, content: dict[str, Any]) -> Path:
+    path = folder / ("trials" if kind == "agent" else "") / f"{KINDS[kind]}-{content['name']}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content))
-    read_entry(path)
-    EDITS[edit](content)
-    path.write_text(json.dumps(content))
-    with pytest.raises(BidexError) as told:
-        read_entry(path)
-    assert "\n" not in str(told.value) and str(path) in str(told.value)
+    return path
 
 
-def test_a_policy_stands_in_one_entry_alone() -> None:
-    entries = {path: read_entry(path) for path in SHIPPED}
-    check_apart(entries)
-    first = next(iter(entries.values()))
+def _places(value: Any, place: tuple = ()) -> Iterator[tuple]:
+    """Every place in a content of JSON."""
+    yield place
+    if isinstance(value, dict):
+        for name, each in value.items():
+            yield from _places(each, (*place, name))
+    elif isinstance(value, list):
+        for number, each in enumerate(value):
+            yield from _places(each, (*place, number))
+
+
+def _edited(value: Any, rng: random.Random) -> Any:
+    """Another value in the place of one."""
+    if isinstance(value, dict):
+        names = list(value)
+        one, two = rng.choice(names), rng.choice(names)
+        return rng.choice([
+            {**value, "extra": 1},
+            {name: each for name, each in value.items() if name != one},
+            {name + "x" * (name == one): each for name, each in value.items()},
+            {**value, one: value[two], two: value[one]},
+            dict(reversed(value.items())),
+        ])  # fmt: skip
+    if isinstance(value, list):
+        if not value:
+            return [rng.choice([0, "x", None])]
+        one, two = rng.randrange(len(value)), rng.randrange(len(value))
+        swapped = list(value)
+        swapped[one], swapped[two] = value[two], value[one]
+        return rng.choice([[*value, value[one]], value[:one] + value[one + 1 :], swapped, value * 2, [], value[::-1]])
+    if isinstance(value, str):
+        return rng.choice([value + "0", value[1:], value[::-1], value.upper(), "", 0, "MT4", "a|b", "/home/me/x"])
+    if value is None:
+        return rng.choice([0, "x", 1.0, []])
+    return rng.choice([value + 1, value - 1, value / 2, value * 2 + 0.01, -value, 0, 1, 1e12, float("nan"), None, "1"])
+
+
+PROVEN = ("suite", "episodes", "format", "own", "new", "seed")
+"""Fields that follow from the weights, the suite or other fields. A forger gives the rest a fitting digest too."""
+
+
+def _resealed(content: dict[str, Any]) -> None:
+    with suppress(BidexError, LookupError, TypeError, AttributeError):
+        entry = parse(content, Entry, "edited", exact=True)
+        content["receipt"]["evaluation"] = leaderboard._digest_of(entry)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_200_random_edits_are_refused_or_equal_in_meaning(kind: str, tmp_path: Path, few_resamples) -> None:
+    content = json.loads(json.dumps(made(kind)))
+    path = place_of(tmp_path, kind, content)
+    whole = read_entry(path)
+    rng = random.Random(0)
+    places = list(_places(content))
+    by_field: dict[Any, list[tuple]] = {}
+    for place in places[1:]:
+        by_field.setdefault(place[0], []).append(place)
+    refused = 0
+    for number in range(200):
+        edited = copy.deepcopy(content)
+        # Most numbers are of tasks, so that an edit chooses its field first.
+        place = rng.choice(by_field[rng.choice(list(by_field))]) if number else ()
+        parent = edited
+        for name in place[:-1]:
+            parent = parent[name]
+        if place:
+            parent[place[-1]] = _edited(parent[place[-1]], rng)
+        else:
+            edited = _edited(edited, rng)
+        if kind != "agent" and place and place[0] in PROVEN and "rollouts" not in place:
+            _resealed(edited)
+        path.write_text(json.dumps(edited))
+        try:
+            assert read_entry(path) == whole, f"{place} {json.dumps(parent)[:300]}"
+        except BidexError as told:
+            refused += 1
+            assert "\n" not in str(told) and str(path) in str(told)
+    assert refused > 150
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_contradictions_are_refused_whatever_the_digest(kind: str, tmp_path: Path, few_resamples) -> None:
+    """Each is an edit of somebody who knows how digests are made."""
+    name = next(iter(made(kind)["new"]["shots"][0]))
+    edits: dict[str, Callable[[dict[str, Any]], object]] = {
+        "shots": lambda entry: entry["new"]["shots"].append(entry["new"]["shots"][0]),
+        "classes": lambda entry: entry["new"]["shots"][0].update(Juggling=entry["new"]["shots"][0].pop(name)),
+        "at most": lambda entry: entry["new"]["shots"][0].update({name: solved_by(entry, 7)}),
+        "episodes of a task": lambda entry: entry.update(episodes=1_000_000),
+        "version": lambda entry: entry["conditions"].update(suite_version=9),
+        "digest": lambda entry: entry["conditions"].update(suite_digest="0" * 12),
+        "mujoco": lambda entry: entry["conditions"]["packages"].pop("mujoco"),
+        "rollouts": lambda entry: entry["new"].update(rollouts=4 if kind == "multi-task" else 0),
+        "shipped suite": lambda entry: entry.update(suite="mine"),
+        "receipt|one per run": lambda entry: entry["receipt"]["config"].append("0" * 32),
+    }
+    if kind != "agent":
+        edits |= {
+            "seed: expected": lambda entry: entry.update(seed=entry["seed"] + 1),
+            "which comes from the weights": lambda entry: entry["receipt"]["weights"].__setitem__(0, "f" * 32),
+            "got one twice": lambda entry: entry["receipt"].update(weights=["0" * 32] * 2),
+            "each seed once": lambda entry: entry["stated"].update(seeds=[0, 0]),
+            "train_tasks|digest": lambda entry: entry.update(train_tasks=7),
+        }
+
+    def solved_by(entry: dict[str, Any], count: int) -> dict[str, Any]:
+        solved = [[count] * len(run) for run in entry["new"]["shots"][0][name]["solved"]]
+        return {**entry["new"]["shots"][0][name], "solved": solved}
+
+    for expected, edit in edits.items():
+        content = made(kind)
+        edit(content)
+        with pytest.raises(BidexError, match=expected):
+            sealed(content, AgentEntry if kind == "agent" else Entry, "edited")
+
+
+def test_a_policy_stands_in_one_entry_alone_of_all_suites(tmp_path: Path, few_resamples) -> None:
+    board = tmp_path / "leaderboard"
+    place_of(board, "multi-task", made("multi-task", first=0))
+    assert list(leaderboard_table("", tmp_path / "data"))
+    place_of(board, "reward-only", made("reward-only", first=1))  # its first policy is the other's second
     with pytest.raises(BidexError, match="their weights are equal"):
-        check_apart(entries | {Path("copy.json"): first})
+        list(leaderboard_table("", tmp_path / "data"))
 
 
-def test_a_submission_is_played_and_ranked(toy_worlds, tmp_path: Path, shown, refused, monkeypatch) -> None:
-    monkeypatch.setattr(statistics, "RESAMPLES", 400)
-    monkeypatch.setattr(leaderboard, "tasks_of_suite", lambda name, version: {"Near": 3, "Far": 2})
-    runs = [str(tmp_path / f"r{seed}") for seed in (0, 1)]
-    for seed, run in enumerate(runs):
+def test_the_table_is_by_track_and_suite_and_claims_only_what_is_separated(tmp_path: Path, few_resamples) -> None:
+    board = tmp_path / "leaderboard"
+    place_of(board, "multi-task", made("multi-task", "strong", 0.9, first=0))
+    place_of(board, "multi-task", made("multi-task", "like", 0.9, first=2))
+    place_of(board, "multi-task", made("multi-task", "weak", 0.1, runs=1, first=4))
+    place_of(board, "reward-only", made("reward-only", first=6))
+    scout = place_of(board, "agent", made("agent", "scout"))
+    with pytest.raises(BidexError, match="nobody can play it"):
+        submitting.check(scout, [], "cpu")
+    lines = list(leaderboard_table("", tmp_path / "data"))
+    heads = [line for line in lines if line.startswith("**")]
+    of = "adaptation, reward only"
+    assert heads == ["**MT5-v2, multi-task**", f"**ML1-Switch-choice2, {of}**", f"**ML5-v2, {of}**"]
+    assert sum("better than weak (policies of single runs)" in line for line in lines) == 2
+    assert sum("| not separated |" in line for line in lines) == 1
+    assert any("scout (not verified)" in line and "| 12 × 1 |" in line for line in lines)
+    assert not list(leaderboard_table("MT4", tmp_path / "data"))
+    assert next(iter(leaderboard_table("MT5-v2", tmp_path / "data"))) == heads[0]
+
+
+@pytest.fixture
+def toy_suite(toy_worlds, few_resamples, monkeypatch: pytest.MonkeyPatch) -> None:
+    pools = {name: list(map(str, range(count))) for name, count in zip(SLOT_NAMES, SLOT_TASKS, strict=True)}
+    monkeypatch.setattr(Suite, "task_names", lambda suite, split: pools)
+
+
+@pytest.fixture
+def runs(toy_suite, tmp_path: Path, shown) -> list[Path]:
+    """Two runs that differ in the seed."""
+    folders = [tmp_path / f"r{seed}" for seed in (0, 1)]
+    for seed, run in enumerate(folders):
         shown("run", *SMALL, "--steps", "96", "--run-dir", run, "--seed", seed, "--no-evaluate")
+    return folders
+
+
+def copied(run: Path, **entries: Any) -> Path:
+    """A copy of a run whose config says otherwise, and that tells nothing of its versions."""
+    path = shutil.copytree(run, run.parent / f"copy{len(list(run.parent.iterdir()))}")
+    (path / "versions.json").write_text("{}")
+    return change(path, **entries)
+
+
+def test_a_submission_is_played_by_the_seed_of_its_weights_and_ranked(
+    runs, tmp_path: Path, shown, refused, monkeypatch
+) -> None:
     out = tmp_path / "leaderboard"
-    copy = shutil.copytree(runs[0], tmp_path / "copy")
-    config = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps(config | {"seed": 2}))
-    assert "they are one run" in refused("submit", *runs, copy, "--out", out)
-    shown("submit", *runs, "--out", out, "--episodes", "2", "--device", "cpu")
-    entry = read_entry(out / "MT4-mtppo.json")
-    assert (entry.suite, entry.version, entry.stated.seeds, entry.steps) == ("MT4", 1, [0, 1], [96, 96])
-    assert list(entry.own) == ["Near", "Far"] and entry.stated.device == "cpu, 1 thread"
-    assert len({*entry.weights}) == 2
-    lines = list(leaderboard_table("MT4", tmp_path / "data"))
-    assert (
-        len(lines) == 3 and lines[2].startswith("| 1 | mtppo | ") and not list(leaderboard_table("MT1", tmp_path / "x"))
+    assert "--tuning: expected the number of settings" in refused("submit", *runs, "--out", out)
+    assert "got '12'" in refused("submit", *runs, "--out", out, "--tuning", 12)
+    copy = copied(runs[0], seed=2)
+    assert "they are one run" in refused("submit", *runs, copy, "--out", out, *TUNED)
+    task_seeds: list[int] = []
+    make = OwnSuite.world
+    monkeypatch.setattr(
+        OwnSuite, "world", lambda source, *given: (task_seeds.append(source.seed), make(source, *given))[1]
     )
-    assert lines[0].count("stated: ") == 3
-    assert "There is" in refused("submit", *runs, "--out", out)
-    assert "Two of the runs have one seed" in refused("submit", runs[0], runs[0], "--name", "x", "--out", out)
-    assert f"stands in {out / 'MT4-mtppo.json'}" in refused("submit", copy, "--name", "x", "--out", out)
+    shown("submit", *runs, "--out", out, "--episodes", "2", "--device", "cpu", *TUNED)
+    entry = read_entry(out / "MT4-mtppo.json")
+    assert isinstance(entry, Entry) and entry.verified and entry.track == "multi-task"
+    assert (entry.suite, entry.stated.seeds, entry.steps) == ("MT4", [0, 1], [96, 96])
+    assert list(entry.own.shots[0]) == ["Near", "Far"] and entry.stated.device == "cpu, 1 thread"
+    assert (entry.tuning.trials, entry.tuning.seeds) == (12, 1)
+    assert len({*entry.receipt.weights}) == len({*entry.receipt.config}) == 2
+    assert entry.seed == evaluation_seed(entry.receipt.weights) and sorted(task_seeds) == [0, 1, *[entry.seed] * 2]
+    lines = list(leaderboard_table("MT4", tmp_path / "data"))
+    assert lines[0] == "**MT4, multi-task**" and lines[4].startswith("| 1 | mtppo | ")
+    assert "There is" in refused("submit", *runs, "--out", out, *TUNED)
+    assert "Two of the runs have one seed" in refused("submit", runs[0], runs[0], "--name", "x", "--out", out, *TUNED)
+    for words in ({"seed": 2}, {"seed": 2, "suite": "MT4-v2"}):
+        told = refused("submit", copied(runs[0], **words), "--name", "x", "--out", out, *TUNED)
+        assert f"stands in {out / 'MT4-mtppo.json'}" in told
 
 
-def test_an_entry_of_an_own_suite_holds_no_path(toy_worlds, tmp_path: Path, shown, monkeypatch) -> None:
-    monkeypatch.setattr(statistics, "RESAMPLES", 400)
+def test_check_repeats_an_entry_and_finds_a_forgery(runs, tmp_path: Path, shown, refused, capsys) -> None:
+    out = tmp_path / "leaderboard"
+    path = out / "MT4-mtppo.json"
+    shown("submit", *runs, "--out", out, "--episodes", "2", "--device", "cpu", *TUNED)
+    before = path.read_bytes()
+    again = ["submit", "--check", path, *runs[::-1], "--device", "cpu"]
+    assert shown(*again).splitlines()[-1] == f"{path}: equal" and path.read_bytes() == before
+    assert "is of other runs" in refused(*again[:3], runs[0])
+    assert "--check takes" in refused(*again, *TUNED)
+    forge(path, 1)
+    assert shown(*again).splitlines()[-1] == f"{path}: within the interval"
+    forge(path, 40)
+    change(runs[0], evaluate_every=5)
+    with pytest.raises(SystemExit, match="1"):
+        submit_main(again)
+    assert "different, receipt.config differs" in capsys.readouterr().out
+
+
+def submit_main(words: list[object]) -> None:
+    from bidex_meta.cli.submit import main
+
+    main(list(map(str, words[1:])))
+
+
+def forge(path: Path, tasks: int) -> None:
+    """Solve up to this many tasks more, and give all else the values that fit."""
+    content = json.loads(path.read_text())
+    for part in ("own", "new"):
+        for name, row in content[part]["shots"][0].items():
+            for of_run in row["solved"]:
+                for task, solved in enumerate(of_run):
+                    if solved < 2 and tasks > 0:
+                        of_run[task] += 1
+                        tasks -= 1
+            content[part]["shots"][0][name] = class_row(row["solved"], 2)
+    path.write_text(json.dumps(sealed(content, Entry, str(path))))
+    read_entry(path)
+
+
+def test_runs_that_adapt_play_trials_of_three_episodes_on_both_splits(
+    finder, tmp_path: Path, shown, refused, few_resamples, monkeypatch
+) -> None:
+    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
+    monkeypatch.setattr(Suite, "task_names", lambda suite, split: pools[split])
+    task_seeds: list[tuple[str, int]] = []
+
+    def world(source: OwnSuite, split: str = "train", *given: Any) -> Any:
+        task_seeds.append((split, source.seed))
+        return points(source, split, *given)
+
+    folders = [tmp_path / f"r{seed}" for seed in (0, 1)]
+    for seed, run in enumerate(folders):
+        shown("run", *FINDER, "--run-dir", run, "--no-evaluate", "--seed", seed)
+    monkeypatch.setattr(OwnSuite, "world", world)
+    out = tmp_path / "leaderboard"
+    assert "--track is for --evaluation" in refused("submit", *folders, "--track", "privileged", *TUNED)
+    shown("submit", *folders, "--out", out, "--device", "cpu", *TUNED)
+    entry = read_entry(out / "ML4-finder.json")
+    assert isinstance(entry, Entry) and (entry.track, entry.episodes) == ("reward-only", 10)
+    assert len(entry.own.shots) == len(entry.new.shots) == 3 and entry.new.trials == 3 and entry.new.rollouts == 4
+    assert list(entry.own.shots[0]) == ["Near", "Far"] and list(entry.new.shots[0]) == ["Near"]
+    before, after = (entry.new.tables(entry.episodes, shot)[0].mean() for shot in (0, -1))
+    assert after > before
+    assert {*task_seeds} == {("train", 0), ("train", 1), ("test", entry.seed)}
+    copy = copied(folders[0], seed=2)
+    assert "they are one run" in refused("submit", *folders, copy, "--name", "x", "--out", out, *TUNED)
+    assert "stands in" in refused("submit", copy, "--name", "x", "--out", out, *TUNED)
+    last = shown("submit", "--check", out / "ML4-finder.json", *folders, "--device", "cpu").splitlines()[-1]
+    assert last.endswith(": equal")
+
+
+@pytest.mark.parametrize(
+    ("entries", "start", "privileged"),
+    [
+        ({"algo": "rl2"}, None, False),
+        ({"algo": "icl"}, None, True),
+        ({"algo": "maml"}, {"suite": "ML1"}, False),
+        ({"algo": "maml"}, {"suite": "MT1"}, True),
+        ({"algo": "maml"}, {"suite": "ML1", "teacher": ("scripts",)}, True),
+        ({"algo": "maml"}, {"suite": "ML1", "start_from": "not/here"}, None),
+    ],
+)
+def test_a_track_follows_from_the_learner_and_what_it_learned_from(
+    entries: dict, start: dict | None, privileged: bool | None, tmp_path: Path
+) -> None:
+    if start is not None:
+        RunFolder.create(run_config(**start), tmp_path / "start")
+        entries = {**entries, "start_from": str(tmp_path / "start")}
+    assert submitting._was_privileged(run_config(suite="ML1", **entries)) is privileged
+
+
+def test_runs_that_nobody_else_could_play_are_refused(toy_suite, tmp_path: Path, shown, refused) -> None:
     suite = shutil.copyfile(ROOT / "suites" / "MT4.toml", tmp_path / "mine.toml")
-    run, out = tmp_path / "r", tmp_path / "leaderboard"
+    run = tmp_path / "r"
     shown("run", *SMALL[2:], "--suite", suite, "--steps", "24", "--run-dir", run, "--no-evaluate")
-    shown("submit", run, "--out", out, "--device", "cpu")
-    assert read_entry(out / "mine-mtppo.json").suite == "mine"
-    assert str(tmp_path) not in (out / "mine-mtppo.json").read_text()
+    told = refused("submit", run, "--out", tmp_path, *TUNED)
+    assert "trained on mine.toml. The leaderboard is of shipped suites" in told
+    change(run, suite="MT4", points=16)
+    assert "saw clouds of points" in refused("submit", run, "--out", tmp_path, *TUNED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["rl2", "varibad", "pearl", "maml", "promp"])
+def test_every_learner_that_adapts_is_played_and_repeated(algo: str, tmp_path: Path, shown, few_resamples) -> None:
+    run = trained_run(algo)
+    shown("submit", run, "--out", tmp_path, "--episodes", 1, "--device", "cpu", *TUNED)
+    entry = read_entry(tmp_path / f"ML1-{algo}.json")
+    assert entry.track == "reward-only" and len(entry.new.shots) == 3 and entry.new.rollouts > 0
+    again = shown("submit", "--check", tmp_path / f"ML1-{algo}.json", run, "--device", "cpu")
+    assert again.splitlines()[-1].endswith(": equal")

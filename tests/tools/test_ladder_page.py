@@ -29,7 +29,7 @@ def run(arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float 
             rewards_shown=True, hidden_by_shot=None if hidden is None else [summary(hidden)] * 3,
         )  # fmt: skip
         found = MetaTestEvaluation(splits={"test": split})
-        algo = arm
+        algo = arm if arm == "icl" else "rl2"
     content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}}
     config = SimpleNamespace(algo=algo, seed=seed)
     return SimpleNamespace(arm=arm, content=content, evaluation=lambda: found, config=lambda: config)

@@ -22,7 +22,7 @@ from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table
 from tools.pages.ladder import ladder_figure, ladder_table, suites_table
-from tools.pages.leaderboard import leaderboard_table, trials_table
+from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import curves_figure, digest_of, read_studies
@@ -38,7 +38,7 @@ _TABLES = {
     "offline": offline_table,
     "rows": rows_table,
 }
-_WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table, "trials": trials_table}
+_WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table}
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),

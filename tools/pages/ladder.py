@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bidex_meta.evaluation.statistics import crossed_estimate, probability_of_improvement
+from bidex_meta.experiments.learners import learner_class
 from bidex_meta.runs import plots
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation
@@ -26,8 +27,6 @@ BLIND = "blind PPO"
 """The line of MT-PPO on the suite itself, which hides goals and shows no rewards."""
 SHOWN = "goal-shown PPO"
 """The line of MT-PPO on the multi-task twin of the suite, which shows goals."""
-_GIVEN = {"icl": "teachers, rewards of other goals"}
-"""What learners see in training beyond the rewards of their own episodes, by the learner's name."""
 _OWN = "own rewards"
 _HEAD = (
     "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
@@ -158,7 +157,7 @@ def _named(run: StoredRun) -> tuple[str, Line]:
     """Return the name of a run's line, and an empty line."""
     algo = run.config().algo
     if algo != "mtppo":
-        return run.arm, Line(_GIVEN.get(algo, _OWN))
+        return run.arm, Line(", ".join(learner_class(algo).privileges) or _OWN)
     if str(run.content["suite"]["name"]).startswith("MT"):
         return SHOWN, Line("the goal")
     return BLIND, Line(_OWN)

@@ -1,72 +1,101 @@
 """Tables of the leaderboard, from the entries in ``leaderboard/`` and its ``trials/`` next to the folder of data."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 from pathlib import Path
+from typing import get_args
 
 from bidex_meta.evaluation import leaderboard as board
-from bidex_meta.evaluation.leaderboard import Entry
-from bidex_meta.evaluation.statistics import iqm
-from bidex_meta.runs.evaluations import Aggregate, Summary
-from bidex_meta.suite import load_suite, suite_names
+from bidex_meta.evaluation.leaderboard import MULTI_TASK, SHOTS, AnyEntry, Entry
+from bidex_meta.evaluation.statistics import NONE, iqm
 from tools.pages.tables import table
+
+_TITLES = {
+    MULTI_TASK: "multi-task",
+    "reward-only": "adaptation, reward only",
+    "privileged": "adaptation, privileged training",
+}
+_LAST = ["runs", "steps", "tuning", "hours", "trained on", "commit"]
 
 
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
-    """Yield a row for each entry of a suite in its present version, best first.
+    """Yield for each track and suite a table of entries, best first, and a table of pairs; ``suite`` "": for all."""
+    entries = list(board.read_entries(data.parent / "leaderboard").values())
+    for track in get_args(board.Track):
+        of_track = [entry for entry in entries if entry.track == track and suite in ("", entry.suite)]
+        for name in sorted({entry.suite for entry in of_track}):
+            ranked = sorted((entry for entry in of_track if entry.suite == name), key=_rank, reverse=True)
+            yield from (f"**{name}, {_TITLES[track]}**", "")
+            head = _multi_task_head() if track == MULTI_TASK else _adaptation_head()
+            yield from table(["", "entry", *head, *_LAST], [_row(*numbered) for numbered in enumerate(ranked, 1)])
+            yield ""
+            if len(ranked) > 1:
+                yield from table(["first", "second", "probability that the first is better", "claim"], _pairs(ranked))
+                yield ""
 
-    Each row has the probability that its entry is better than the entry of the next row.
-    """
-    entries = {path: board.read_entry(path) for path in sorted((data.parent / "leaderboard").glob("*.json"))}
-    board.check_apart(entries)
-    version = load_suite(suite).version if suite in suite_names() else None
-    comparable = [entry for entry in entries.values() if (entry.suite, entry.version) == (suite, version)]
-    ranked = sorted(comparable, key=_rank, reverse=True)
-    rows = [_row(place, entry, ranked[place:]) for place, entry in enumerate(ranked, 1)]
+
+def _multi_task_head() -> list[str]:
     above = [f"> {100 * rate:.0f} %" for rate in board.PROFILE]
-    head = ["", "entry", "success, IQM", "other tasks, IQM", *above, "above the next", "runs", "steps"]
-    yield from table([*head, "stated: hours", "stated: trained on", "stated: commit"], rows) if rows else ()
+    return ["new tasks, IQM", "own tasks, IQM", *above]
 
 
-def trials_table(suite: str, data: Path) -> Iterator[str]:
-    """Yield a row for each agent that adapts on a suite, best first; tracks stay apart."""
-    folder = data.parent / "leaderboard" / "trials"
-    entries = [board.read_trial_entry(path) for path in sorted(folder.glob(f"{suite}-*.json"))]
-    found = []
-    for entry in entries:
-        test = entry.evaluation.splits["test"]
-        if entry.evaluation.suite == suite:
-            after = [_mean_success(shot) for shot in test.by_shot]
-            gain = test.gain.aggregate["success"] if test.gain else None
-            cells = [f"{100 * mean.mean:.1f} %{_ends(mean)}" for mean in after]
-            cells += [gain.text(100.0, " %") if gain else "–", str(test.rollouts), "not verified"]
-            found.append((entry.track, -after[-1].mean, [entry.name, entry.track, *cells]))
-    head = ["agent", "training", "after 0", "after 1", "after 2", "gain", "episodes per shot", ""]
-    yield from table(head, [row for *_, row in sorted(found)]) if found else ()
+def _adaptation_head() -> list[str]:
+    after = [f"after {shot}" for shot in range(1, SHOTS + 1)]
+    return ["before", *after, f"own tasks, after {SHOTS}", "exploration episodes"]
 
 
-def _mean_success(shot: Summary) -> Aggregate:
-    mean = (shot.aggregate or {})["success"]
-    assert mean is not None  # ``check_trials`` refuses entries without it
-    return mean
+def _rank(entry: AnyEntry) -> float:
+    return float(iqm(board.success_rates(entry.result).ravel()))
 
 
-def _ends(mean: Aggregate) -> str:
-    return "" if mean.interval is None else f" [{100 * mean.interval[0]:.1f}, {100 * mean.interval[1]:.1f}]"
+def _row(place: int, entry: AnyEntry) -> list[str]:
+    own = NONE
+    if isinstance(entry, Entry):
+        own = _percent(entry.own.tables(entry.episodes))
+    shots = [_percent(entry.new.tables(entry.episodes, shot)) for shot in range(len(entry.new.shots))]
+    if entry.track == MULTI_TASK:
+        measures = [*shots, own, *(f"{100 * board.profile(entry.result, rate):.0f} %" for rate in board.PROFILE)]
+    else:
+        measures = [*shots, own, str(entry.new.rollouts)]
+    tuning = f"{entry.tuning.trials} × {entry.tuning.seeds}"
+    return [str(place), _label(entry), *measures, str(entry.runs), *_trained(entry, tuning)]
 
 
-def _rank(entry: Entry) -> float:
-    return float(iqm(board.success_rates(entry.success(entry.own)).ravel()))
+def _label(entry: AnyEntry) -> str:
+    if not isinstance(entry, Entry):
+        return f"{entry.name} (not verified)"
+    if entry.name == entry.algorithm:
+        return entry.name
+    return f"{entry.name} ({entry.algorithm})"
 
 
-def _row(place: int, entry: Entry, below: list[Entry]) -> list[str]:
-    own = entry.success(entry.own)
+def _trained(entry: AnyEntry, tuning: str) -> list[str]:
+    """Return the cells of steps, tuning, hours, device and commit."""
+    if not isinstance(entry, Entry):
+        return [NONE, tuning, NONE, NONE, NONE]
     stated = entry.stated
-    better = board.improvement(own, below[0].success(below[0].own)).text(form=".2f") if below else "–"
-    return [
-        str(place), f"{entry.name} ({entry.algorithm})" if entry.name != entry.algorithm else entry.name,
-        *(board.success_iqm(part).text(100.0, " %") for part in (own, entry.success(entry.others))),
-        *(f"{100 * board.profile(own, rate):.0f} %" for rate in board.PROFILE), better,
-        str(len(entry.weights)), " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps))),
-        f"{sum(stated.hours) / len(stated.hours):.2f}", stated.device,
-        ", ".join(sorted({commit or "unknown" for commit in stated.commit})),
-    ]  # fmt: skip
+    steps = " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps)))
+    hours = f"{sum(stated.hours) / len(stated.hours):.2f}"
+    commits = ", ".join(sorted({commit or "unknown" for commit in stated.commit}))
+    return [steps, tuning, hours, stated.device, commits]
+
+
+def _percent(tables: Sequence) -> str:
+    return board.success_iqm(tables).text(100.0, " %")
+
+
+def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
+    """Return a row for each pair of entries: a claim holds if the interval excludes one half."""
+    rows = []
+    for first, second in combinations(ranked, 2):
+        found = board.improvement(first.result, second.result)
+        low, high = found.interval or (0.0, 1.0)
+        claim = "not separated"
+        if low > 0.5:
+            claim = f"{first.name} better than {second.name}"
+        elif high < 0.5:
+            claim = f"{second.name} better than {first.name}"
+        if claim != "not separated" and min(first.runs, second.runs) == 1:
+            claim += " (policies of single runs)"
+        rows.append([first.name, second.name, found.text(form=".2f"), claim])
+    return rows

@@ -80,6 +80,7 @@ class ICL(TrialLearner):
     config_type = ICLConfig
     presets = PRESETS
     capabilities = TrialLearner.capabilities | {Capability.TAUGHT}
+    privileges = ("teachers", "rewards of other goals")
     per_process = ("generator", "episodes", "data")
     config: ICLConfig
     policy: BeliefPolicy
