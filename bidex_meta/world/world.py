@@ -405,6 +405,8 @@ class World(BatchedWorld):
             task = slot.task_class
             made[f"class of {slot.name}"] = f"{type(task).__module__}:{type(task).__qualname__}"
             made[f"moving base of {slot.name}"] = str(task.moving_base)
+            if task.touch:
+                made[f"touch of {slot.name}"] = "on"
             made |= {f"{rule} of {slot.name}": str(value) for rule, value in vars(task.rules).items()}
             made |= {f"{option} of {slot.name}": _option(value) for option, value in task.chosen.items()}
         return made
