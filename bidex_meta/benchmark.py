@@ -330,7 +330,7 @@ class Benchmark:
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
             own = entry.reward_scale, entry.class_name, self.suite.rules, points, bool(entry.tasks)
-            recipe = EnvRecipe(entry.name, *look, *own)
+            recipe = EnvRecipe(entry.name, *look, *own, self.suite.touch)
             classes[recipe.env_name] = recipe.make_class()
         return ByClass(classes, self.suite.rules)
 
@@ -371,6 +371,7 @@ def make_task_world(
     randomisation: Randomisation | None = None,
     pixels: int = 0,
     task_seed: int | None = None,
+    touch: bool = False,
 ) -> World:
     """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -382,6 +383,7 @@ def make_task_world(
       evaluation worlds.
     - `moving_base`: whether the hands' bases move; None: as the class defines it.
     - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state.
+    - `touch`: whether observations show touch sensors of both hands (docs/world.md#the-contract).
     - `randomisation`: randomisation of the environments (docs/randomisation.md); None: nothing is randomised.
     - `task_seed`: seed of the 50 tasks; None: `seed`.
     - `object`: name or MJCF file (docs/objects.md) of an object that replaces the class's own; the slot's name then
@@ -391,7 +393,7 @@ def make_task_world(
     """
     task_name = registry.resolve(task_name)
     mode = checked_mode(autoreset_mode)
-    task_class = registry.get(task_name, moving_base, **registry.with_object(object))
+    task_class = registry.get(task_name, moving_base, touch, **registry.with_object(object))
     of_tasks = whole_number("seed", seed, 0)
     if task_seed is not None:
         of_tasks = whole_number("task_seed", task_seed, 0)
@@ -420,7 +422,8 @@ def make_task_world(
 
 def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
     try:
-        task_class = registry.get(entry.class_name, True if suite.base == "moving" else None, **entry.options)
+        moving = True if suite.base == "moving" else None
+        task_class = registry.get(entry.class_name, moving, suite.touch, **entry.options)
         task_class.adopt(suite.rules)
         for task in entry.tasks:
             for component in task.fixed:

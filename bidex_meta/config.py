@@ -90,6 +90,8 @@ class RunConfig(Generic[LearnerSettings]):
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
     """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
     original; docs/points.md); 0: the states, or as the suite's file says."""
+    touch: Switch = False
+    """Observations also show touch sensors: normal forces at the fingertips and palms, 14 entries (docs/world.md)."""
     object: Text | None = None
     """With --task: the object to throw in place of the class's own object: a name of the shelf or the path of an MJCF
     file (docs/objects.md)."""

@@ -119,6 +119,8 @@ class Suite:
     """True if each point has its kind as a fourth entry."""
     randomisation: Randomisation | None = None
     """Randomisation of training worlds."""
+    touch: bool = False
+    """True if observations show touch sensors of both hands."""
 
     def __post_init__(self) -> None:
         """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
@@ -329,6 +331,7 @@ class _File:
     classes: Annotated[list[_ClassEntry], _Tables]
     tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
     points: _PointsEntry | None = None
+    touch: bool = False
     randomisation: Randomisation | None = None
     variation: Literal["narrow", "wide"] = "narrow"
     success: Literal["once", "at-end"] = "once"

@@ -51,7 +51,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
     if flags.actor not in ("zero", "random"):
         run = RunFolder.open(Path(flags.actor)).config()
         config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
-        config = replace(config, base=run.base, points=run.points)
+        config = replace(config, base=run.base, points=run.points, touch=run.touch)
         if not flags.task and not flags.object:
             config = replace(config, object=run.object)
     if config.suite is None and config.task is None:

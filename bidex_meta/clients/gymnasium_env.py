@@ -16,15 +16,15 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
     `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Without `seed` the tasks are those of seed 0,
-    and the starts differ from environment to environment. Raises BidexError for an unknown task class or a render mode
-    other than None and `"rgb_array"`.
+    and the starts differ from environment to environment. With `touch` observations show touch sensors. Raises
+    BidexError for an unknown task class or a render mode other than None and `"rgb_array"`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (Gymnasium's own convention)
 
     def __init__(
         self, task_name: str, render_mode: str | None = None, seed: int | None = None,
-        device: str | torch.device = "cpu"
+        device: str | torch.device = "cpu", touch: bool = False
     ) -> None:  # fmt: skip
         check_render_mode(render_mode)
         self.render_mode = render_mode
@@ -37,6 +37,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             autoreset_mode="DISABLED",
             task_sampling="uniform",
             task_seed=task_seed,
+            touch=touch,
         )
         self.observation_space = self.world.single_observation_space
         self.action_space = self.world.single_action_space

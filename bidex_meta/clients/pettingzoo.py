@@ -30,9 +30,9 @@ class HandsEnv(ParallelEnv):
 
     def __init__(
         self, task: str, agents: Agents = "hands", render_mode: str | None = None, seed: int | None = None,
-        device: str | torch.device = "cpu"
+        device: str | torch.device = "cpu", touch: bool = False
     ) -> None:  # fmt: skip
-        self._env = TaskEnv(task, render_mode, seed, device)
+        self._env = TaskEnv(task, render_mode, seed, device, touch)
         self.render_mode = render_mode
         whole = self._env.world.single_observation_space
         size = self._env.world.single_action_space.shape[0]

@@ -134,6 +134,7 @@ class _Formulas:
         self._rules = Rules(**about.get("rules", {}))
         # The suite's file says whether bases move. If that file is gone, the number of actions shows whether they do.
         self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
+        self._touch = bool(about.get("touch"))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
         self._known: dict[str, tuple[TaskClass, _Shown] | None] = {}
 
@@ -176,7 +177,7 @@ class _Formulas:
 
     def _class(self, name: str) -> TaskClass:
         """Return the class whose bases, fixed or moving, match the data's number of actions."""
-        classes = [registry.get(name, base) for base in self._bases]
+        classes = [registry.get(name, base, self._touch) for base in self._bases]
         actions = self._dataset.action_size
         for task in classes:
             if task.action_size == actions:
@@ -192,11 +193,11 @@ class _Formulas:
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
     """Map each sensor that an observation shows whole and unmapped to its slice and factor, without ``hidden`` entries.
 
-    Joint positions are left out: the observation maps each one from its joint's range.
+    Joint positions are left out: the observation maps each one from its joint's range. So are blocks that saturate.
     """
     shown: _Shown = {}
     for block, where in task.layout:
-        if block.sensors and not block.name.endswith("joint_position"):
+        if block.sensors and not block.saturates and not block.name.endswith("joint_position"):
             start = where.start
             for sensor in block.sensors:
                 size = _size(block, sensor)

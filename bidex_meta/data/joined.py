@@ -98,6 +98,17 @@ def gathered(
     return Joined(states, at, acts, rewards, ends, task, left)
 
 
+def check_touch(dataset: Dataset, touch: bool) -> None:
+    """Raise BidexError unless a data set shows touch sensors as a world does: ``touch`` says whether.
+
+    Padding would hide the different widths.
+    """
+    if bool(dataset.metadata.get("touch")) != touch:
+        if touch:
+            raise BidexError(f"{dataset.name} shows no touch sensors, the world here does. Leave --touch out.")
+        raise BidexError(f"{dataset.name} shows touch sensors, the world here does not. Add --touch.")
+
+
 class _Columns(NamedTuple):
     """Columns of an observation without its task id; padding stands before the cloud."""
 
@@ -138,6 +149,7 @@ class _Form:
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
         slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
+        check_touch(dataset, any(slot.task_class.touch for slot in slots))
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own = about.get("reward_scales", {})
         theirs = {slot.name: slot.reward_scale for slot in slots}

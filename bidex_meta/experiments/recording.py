@@ -51,7 +51,7 @@ _USUAL_SIZE = 1_000_000
 _DEMONSTRATORS = {"witness": 32, "tasks": 200}  # environments of demonstrations by default, by ``starts``
 _MOST_HELD = 1_200_000_000  # most bytes of running episodes, without the world
 _PATIENCE = 3  # rounds of demonstrations that may all fail
-_OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
+_OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "touch": False, "seed": None}
 """Entries of a run's config that decide which tasks are played."""
 
 

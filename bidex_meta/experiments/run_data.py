@@ -7,6 +7,7 @@ import gymnasium
 
 from bidex_meta.clients.gymnasium_ids import task_id
 from bidex_meta.data import Dataset, open_dataset
+from bidex_meta.data.joined import check_touch
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.runs.atomic import Json
@@ -20,24 +21,25 @@ from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
 UPDATES = 300_000  # updates of an offline run by default
-_FORM = ("suite", "task", "base", "object", "points")
+_FORM = ("suite", "task", "base", "object", "points", "touch")
 
 
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
     """Our entry in the metadata of a data set of a world of some source, and ``more``; all ready for JSON.
 
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
-    ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
-    ``instructions``, what the class of each slot asks for; ``reward_scales``, factor on the reward by slot; ``rules``,
-    the suite's; ``hides_goals``; ``observation_groups``, [name, index ranges]; ``kind`` (``random``, ``medium``, ...),
-    ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}}, unscaled returns),
-    ``versions``, ``commit``, and ``gymnasium_id`` of the same environment, None of a suite or an altered class.
+    ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``touch``, whether observations show
+    touch sensors; ``tasks``, names of the slots; ``instructions``, what the class of each slot asks for;
+    ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
+    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
+    ({class: {random, zero, expert}}, unscaled returns), ``versions``, ``commit``, and ``gymnasium_id`` of the same
+    environment, None of a suite or an altered class.
     """
     alone = source.class_name
     versions = collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
     references = {name: known for name, known in source.references().items() if name in names}
-    altered = source.object or source.points or source.moving_base is not None
+    altered = source.object or source.points or source.touch or source.moving_base is not None
     env_id = None
     if alone and not altered and task_id(alone) in gymnasium.registry:
         env_id = task_id(alone)
@@ -50,7 +52,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     return {
         "suite": None if alone else source.name,
         "suite_version": version,
-        "task": alone, "object": source.object, "points": source.points,
+        "task": alone, "object": source.object, "points": source.points, "touch": source.touch,
         "base": base,
         "tasks": list(world.task_names),
         "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
@@ -77,7 +79,7 @@ def open_datasets(names: Sequence[str]) -> list[Dataset]:
 
 
 def implied(datasets: Sequence[Dataset]) -> Json:
-    """Return the suite (or task, base, object) and the points that all data sets share; empty without metadata."""
+    """Return suite (or task, base, object), points and touch that all data sets share; empty without metadata."""
     forms = [tuple(dataset.metadata.get(name) or None for name in _FORM) for dataset in datasets]
     if not forms or forms[0][:2] == (None, None):
         return {}
@@ -86,8 +88,13 @@ def implied(datasets: Sequence[Dataset]) -> Json:
     if len(which) > 1:
         raise BidexError(f"The data sets are of {' and '.join(which)}. {suite}")
     same = "Name some that were recorded alike"
-    mends = {"base": f"{same}, or what fits all: --task NAME --base BASE.", "points": f"{same}.", "object": suite}
-    usual = {"points": 0, "object": "its own"}
+    mends = {
+        "base": f"{same}, or what fits all: --task NAME --base BASE.",
+        "points": f"{same}.",
+        "touch": f"{same}.",
+        "object": suite,
+    }
+    usual = {"points": 0, "touch": False, "object": "its own"}
     for name, mend in mends.items():
         values = {str(form[_FORM.index(name)] or usual.get(name)) for form in forms}
         if len(values) > 1:
@@ -116,7 +123,7 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
     if launch().count > 1:
         raise BidexError(f"{kind.name} learns in one process, here are {launch().count}. Start it without torchrun.")
     for dataset in datasets:
-        _check_goals(dataset, source)
+        _check_shown(dataset, source)
 
 
 def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
@@ -128,7 +135,7 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
         classes = source.task_classes()
         for slot in dataset.metadata["tasks"]:
             known_name(f"class in {source.name} of", name_among(slot.partition("/")[0], classes), classes)
-        _check_goals(dataset, source)
+        _check_shown(dataset, source)
         actions = max(task_class.action_size for task_class in classes.values())
         if dataset.action_size != actions:
             if dataset.action_size > actions:
@@ -141,8 +148,12 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
             )
 
 
-def _check_goals(dataset: Dataset, source: Worlds) -> None:
-    """Refuse data that hide the goals if the source shows them; data may show goals that the source hides."""
+def _check_shown(dataset: Dataset, source: Worlds) -> None:
+    """Refuse data that hide the goals if the source shows them, or that differ from it in touch sensors.
+
+    Data may show goals that the source hides.
+    """
+    check_touch(dataset, source.touch)
     about = dataset.metadata
     if about.get("hides_goals", source.hides_goals) == source.hides_goals:
         return

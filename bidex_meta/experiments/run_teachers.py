@@ -94,8 +94,8 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     if not known or source.points != other.points or (source.points and other.class_name is not None):
         raise BidexError(
             f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected "
-            "a run on the same suite (one that shows goals), or on one of its classes with the same rules, bases and "
-            "objects."
+            "a run on the same suite (one that shows goals), or on one of its classes with the same rules, bases, "
+            "objects and touch."
         )
     return known
 

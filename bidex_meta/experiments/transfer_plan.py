@@ -109,6 +109,8 @@ def suite_file(worlds: Any, name: str, folder: Path) -> Path:
         content["tasks_per_class"] = suite.tasks_per_class
     if suite.points:
         content["points"] = {"count": suite.points, "kinds": suite.point_kinds}
+    if suite.touch:
+        content["touch"] = True
     lines = [f"{key} = {_toml(value)}" for key, value in content.items()]
     text = "\n".join([*lines, "classes = [", *(f"    {_toml(entry)}," for entry in entries), "]\n"])
     path = folder / f"{content['name']}.toml"

@@ -19,6 +19,8 @@ LINEAR_DAMPING, ANGULAR_DAMPING = (501.0, 501.0, 501.0), (2.60, 2.65, 1.12)
 original's 100 per second (docs/figures.md, base)."""
 FORCE_PER_SCALE, TORQUE_PER_SCALE = 100_000.0 / 60.0, 1_000.0 / 60.0
 """N and N m per unit of action and of a class's translation and orientation scale (docs/figures.md, base)."""
+TOUCHED = (*(f"{finger}distal" for finger in FINGERS), "palm", "lfmetacarpal")
+"""Bodies with touch sensors: fingertips, palm, and the little finger's metacarpal, which is the palm's outer edge."""
 DISTAL_PER_MIDDLE = 0.00805 / 0.00705
 """Distal over middle joint angle when the coupling tendon is at rest (docs/figures.md, hand joints)."""
 
@@ -70,6 +72,8 @@ other; all other kinds collide. An object's file marks a geom INNER if a table a
 first, so that tables need not test it."""
 _ALL = RIGHT | LEFT | OBJECT
 _COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: _ALL, FIXTURE: _ALL, INNER: _ALL | INNER}
+_TOUCH_RADIUS = 0.12
+"""Of a touch sensor's site about its body's origin, metres; the palm reaches 0.1 m."""
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}
 
 
@@ -82,10 +86,11 @@ def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
             geom.conaffinity = _COLLIDES[own]
 
 
-def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool) -> None:
+def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool, touch: bool = False) -> None:
     """Add both hands with the start poses of their mounts; names get the prefixes ``right/`` and ``left/``.
 
-    Moving bases are free joints at the centre of mass (damped by ``damp_bases``); others are welded.
+    Moving bases are free joints at the centre of mass (damped by ``damp_bases``); others are welded. With ``touch`` the
+    bodies of ``TOUCHED`` get sensors, e.g. ``right/palm_touch``.
     """
     for side, pose, bit in zip(SIDES, (right, left), (RIGHT, LEFT), strict=True):
         part = hand_spec()
@@ -96,7 +101,18 @@ def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: boo
         base.quat = pose.quaternion
         if moving:
             base.add_freejoint(name="free")
+        if touch:
+            _add_touch(part)
         scene.attach(part, prefix=f"{side}/", frame=scene.worldbody.add_frame())
+
+
+def _add_touch(part: mujoco.MjSpec) -> None:
+    for body in TOUCHED:
+        # Only contacts of the sensor's own body within its site count, and this site encloses each of the bodies.
+        site = part.body(body).add_site(name=f"{body}_touch", size=[_TOUCH_RADIUS] * 3, group=4)
+        part.add_sensor(
+            name=site.name, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name
+        )
 
 
 def damp_bases(model: mujoco.MjModel) -> None:

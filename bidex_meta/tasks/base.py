@@ -99,6 +99,7 @@ class TaskClass(ABC):
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
             class says (fixed only for HandOver).
+        touch: Whether the hands have touch sensors, which the observation shows; ``registry.get`` sets it.
         solver: Settings of the contact solver for this class.
         needs: Maximum number of contacts and of constraint rows in 30,208 states under rough actions, for the fixed
             buffers of mujoco_warp; measured with ``python -m tools.bench capacity --task NAME --steps 30000``. A class
@@ -132,6 +133,7 @@ class TaskClass(ABC):
     chosen: Mapping[str, float | str] = MappingProxyType({})
     blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
+    touch: bool = False
     solver: ClassVar[Solver] = Solver()
     needs: Capacity = Capacity(71, 20, 134)
     camera_target: ClassVar[Point] = (0.0, -0.58, 0.5)
@@ -205,7 +207,7 @@ class TaskClass(ABC):
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
         """Return the values that determine the compiled scene; classes with equal keys may share it."""
-        return self.name, self.moving_base, self.rules
+        return self.name, self.moving_base, self.rules, self.touch
 
     @property
     def observation_size(self) -> int:
@@ -221,7 +223,7 @@ class TaskClass(ABC):
     def layout(self) -> Layout:
         """Return the observation as named blocks: both hands' blocks, then ``blocks``."""
         more = self.wide_blocks if self.rules.wide else ()
-        return Layout((*both_hands(self.moving_base), *self.blocks, *more))
+        return Layout((*both_hands(self.moving_base, self.touch), *self.blocks, *more))
 
     @abstractmethod
     def add_objects(self, scene: mujoco.MjSpec) -> None:

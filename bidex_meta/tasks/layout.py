@@ -6,7 +6,7 @@ from functools import cache, cached_property
 from itertools import chain, product
 
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.hands.hand import FINGERS, SIDES, hand
+from bidex_meta.hands.hand import FINGERS, SIDES, TOUCHED, hand
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Finite, Text
 
@@ -14,8 +14,12 @@ VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
 """Scales of joint and objects' angular velocities, and of forces and torques (docs/figures.md, observation)."""
 CLIP = 5.0
 """Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
+TOUCH_FORCE = 5.0
+"""Normal force that touch entries show as 0.5, N. Fingertips felt 3 to 5 N (median) under random and scripted actions,
+and up to 394 N, so that a linear scale would either clip or hide most contacts."""
 _TIP_STATE = "per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame"
 _TIP_WRENCH = "per distal body: force (10 N), torque (10 N m) at its origin, body frame, no weight"
+_TOUCH = "per fingertip, palm and little finger's metacarpal: normal force f of contacts, f / (f + 5 N)"
 _POSE = "position (m) and quaternion (x, y, z, w), world frame"
 _DIFFERENCE = "object times inverse goal quaternion, (x, y, z, w)"
 
@@ -29,6 +33,7 @@ class Block:
         sensors: Names of the sensors that the block is read from, in order; empty if the entries are computed.
         scale: Factor on the sensors' values.
         goal: Whether the block shows the goal, so that meta suites zero it.
+        saturates: Whether a scaled value x is shown as x / (1 + abs(x)), within (-1, 1).
         description: One line for documentation, with unit and frame.
     """
 
@@ -37,6 +42,7 @@ class Block:
     sensors: tuple[Text, ...] = ()
     scale: Finite = 1.0
     goal: bool = False
+    saturates: bool = False
     description: str = ""
 
 
@@ -85,8 +91,12 @@ class Layout:
         return indices
 
 
-def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
-    """Return one hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
+def hand_blocks(side: str, moving: bool, touch: bool = False) -> tuple[Block, ...]:
+    """Return one hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions).
+
+    With ``touch`` 7 entries follow, those of ``hand.TOUCHED``: the sum f of the normal forces (N) of a body's contacts,
+    shown as f / (f + TOUCH_FORCE), in [0, 1).
+    """
 
     def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
         sensors = tuple(f"{side}/{part}_{kind}" for part, kind in product(parts, kinds.split()))
@@ -108,8 +118,11 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
             Block(f"{side}_base_position", 3, (f"{side}/mount_position",), description="mount origin, world frame, m"),
             Block(f"{side}_base_rotation", 3, description="roll, pitch, yaw of the mount against its start, rad"),
         ]
-    last = Block(f"{side}_action", 26 if moving else 20, description="last actions of this hand, in [-1, 1]")
-    return (*blocks, last)
+    blocks.append(Block(f"{side}_action", 26 if moving else 20, description="last actions of this hand, in [-1, 1]"))
+    if touch:
+        sensors = tuple(f"{side}/{body}_touch" for body in TOUCHED)
+        blocks.append(Block(f"{side}_touch", 7, sensors, 1.0 / TOUCH_FORCE, saturates=True, description=_TOUCH))
+    return tuple(blocks)
 
 
 @checked_arguments
@@ -146,6 +159,6 @@ def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
 
 
 @cache
-def both_hands(moving: bool) -> tuple[Block, ...]:
-    """Return Table 7: 398 entries with moving bases, 374 with fixed bases."""
-    return tuple(chain.from_iterable(hand_blocks(side, moving) for side in SIDES))
+def both_hands(moving: bool, touch: bool = False) -> tuple[Block, ...]:
+    """Return Table 7: 398 entries with moving bases, 374 with fixed bases; 14 more with ``touch``."""
+    return tuple(chain.from_iterable(hand_blocks(side, moving, touch) for side in SIDES))

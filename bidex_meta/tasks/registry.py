@@ -10,6 +10,7 @@ from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.rules import V2, plain_name, versioned_name
 from bidex_meta.utils.arguments import check_attributes
 from bidex_meta.utils.plugins import is_outside, outside_class
+from bidex_meta.utils.validation import true_or_false
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
@@ -73,12 +74,12 @@ def check_object(name: object) -> None:
         raise BidexError(f"object: expected a name other than v2, which stands for a version, got {name!r}. Rename it.")
 
 
-def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
+def get(name: str, moving_base: bool | None = None, touch: bool = False, **options: float | str) -> "TaskClass":
     """Return a task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
 
     ``CatchUnderarm-v2`` has the rules of version 2. ``moving_base`` drives the hands' bases (52 actions) or fixes them
-    (40); None takes the class's own. Options are those of the class, e.g. ``water=30`` for PourWater,
-    ``object="block"`` for CatchUnderarm.
+    (40); None takes the class's own. With ``touch`` observations show touch sensors. Options are those of the class,
+    e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
 
     Raises BidexError if there is no such class or option; the message gives the nearest name and the list.
     """
@@ -95,6 +96,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
             raise unknown_name(f"option of {name}", option, known)
     check_object(options.get("object"))
     made = task_class(moving_base, **options)
+    made.touch = true_or_false("touch", touch)
     made.chosen = {option: parameter.default for option, parameter in known.items()} | options
     if name != plain:
         made.adopt(V2)

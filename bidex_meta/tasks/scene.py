@@ -183,7 +183,7 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     spec.option.cone = task.solver.cone
     spec.option.impratio = task.solver.impratio
     set_contact_bits(spec.geoms, FIXTURE)
-    add_hands(spec, task.right, task.left, task.moving_base)
+    add_hands(spec, task.right, task.left, task.moving_base, task.touch)
     task.add_objects(spec)
     # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
     # million times as large on a few objects, costs nothing.

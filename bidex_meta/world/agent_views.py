@@ -79,11 +79,12 @@ def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, li
     share = num_actions // len(SIDES)
     found = dict[str, list[int]]()
     sizes = {group.name: group.size for group in groups}
-    whole = sum(block.size for block in hand_blocks("right", moving=share > len(hand().actuated)))
-    if any(sizes.get(f"{side}_hand") != whole for side in SIDES):
+    moving = share > len(hand().actuated)
+    whole = [sum(block.size for block in hand_blocks("right", moving, touch)) for touch in (False, True)]
+    if any(sizes.get(f"{side}_hand") not in whole for side in SIDES):
         raise BidexError(
-            f"agents: expected a world that shows each hand as {whole} entries, got {sizes}: its classes have moving "
-            "and fixed bases. Name a suite or a task of one kind."
+            f"agents: expected a world that shows each hand as {whole[0]} entries, or {whole[1]} with touch, got "
+            f"{sizes}: its classes have moving and fixed bases. Name a suite or a task of one kind."
         )
     joints = [hand().joints[i] for i in hand().actuated]
     for number, side in enumerate(SIDES):

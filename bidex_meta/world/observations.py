@@ -15,7 +15,7 @@ from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
 """The observation of a suite: everything; everything and the task's id; everything but the goal."""
-_HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both_hands(moving=True)}
+_HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both_hands(moving=True, touch=True)}
 """By name and not by prefix: ``right_handle_position`` is of an object."""
 
 
@@ -45,6 +45,7 @@ class Observer:
         self._columns = slice(0, sensors), slice(sensors, actions), slice(actions, actions + turns)
         self._source = torch.zeros(width, dtype=torch.int64, device=device)
         self._scale, self._offset = torch.zeros(2, width, device=device).unbind()
+        self._saturating = [where for block, where in self.layout if block.saturates]
         span = torch.as_tensor(hand().high - hand().low).float().to(device)
         middle = torch.as_tensor(hand().high + hand().low).float().to(device)
         for block, where in self.layout:
@@ -111,7 +112,11 @@ class Observer:
         values[:, acted] = action
         if rotation is not None:
             values[:, turned] = rotation.flatten(1)
-        return torch.index_select(values, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
+        shown = torch.index_select(values, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
+        for where in self._saturating:
+            block = shown[:, where]
+            block.div_(1.0 + block.abs())
+        return shown
 
 
 def _indices(scene: Scene, name: str) -> Tensor:

@@ -65,6 +65,8 @@ class EnvRecipe:
     """Points of the cloud in place of objects' states (0: the states), and whether each point has its kind."""
     listed: bool = False
     """True if the suite's file lists the tasks, which may then lie outside of the class's variation space."""
+    touch: bool = False
+    """True if observations show touch sensors."""
 
     @property
     def env_name(self) -> str:
@@ -246,7 +248,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
 @cache
 def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
-    task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
+    name = recipe.class_name or recipe.name
+    task_class = registry.get(name, recipe.moving_base, recipe.touch, **dict(recipe.options))
     task_class.adopt(recipe.rules)
     text = f"{task_class.instruction()}."
     return _Remade(recipe.env_name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})

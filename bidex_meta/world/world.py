@@ -162,6 +162,8 @@ class World(BatchedWorld):
         if self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP:
             self._stepper = CapturedStepper(self._state, self._put_state)
         self._painter = Painter()
+        self.pictures: Tensor | None = None
+        """The last ``info["pixels"]``; None without ``pixels`` and before the first reset."""
         self._renew_draws()
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
@@ -176,7 +178,8 @@ class World(BatchedWorld):
 
     def _with_pixels(self, info: Info) -> Info:
         if self._config.pixels:
-            info["pixels"] = self._painter.pictures(self, self._config.pixels).to(self.device)
+            self.pictures = self._painter.pictures(self, self._config.pixels).to(self.device)
+            info["pixels"] = self.pictures
         return info
 
     def _describe_observations(self, groups: list[Group]) -> None:
@@ -405,6 +408,8 @@ class World(BatchedWorld):
             task = slot.task_class
             made[f"class of {slot.name}"] = f"{type(task).__module__}:{type(task).__qualname__}"
             made[f"moving base of {slot.name}"] = str(task.moving_base)
+            if task.touch:
+                made[f"touch of {slot.name}"] = "on"
             made |= {f"{rule} of {slot.name}": str(value) for rule, value in vars(task.rules).items()}
             made |= {f"{option} of {slot.name}": _option(value) for option, value in task.chosen.items()}
         return made

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -32,6 +33,7 @@ class WorldsConfig:
     task: str | None = None
     base: Base = "own"
     points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
+    touch: bool = False  # True: observations show touch sensors; False: as the suite has it
     object: str | None = None
     tasks_per_class: int | None = None  # train tasks per class of a suite; 0: a new one in each episode or trial
     seed: int = 0  # of starts, and of tasks without ``task_seed``
@@ -79,6 +81,7 @@ class Worlds(ABC):
         self.threads = config.threads
         self.engine = config.engine
         self.points = config.points
+        self.touch = config.touch
         if config.randomisation is None:
             self.randomisation = None
         else:
@@ -170,8 +173,13 @@ V2_PRESET = "v2", "success counts at the end of the episodes, as in version 2"
 
 
 def physics_of(classes: "Mapping[str, TaskClass]") -> str:
-    """Return twelve letters that identify the physics of some classes."""
+    """Return twelve letters that identify the physics of some classes, which touch sensors do not change."""
     from bidex_meta.engine.models import common_identity
     from bidex_meta.tasks.scene import compile_scene
 
-    return common_identity({name: compile_scene(task_class).model for name, task_class in classes.items()})
+    models = {}
+    for name, task_class in classes.items():
+        bare = copy(task_class)
+        bare.touch = False
+        models[name] = compile_scene(bare).model
+    return common_identity(models)

@@ -34,6 +34,8 @@ class Foreign(Worlds):
         super().__init__(name, config)
         if self.randomisation is not None:
             raise BidexError(f"Worlds of our own are randomised, got {name}. Leave --randomisation out.")
+        if config.touch:
+            raise BidexError(f"Touch sensors are of our hands, got {name}. Leave --touch out.")
         if config.tasks_per_class is not None:
             raise BidexError(f"Suites of our own draw their tasks, got {name}. Leave --tasks-per-class out.")
 

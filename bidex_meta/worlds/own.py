@@ -27,6 +27,9 @@ class OwnSuite(Worlds):
         self.suite = load_suite(name).with_train_tasks(config.tasks_per_class)
         if self.points:
             self.suite = replace(self.suite, points=self.points)
+        if self.touch:
+            self.suite = replace(self.suite, touch=True)
+        self.touch = self.suite.touch
         if self.suite.rules.success == "at-end":
             self.preset = V2_PRESET
         self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
@@ -90,7 +93,7 @@ class SingleClass(Worlds):
         if split != "train":
             raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
         named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
-        named |= {"randomisation": self.randomisation}
+        named |= {"randomisation": self.randomisation, "touch": self.touch}
         given = self.class_name, rows or _TASKS_ALONE, self.device, self.seed, mode or "DISABLED", self.threads
         return make_task_world(*given, **named)
 
@@ -102,7 +105,8 @@ class SingleClass(Worlds):
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """See ``Worlds``."""
-        return {self.name: registry.get(self.class_name, self.moving_base, **registry.with_object(self.object))}
+        options = registry.with_object(self.object)
+        return {self.name: registry.get(self.class_name, self.moving_base, self.touch, **options)}
 
     @property
     def rules(self) -> Rules:

@@ -163,6 +163,7 @@ HUMANOID = "run --task gymnasium/Humanoid-v5 --num-envs 4 --device cpu --algo pp
         ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
         ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
         ("run --suite metaworld/MT10 --points 16", "scenes of our own"),
+        ("run --suite metaworld/MT10 --touch", "Touch sensors are of our hands, got metaworld/MT10. Leave --touch"),
         ("run --suite ML1 --algo maml --points 16 --threads 1", "does not read point clouds"),
         *(
             (

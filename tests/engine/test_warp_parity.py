@@ -126,10 +126,11 @@ class Pair:
         return reward
 
 
-def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
+def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu", touch: bool = False) -> Pair:
     """Both engines at the same fresh starts of the classes' tasks; the Warp engine on the given device."""
     world = World(
-        [slot(registry.get(name, True)) for name in names], WorldConfig(rows, autoreset_mode="DISABLED", threads=1)
+        [slot(registry.get(name, True, touch)) for name in names],
+        WorldConfig(rows, autoreset_mode="DISABLED", threads=1),
     )
     world.reset(seed=0)
     (part,) = world.parts

@@ -11,6 +11,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.data.joined import join
@@ -18,6 +19,7 @@ from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.run_data import implied
 from bidex_meta.runs import RunFolder
+from bidex_meta.suite import load_suite
 from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup
@@ -121,19 +123,21 @@ def stored(folder: Path, name: str, episodes: list[Any], tasks: list[str], **abo
     return open_dataset(folder / name)
 
 
-def alone(slot: int, size: int) -> list[Any]:
+def alone(slot: int, size: int, actions: int = 2) -> list[Any]:
     world = opposite_bandits(rows=2)
     found = [e for e in played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.3), 9) if e.task == slot]
     for episode in found:
         object.__setattr__(episode, "task", 0)
         object.__setattr__(episode, "observations", np.repeat(episode.observations[:, :1], size, 1))
+        object.__setattr__(episode, "actions", np.resize(episode.actions, (len(episode), actions)))
     return found
 
 
 def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) -> None:
     both, world = [alone(0, 1), alone(1, 3)], opposite_bandits(rows=2)
     world.single_observation_space = Box(-np.inf, np.inf, (5,), np.float32)  # 3 and the one-hot
-    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0, task_class=None) for i in (0, 1)]  # type: ignore
+    plain = SimpleNamespace(touch=False)
+    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0, task_class=plain) for i in (0, 1)]  # type: ignore
     sets = [
         stored(tmp_path, f"{i}-v0", both[i], [f"task{i}"], reward_scales={f"task{i}": 4.0 * i + 1.0}) for i in (0, 1)
     ]
@@ -222,6 +226,15 @@ def test_a_class_recorded_alone_keeps_its_cloud_in_its_place(tmp_path: Path) -> 
             join([dataset], world, every=False)
 
 
+def test_padding_does_not_hide_that_touch_differs(tmp_path: Path) -> None:
+    suite = replace(load_suite("MT4"), touch=True)
+    worlds = [Benchmark(each).make_world(num_envs=4, device="cpu", threads=1) for each in (suite, "MT4")]
+    for world, touch, told in ((worlds[0], False, "shows no touch"), (worlds[1], True, "shows touch")):
+        seen = stored(tmp_path, f"{touch}-v0".lower(), alone(1, 422 + 14 * touch, 52), ["CatchUnderarm"], touch=touch)
+        with pytest.raises(BidexError, match=f"{told} sensors, the world here"):
+            join([seen], world, every=False)
+
+
 def test_data_sets_imply_what_they_were_recorded_of():
     told = {"suite": None, "task": "CatchUnderarm", "base": "moving"}
     mug, egg = (SimpleNamespace(metadata=told | {"object": n, "points": p}) for n, p in (("mug", 64), (None, 0)))
@@ -235,6 +248,7 @@ def test_data_sets_imply_what_they_were_recorded_of():
     for differs, named in (
         (other(object="mug"), "of CatchUnderarm differ in object: its own and mug. Name the suite .* --suite NAME"),
         (other(points=64), "of CatchUnderarm differ in points: 0 and 64. Name some that were recorded alike"),
+        (other(touch=True), "of CatchUnderarm differ in touch: False and True. Name some that were recorded alike"),
         (other(base="own"), "of CatchUnderarm differ in base: moving and own. .* --task NAME --base BASE"),
         (other(task="Switch"), "are of CatchUnderarm and Switch. Name the suite .* --suite NAME"),
     ):

@@ -77,6 +77,7 @@ NOT_TRUE_OR_FALSE = [value for value in ODD if value is not None and not isinsta
 @pytest.mark.parametrize("name, values", [
     ("moving_base", NOT_TRUE_OR_FALSE),
     ("stagger", NOT_TRUE_OR_FALSE),
+    ("touch", NOT_TRUE_OR_FALSE),
     ("points", [value for value in ODD if type(value) not in (int, np.int64)] + [-1, 10**6]),
     ("task_sampling", [value for value in ODD if value is not None]),
     ("object", [value for value in ODD if value is not None]),

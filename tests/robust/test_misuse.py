@@ -145,7 +145,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "make_task_world": lambda s: (made(make_task_world), {
         "task_name": ("HandOver", ""), **MAKING, "task_sampling": ("fixed", "None"),
         "moving_base": (False, "None true"),
-        "points": (0, "zero one"), "object": (None, "None"),
+        "points": (0, "zero one"), "object": (None, "None"), "touch": (False, "true"),
     }),
     "load_suite": lambda s: (load_suite, {"name_or_path": ("MT4", "")}),
     "load_randomisation": lambda s: (load_randomisation, {"path": (Path("suites/no.toml"), "")}),
@@ -244,7 +244,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     }),
     "TaskEnv": lambda s: (made(TaskEnv), {
         "task_name": ("HandOver", ""), "render_mode": (None, "None"),
-        "seed": (0, SEED + " None"), "device": ("cpu", ""),
+        "seed": (0, SEED + " None"), "device": ("cpu", ""), "touch": (False, "true"),
     }),
     "TaskEnv.reset": lambda s: (s.task_env.reset, {"seed": (0, SEED + " None"), "options": (None, "None dict")}),
     "TaskEnv.step": lambda s: (s.task_env.step, {"action": (np.zeros(40), "")}),
@@ -363,7 +363,7 @@ CALLS: dict[str, Callable[[Shop], Call]] = {
     "VariationSpace.contains": lambda s: (s.space.contains, {"vector": (s.pool[0], " ".join(HOSTILE))}),
     "Block": lambda s: (Block, {
         "name": ("a", "word"), "size": (3, "one"), "sensors": (("a",), ""), "scale": (1.0, NUMBERS + " huge"),
-        "goal": (False, "true"), "description": ("", "empty word"),
+        "goal": (False, "true"), "saturates": (False, "true"), "description": ("", "empty word"),
     }),
     "Layout": lambda s: (Layout, {"blocks": (object_blocks("block"), "")}),
     "Layout.range": lambda s: (s.layout.range, {"name": ("block_pose", "")}),
