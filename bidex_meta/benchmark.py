@@ -230,6 +230,7 @@ class Benchmark:
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
         episodes_per_task: int = 1,
+        deterministic: bool = False,
     ) -> World:
         """Make a batched world of one split.
 
@@ -255,13 +256,15 @@ class Benchmark:
             pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
             episodes_per_task: Consecutive episodes of an environment that play one drawn task, as in a trial
                 (docs/clients.md#trials-as-episodes); 1: as above.
+            deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
+                always does.
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         if split == OTHERS:
             return self.others.make_world(
                 "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels,
-                episodes_per_task
+                episodes_per_task, deterministic
             )  # fmt: skip
         slots = self._slots(self._checked_split(split))
         mode = checked_mode(autoreset_mode)
@@ -289,6 +292,7 @@ class Benchmark:
             num_envs=num_envs,
             device=device,
             engine=engine,
+            deterministic=deterministic,
             seed=seed,
             autoreset_mode=mode,
             observation=self.suite.observation,
@@ -372,6 +376,7 @@ def make_task_world(
     pixels: int = 0,
     task_seed: int | None = None,
     touch: bool = False,
+    deterministic: bool = False,
 ) -> World:
     """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -408,6 +413,7 @@ def make_task_world(
         num_envs=num_envs,
         device=device,
         engine=engine,
+        deterministic=deterministic,
         seed=seed,
         autoreset_mode=mode,
         task_sampling=task_sampling,

@@ -157,6 +157,8 @@ class RunConfig(Generic[LearnerSettings]):
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
     """Physics engine: C MuJoCo (CPU only) or mujoco_warp (CPU or GPU); auto: the faster one on the device."""
+    deterministic: bool = False
+    """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
     processes. A resumed run keeps its number."""

@@ -31,6 +31,7 @@ class BenchFlags:
     threads: Threads | None = None  # Threads of the physics on a CPU; None takes all cores.
     device: Device = "cpu"
     engine: str = "auto"  # auto, c or warp.
+    deterministic: bool = False  # Measure physics that repeats bit for bit on a GPU.
     seed: Seed = 0  # Seed of world and actions.
     json: JsonSwitch = False
 
@@ -49,6 +50,7 @@ def main(arguments: Sequence[str]) -> None:
         threads=flags.threads,
         device=flags.device,
         engine=flags.engine,
+        deterministic=flags.deterministic,
         seed=flags.seed,
     )
     if flags.json:

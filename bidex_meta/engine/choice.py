@@ -11,12 +11,13 @@ ENGINES = ("auto", "c", "warp")
 
 
 def choose_engine(
-    device: str | torch.device, engine: str = "auto", threads: int | None = None
+    device: str | torch.device, engine: str = "auto", threads: int | None = None, deterministic: bool = False
 ) -> tuple[torch.device, EngineMaker]:
     """Return the device and its engine maker; ``threads`` are the threads of C MuJoCo, None takes all CPUs.
 
-    ``engine`` "auto" is C MuJoCo on the CPU, mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing
-    device, C MuJoCo on a GPU, or an impossible number of threads.
+    ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" is C
+    MuJoCo on the CPU, mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing device, C MuJoCo on a
+    GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)
@@ -27,7 +28,7 @@ def choose_engine(
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
         from bidex_meta.engine.warp import WarpEngine  # mujoco_warp takes seconds to import
 
-        return place, lambda models, rows, room: WarpEngine(models, rows, room, device=str(place))
+        return place, lambda models, rows, room: WarpEngine(models, rows, room, str(place), deterministic)
     return place, lambda models, rows, room: CpuEngine(models, rows, threads)
 
 

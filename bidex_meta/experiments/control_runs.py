@@ -70,7 +70,7 @@ def control_runs(
         here = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
         config = replace(stored, device=here, engine=engine)
         worlds = open_worlds(config.to_json())
-        set_up_torch(config.threads)
+        set_up_torch(config.threads, config.deterministic)
         counts = [len(pool) for pool in worlds.tasks("test").values()]
         adaptation = metatest.Adaptation.of(worlds, config)
         of_shot = metatest.rollouts_of(adaptation, rollouts, max(1, num_envs // len(counts)))

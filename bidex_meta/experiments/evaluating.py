@@ -361,7 +361,7 @@ def _set_up(folder: RunFolder, device: str, engine: str, randomisation: str | Pa
     else:
         file = str(randomisation)
     worlds = open_worlds({**config.to_json(), "randomisation": file})
-    set_up_torch(config.threads)
+    set_up_torch(config.threads, config.deterministic)
     return config, worlds
 
 

@@ -266,7 +266,7 @@ def _played(runs: Sequence[_Run], track: Track, episodes: int | None, device: st
         played = []
         for run, of_run in zip(runs, worlds, strict=True):
             say(f"{run.folder.path}: playing {'its own' if name == 'own' else 'new'} tasks.")
-            set_up_torch(run.config.threads)
+            set_up_torch(run.config.threads, run.config.deterministic)
             if track == MULTI_TASK:
                 played.append(_judged(run, of_run[place], episodes, seed))
             else:

@@ -190,7 +190,7 @@ def _begin(
 ) -> _Run:
     """Make the world, the learner and the folder; process 0's folder is that of all processes."""
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
-    set_up_torch(config.threads)
+    set_up_torch(config.threads, config.deterministic)
     kind = learner_kind(config.algo, config.task)
     worlds = open_worlds({**config.to_json(), "device": launch().own_device(config.device)})
     if launch().count > 1:

@@ -87,7 +87,7 @@ def verify(
     then = recorded_conditions(recorded, versions_of(folder), config)
     config = _where(device, engine, then, config)
     worlds = open_worlds(config.to_json())
-    set_up_torch(config.threads)
+    set_up_torch(config.threads, config.deterministic)
     if num_envs is None:
         environments = then.num_envs
     else:

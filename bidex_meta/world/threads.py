@@ -1,5 +1,6 @@
 """Torch's use of the machine: its threads, and memory that it has freed."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -21,9 +22,17 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def set_up_torch(threads: int) -> None:
-    """Give torch this many threads, and the process the memory settings of training."""
+def set_up_torch(threads: int, deterministic: bool = False) -> None:
+    """Give torch this many threads, and the process the memory settings of training.
+
+    With ``deterministic`` torch only takes algorithms that repeat bit for bit on a GPU, from now on.
+    """
     torch.set_num_threads(threads)
+    if deterministic:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a GPU is first used
+        torch.use_deterministic_algorithms(True)
+        # To fill new memory only serves to find faults, and takes time.
+        setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010  # the stubs lack it
     keep_freed_memory()
 
 

@@ -55,6 +55,7 @@ class WorldConfig:
         num_envs: Environments, split evenly over the slots; None: 1024 on the CPU and 8192 on an accelerator.
         device: "cpu", "auto" (CUDA if there is one) or a CUDA device, e.g. "cuda:0".
         engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": the faster one there.
+        deterministic: Make physics on a GPU repeat bit for bit; on a CPU it always does.
         seed: Decides every draw.
         autoreset_mode: SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation), as a
             member or its name.
@@ -77,6 +78,7 @@ class WorldConfig:
     num_envs: int | None = None
     device: str | torch.device = "cpu"
     engine: str = "auto"
+    deterministic: bool = False
     seed: int = 0
     autoreset_mode: str | AutoresetMode | None = None
     observation: Rule = "plain"
@@ -115,7 +117,7 @@ class World(BatchedWorld):
         check_argument("slots", slots, Annotated[Sequence[Slot], Meta(min_length=1)])
         check_argument("config", config, WorldConfig | None)
         self._config = config = config or WorldConfig()
-        device, make_engine = choose_engine(config.device, config.engine, config.threads)
+        device, make_engine = choose_engine(config.device, config.engine, config.threads, config.deterministic)
         names = [slot.name for slot in slots]
         num_envs = checked.num_envs(_DEFAULT_SIZES[device.type] if config.num_envs is None else config.num_envs, names)
         if device.type == "cpu":

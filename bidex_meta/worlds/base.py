@@ -41,6 +41,7 @@ class WorldsConfig:
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
+    deterministic: bool = False  # whether a world on a GPU repeats bit for bit
     randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
 
     @staticmethod
@@ -80,6 +81,7 @@ class Worlds(ABC):
         self.device = config.device
         self.threads = config.threads
         self.engine = config.engine
+        self.deterministic = config.deterministic
         self.points = config.points
         self.touch = config.touch
         if config.randomisation is None:

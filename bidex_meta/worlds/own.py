@@ -48,7 +48,8 @@ class OwnSuite(Worlds):
             pools = self.tasks(split).values()
             rows = max(map(len, pools), default=1) * max(len(pools), 1)
         given = split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine
-        return self.benchmark.make_world(*given, randomisation=self.randomisation or mode is not None)
+        randomisation = self.randomisation or mode is not None
+        return self.benchmark.make_world(*given, randomisation=randomisation, deterministic=self.deterministic)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the names that the file lists, else numbers; see ``Worlds``."""
@@ -93,7 +94,7 @@ class SingleClass(Worlds):
         if split != "train":
             raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
         named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
-        named |= {"randomisation": self.randomisation, "touch": self.touch}
+        named |= {"randomisation": self.randomisation, "touch": self.touch, "deterministic": self.deterministic}
         given = self.class_name, rows or _TASKS_ALONE, self.device, self.seed, mode or "DISABLED", self.threads
         return make_task_world(*given, **named)
 

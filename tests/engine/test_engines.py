@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
@@ -341,6 +342,22 @@ def test_each_world_has_the_numbers_of_its_own_model(scenes: list[Scene]) -> Non
     torch.testing.assert_close(ours_seen, theirs_seen, atol=1e-5, rtol=0)
     apart = (theirs_seen[1:] - theirs_seen[0]).abs().max(dim=1).values
     assert (apart > 1e-3).all(), "the variants differ"
+
+
+def test_a_deterministic_engine_repeats_and_agrees_with_the_usual_one(scenes: list[Scene]) -> None:
+    """On the Warp CPU device every engine repeats; the modes must be asked for, and leave the physics as it is."""
+    models = [scene.model for scene in scenes]
+    plain = WarpEngine(models, range(ROWS), ROOM)
+    first, second = (WarpEngine(models, range(ROWS), ROOM, deterministic=True) for _ in range(2))
+    assert first._m.opt.deterministic == mjw.DeterminismType.ALL and not plain._m.opt.deterministic
+    for engine in (plain, first, second):
+        reset(engine, everyone(), starts(scenes))
+        generator = torch.Generator().manual_seed(3)
+        for _ in range(10):
+            act(engine, generator)
+            engine.step(SUBSTEPS)
+    assert torch.equal(first.qpos, second.qpos) and torch.equal(first.sensordata, second.sensordata)
+    torch.testing.assert_close(first.qpos, plain.qpos, atol=1e-5, rtol=0)
 
 
 def _range(at: slice) -> range:

@@ -1,9 +1,18 @@
 import io
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from bidex_meta.benchmark import Benchmark, make_task_world
+from bidex_meta.cli import main
+from bidex_meta.engine.choice import choose_engine
+from bidex_meta.experiments.policies import checkpoint
+from bidex_meta.runs import RunFolder
 from bidex_meta.world import World
+from bidex_meta.world import world as world_module
+from bidex_meta.worlds import open_worlds
 from tests.world.play import (
     assert_same,
     class_world,
@@ -99,3 +108,58 @@ def test_a_loaded_world_of_other_tasks_continues_bit_for_bit_over_several_episod
     assert number_of_ends(unbroken) >= 10
     world.load_state_dict(kept)  # also into a world that went on
     assert_same(unbroken, play(world, actions[before:]))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("kind", ["suite", "others", "class", "worlds of a suite", "worlds of a class"])
+def test_every_way_to_make_a_world_asks_the_engine_to_repeat(
+    kind: str, deterministic: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def choose(device: str, engine: str, threads: int | None, repeat: bool) -> Any:
+        asked.append(repeat)
+        return choose_engine("cpu", engine, threads)
+
+    monkeypatch.setattr(world_module, "choose_engine", choose)
+    config = {"threads": 1, "deterministic": deterministic}
+    if kind in ("suite", "others"):
+        Benchmark("MT1").make_world({"suite": "train"}.get(kind, kind), 4, "cpu", **config).close()
+    elif kind == "class":
+        make_task_world("HandOver", 4, "cpu", **config).close()
+    else:
+        named = {"suite": "MT1"} if kind.endswith("suite") else {"task": "HandOver"}
+        open_worlds({**named, **config}).world("train", 4).close()
+    assert asked == [deterministic]
+
+
+@pytest.mark.gpu
+def test_a_deterministic_run_on_a_gpu_repeats(tmp_path: Path) -> None:
+    """Two runs of 2,000 steps of each environment, with learning, have equal weights."""
+    digests = []
+    for number in range(2):
+        out = str(tmp_path / str(number))
+        argv = [
+            "run",
+            "--suite",
+            "MT20",
+            "--algo",
+            "mtppo",
+            "--device",
+            "cuda:0",
+            "--num-envs",
+            "400",
+            "--episodes",
+            "0",
+        ]
+        assert main([*argv, "--steps", "800000", "--deterministic", "--logger", "none", "--out", out]) == 0
+        state, _ = checkpoint(RunFolder.open(out))
+        digests.append(content_of(state["learner"]))
+    assert digests[0] == digests[1]
+
+
+def content_of(state: object) -> bytes:
+    """All bits of a learner's state."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
