@@ -9,7 +9,8 @@ from bidex_meta.cli.parsing import Device, RunPaths, parse
 from bidex_meta.cli.tables import Sheet, percent, print_table
 from bidex_meta.errors import EXIT_FAILED, BidexError, shortened
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL
-from bidex_meta.evaluation.leaderboard import AdaptationTrack, read_entry, success_iqm
+from bidex_meta.evaluation.entries import AdaptationTrack
+from bidex_meta.evaluation.leaderboard import read_entry, success_iqm
 from bidex_meta.experiments.submitting import check, submit, submit_agent
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Few

@@ -9,7 +9,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements
 from bidex_meta.evaluation.comparison import run_kind
-from bidex_meta.evaluation.leaderboard import (
+from bidex_meta.evaluation.entries import (
     FORMAT,
     MULTI_TASK,
     SHOTS,
@@ -18,11 +18,13 @@ from bidex_meta.evaluation.leaderboard import (
     AgentEntry,
     Entry,
     Track,
-    agent_part,
     class_row,
+    evaluation_seed,
+)
+from bidex_meta.evaluation.leaderboard import (
+    agent_part,
     content_digest,
     entry_name,
-    evaluation_seed,
     read_entries,
     read_entry,
     sealed,

@@ -10,7 +10,8 @@ import torch
 
 from bidex_meta import BidexError, load_suite, meta_test
 from bidex_meta.agents import TrialAgent
-from bidex_meta.evaluation.leaderboard import AgentEntry, read_entry
+from bidex_meta.evaluation.entries import AgentEntry
+from bidex_meta.evaluation.leaderboard import read_entry
 from bidex_meta.evaluation.trial_agents import AdaptingTrialAgent
 from bidex_meta.runs.evaluations import read_evaluation
 from bidex_meta.suite import Suite

@@ -14,11 +14,8 @@ import pytest
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import leaderboard, statistics
+from bidex_meta.evaluation.entries import FORMAT, AgentEntry, Entry, class_row, evaluation_seed
 from bidex_meta.evaluation.leaderboard import (
-    AgentEntry,
-    Entry,
-    class_row,
-    evaluation_seed,
     improvement,
     profile,
     read_entry,
@@ -125,7 +122,7 @@ def made(kind: str, name: str = "mine", rate: float = 0.5, runs: int = 2, first:
     generator = np.random.default_rng(first)
     weights = [f"{first + number:032x}" for number in range(runs)]
     content: dict[str, Any] = {
-        "format": leaderboard.FORMAT, "name": name, "suite": suite.name, "tuning": {"trials": 12, "seeds": 1},
+        "format": FORMAT, "name": name, "suite": suite.name, "tuning": {"trials": 12, "seeds": 1},
         "track": "reward-only" if adapts else kind, "episodes": 3, "seed": evaluation_seed(weights),
         "new": _part(suite, "test" if adapts else "train", adapts, 1 if kind == "agent" else runs, rate, generator),
         "conditions": {

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from bidex_meta.evaluation import leaderboard as board
-from bidex_meta.evaluation.leaderboard import MULTI_TASK, SHOTS, AnyEntry, Entry
+from bidex_meta.evaluation.entries import MULTI_TASK, SHOTS, AnyEntry, Entry, Track
 from bidex_meta.evaluation.statistics import NONE, iqm
 from tools.pages.tables import table
 
@@ -21,7 +21,7 @@ _LAST = ["runs", "steps", "tuning", "hours", "trained on", "commit"]
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
     """Yield for each track and suite a table of entries, best first, and a table of pairs; ``suite`` "": for all."""
     entries = list(board.read_entries(data.parent / "leaderboard").values())
-    for track in get_args(board.Track):
+    for track in get_args(Track):
         of_track = [entry for entry in entries if entry.track == track and suite in ("", entry.suite)]
         for name in sorted({entry.suite for entry in of_track}):
             ranked = sorted((entry for entry in of_track if entry.suite == name), key=_rank, reverse=True)
