@@ -23,7 +23,7 @@ RUN /opt/bidex-meta/bin/pip install --no-cache-dir -c constraints.txt ".[${EXTRA
 
 FROM ${BASE}
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libegl1 libosmesa6 python3 \
+    && apt-get install --yes --no-install-recommends libegl1 libgl1 libosmesa6 python3 \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --create-home --uid 1000 bidex \
     && chmod 1777 /home/bidex
