@@ -143,9 +143,12 @@ name = "Two"
 version = 2
 kind = "multi-task"
 description = "Observations of two sizes"
-observation = "state"
+observation = "plain"
 task_id = "class"
-reward = "paper"
+reward = "v2"
+variation = "wide"
+success = "at-end"
+starts = "jittered"
 base = "moving"
 tasks_per_class = 2
 classes = [{ name = "TwoCatchUnderarm" }, { name = "HandOver" }]
