@@ -25,7 +25,7 @@ help:
 	@echo "make quick     unit tests in less than a minute"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
-	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
+	@echo "make results   fill the tables and pictures of README.md, docs/pretrained.md and docs/results/ from results/"
 	@echo "make collect, experts, gallery  keep runs as data, look up experts, write docs/tasks.md (ARGS=\"...\" or ARGS=--help)"
 	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"

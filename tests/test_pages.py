@@ -5,8 +5,10 @@ import contextlib
 import importlib
 import importlib.util
 import io
+import os
 import re
 import shlex
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,6 +118,31 @@ def test_command_lines_parse(line: str, page: str, run: Path, folder: Path) -> N
     command = importlib.import_module(COMMANDS[name].module).main
     found = flags_of(command, arguments)
     parse(found.options, arguments, name, found.default)
+
+
+@pytest.mark.parametrize("code, asked", [(0, ""), (2, ""), (138, "requeue 7\n")])
+@pytest.mark.parametrize(
+    "given, started",
+    [
+        ("runs/new --suite MT4-v2", "run --run-dir runs/new --suite MT4-v2"),
+        ("runs/old --suite MT4-v2", "run --resume runs/old"),
+        ("my.toml --workers 8", "sweep my.toml --workers 8"),
+    ],
+)
+def test_the_job_of_a_cluster_resumes_and_is_queued_again(
+    given: str, started: str, code: int, asked: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, body in (("srun", f"echo $@ >> started; exit {code}"), ("scontrol", "echo $@ >> asked")):
+        (folder / name).write_text(f"#!/bin/sh\n{body}\n")
+        (folder / name).chmod(0o755)
+    (folder / "runs" / "old").mkdir(parents=True)
+    (folder / "runs" / "old" / "config.json").touch()
+    (folder / "asked").touch()
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    done = subprocess.run(["bash", "job.sh", *given.split()], check=False)
+    assert done.returncode == (0 if asked else code)
+    assert (folder / "started").read_text() == f"bidex-meta {started}\n" and (folder / "asked").read_text() == asked
 
 
 LINK = re.compile(r"\]\((?!https?://|#)(?P<path>[^)#\s]+)?(?:#(?P<anchor>[^)\s]+))?\)")

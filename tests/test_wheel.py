@@ -1,9 +1,11 @@
 """The wheel, built, installed alone, and used beside folders that bear the names of our rooms."""
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -100,3 +102,19 @@ def test_installed_wheel_runs_beside_decoys(wheel: Path, tmp_path: Path) -> None
     assert where == [path.resolve() for path in expected]
     assert not {ROOT, ROOT / "algos"} & set(sys_path)
     assert (target / "bin" / "bidex-meta").is_file() or (target / "Scripts" / "bidex-meta.exe").is_file()
+
+
+def test_the_container_is_built_from_what_the_wheel_is_built_from() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    dockerfile = (ROOT / "Dockerfile").read_text()
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    packed = {path.split("/")[0] for path in project["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]}
+    assert sent == {*packed, "pyproject.toml", "constraints.txt", "README.md", *project["project"]["license-files"]}
+    (extras,) = re.findall(r"^ARG EXTRAS=(.*)$", dockerfile, re.MULTILINE)
+    assert set(extras.split(",")) <= project["project"]["optional-dependencies"].keys()
+    (command,) = re.findall(r'^ENTRYPOINT \["(.*)"\]$', dockerfile, re.MULTILINE)
+    assert command in project["project"]["scripts"]
+    (base,) = re.findall(r"^ARG BASE=(.*)$", dockerfile, re.MULTILINE)
+    assert re.fullmatch(r"debian:bookworm-slim@sha256:[0-9a-f]{64}", base)
+    users = re.findall(r"^USER (.*)$", dockerfile, re.MULTILINE)
+    assert users and users[-1] not in ("0", "root")

@@ -16,10 +16,11 @@ from typing import Any
 from bidex_meta.errors import BidexError
 
 _VARIABLE = "MUJOCO_GL"
-# Backends that need no screen, in the order they are tried, and the library of each; other values that MuJoCo knows.
-_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+# Backends that need no screen, in the order they are tried, and their libraries; other values that MuJoCo knows.
+# EGL needs libGL too, which Debian's libegl1 does not install. Without libGL not even OSMesa draws after EGL was tried.
+_LIBRARIES = {"egl": ("EGL", "GL"), "osmesa": ("OSMesa",)}
 _OTHERS = {"enable", "enabled", "on", "true", "1", "glfw", "glx", "disable", "disabled", "off", "false", "0"}
-_INSTALL = "(Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
+_INSTALL = "(Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6)"
 _impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine does not have
 
 
@@ -29,7 +30,7 @@ def set_aside_what_is_missing() -> None:
     asked = _asked()
     if not sys.platform.startswith("linux") or "mujoco" in sys.modules or asked in {"", *_OTHERS}:
         return
-    if asked not in _LIBRARIES or find_library(_LIBRARIES[asked]) is None:
+    if asked not in _LIBRARIES or _missing(asked):
         _impossible = os.environ.pop(_VARIABLE)
 
 
@@ -79,11 +80,18 @@ def _reason(attempt: Callable[[], None]) -> str | None:
     return None
 
 
+def _missing(backend: str) -> str:
+    """Return the names of a backend's libraries that this machine does not have."""
+    return ", ".join(f"lib{name}" for name in _LIBRARIES.get(backend, ()) if find_library(name) is None)
+
+
 def _load(backend: str, gl_context: Any) -> None:
     """Install and try a backend in MuJoCo.
 
     After a failure the modules that the backend imported are removed, because they would spoil the next backend.
     """
+    if missing := _missing(backend):
+        raise OSError(f"{missing} is missing")
     before = set(sys.modules)
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:

@@ -4,7 +4,7 @@ import importlib.util
 import os
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -17,6 +17,7 @@ from nbclient import NotebookClient
 from bidex_meta import Benchmark
 from bidex_meta.agents import Timestep
 from bidex_meta.clients.trial_env import TrialWorld
+from bidex_meta.errors import BidexError
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -135,3 +136,59 @@ def test_notebook(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, packages)))
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     assert [shown(cell) for cell in code] == stored
+
+
+SUITE = """
+name = "Two"
+version = 2
+kind = "multi-task"
+description = "Observations of two sizes"
+observation = "plain"
+task_id = "class"
+reward = "v2"
+variation = "wide"
+success = "at-end"
+starts = "jittered"
+base = "moving"
+tasks_per_class = 2
+classes = [{ name = "TwoCatchUnderarm" }, { name = "HandOver" }]
+"""
+
+
+def test_envhub_offers_what_lerobot_calls(tmp_path: Path) -> None:
+    """As `rollout` and `eval_policy` of LeRobot 0.6.1 use an environment."""
+    (tmp_path / "two.toml").write_text(SUITE)
+    module = example("envhub/env")
+    envs = module.make_env(n_envs=2, use_async_envs=True, cfg=SimpleNamespace(task=str(tmp_path / "two.toml")))
+    assert list(envs) == ["Two"] and list(envs["Two"]) == [0, 1]
+    other, env = envs["Two"].values()
+    assert env.single_observation_space == other.single_observation_space
+    assert env.num_envs == 2 and env.unwrapped.metadata["render_fps"] == 60
+    obs, _ = env.reset(seed=[5, 6], options={"lerobot_new_rollout": True})
+    whole, _ = env.env.reset(seed=5)
+    assert env.observation_space.contains(obs)
+    assert obs["agent_pos"].shape == (2, 398) and np.array_equal(obs["agent_pos"], whole[:, :398])
+    assert np.array_equal(obs["environment_state"][:, : whole.shape[1] - 398], whole[:, 398:])
+    assert env.get_attr("task") == ("HandOver-v2",) * 2
+    assert all("palm to the left one" in text for text in env.call("task_description"))
+    with pytest.raises(AttributeError):
+        env.get_attr("_max_episode_length")
+    ended = np.zeros(2, dtype=bool)
+    successes = []
+    for _ in range(env.call("_max_episode_steps")[0]):
+        obs, reward, terminated, truncated, info = env.step(np.zeros((2, 52), dtype=np.float32))
+        ended |= terminated | truncated
+        assert env.observation_space.contains(obs) and reward.shape == (2,)
+        if "final_info" in info:
+            successes += info["final_info"]["is_success"].tolist()
+            assert info["final_info"]["is_success"].tolist() == info["final_info"]["episode"]["success"].tolist()
+        if ended.all():
+            break
+    assert ended.all() and set(successes) <= {True, False}
+    for each in (env, other):
+        each.close()
+
+
+def test_envhub_refuses_a_suite_that_hides_its_goals() -> None:
+    with pytest.raises(BidexError, match=r"shows its goals.*got ML4-v2"):
+        example("envhub/env").make_env(cfg=SimpleNamespace(task="ML4-v2"))

@@ -10,7 +10,7 @@ from bidex_meta.cli import main
 from tests.pages import ROOT
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
-from tools.pages.blocks import fill
+from tools.pages.blocks import fill, filled_pages
 from tools.pages.studies import read_studies
 from tools.pages.tables import arms_table, classes_table
 
@@ -19,9 +19,27 @@ no_weights = test_collect.no_weights
 
 def test_pages_of_the_repository_are_as_its_data_say() -> None:
     """Where this fails: make results."""
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs" / "results").glob("*.md"))]
+    pages = filled_pages(ROOT)
     assert sum("<!-- results:" in page.read_text() for page in pages) >= 2
     assert not [str(path) for page in pages for path in fill(page, ROOT / "results" / "data", check=True)]
+
+
+def test_every_policy_of_the_repository_stands_on_the_page_of_pretrained_policies(tmp_path: Path) -> None:
+    folders = {path.parents[1] for room in ("assets", "results") for path in (ROOT / room).rglob("checkpoints/*.pt")}
+    page = tmp_path / "page.md"
+    blocks = [f"<!-- results: show=pretrained on={on} -->\n<!-- end -->" for on in ("policies", "teachers")]
+    page.write_text("\n".join(blocks))
+    fill(page, ROOT / "results" / "data")
+    rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|") and "bidex-meta" in line]
+    commands = [row[-1].strip("`") for row in rows]
+    assert sorted(commands) == sorted(
+        f"bidex-meta play {folder.relative_to(ROOT)}".replace(" assets/policies/MT20", "") for folder in folders
+    )
+    stored = json.loads((ROOT / "assets" / "policies" / "MT20" / "evaluation.json").read_text())
+    assert percent(rows[0][4]) == pytest.approx(
+        stored["other_tasks"]["policy"]["aggregate"]["success"]["mean"], abs=6e-4
+    )
+    assert {row[4] for row in rows if "ML20-mtppo" in row[-1]} == {"not stored"}
 
 
 def test_every_run_of_the_data_is_read_and_small() -> None:

@@ -34,6 +34,7 @@ def machine(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(gl_backend, "_impossible", None)
     monkeypatch.setattr(gl_context, "GLContext", Broken)
+    monkeypatch.setattr(gl_backend, "find_library", lambda name: f"lib{name}.so")
     gl_backend.prepare.cache_clear()
 
     def make(**backends):
@@ -63,6 +64,22 @@ def test_without_a_screen_egl_comes_first_then_osmesa(machine):
     gl_backend.prepare()
     assert gl_context.GLContext is Works and os.environ["PYOPENGL_PLATFORM"] == "osmesa"
     assert "OpenGL.of_egl" not in sys.modules  # what the failed one imported
+
+
+def test_egl_without_libgl_is_not_tried(machine, monkeypatch):
+    """A failed attempt would leave libraries loaded with which OSMesa does not draw."""
+    machine(egl=Works, osmesa=Works)
+    monkeypatch.setattr(gl_backend, "find_library", lambda name: None if name == "GL" else f"lib{name}.so")
+    gl_backend.prepare()
+    assert os.environ["PYOPENGL_PLATFORM"] == "osmesa" and "OpenGL.of_egl" not in sys.modules
+    gl_backend.prepare.cache_clear()
+    machine(egl=Works)
+    with pytest.raises(BidexError, match=r"egl: libGL is missing.*apt-get install libegl1 libgl1"):
+        gl_backend.prepare()
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.delitem(sys.modules, "mujoco")
+    gl_backend.set_aside_what_is_missing()
+    assert "MUJOCO_GL" not in os.environ, "MuJoCo's import would fail"
 
 
 def test_a_screen_comes_before_both(machine, monkeypatch):

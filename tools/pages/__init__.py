@@ -1,1 +1,1 @@
-"""Generate the tables and pictures of README.md and docs/results from results/data."""
+"""Generate the tables and pictures of README.md, docs/pretrained.md and docs/results from results/data."""

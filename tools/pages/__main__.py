@@ -6,17 +6,17 @@ from pathlib import Path
 
 import tyro
 
-from tools.pages.blocks import fill
+from tools.pages.blocks import fill, filled_pages
 
 
 def main(pages: tyro.conf.Positional[tuple[Path, ...]] = (), check: bool = False) -> None:
     """Fill the marked blocks of pages from results/data and print the files that changed.
 
     Args:
-        pages: Markdown files; default: README.md and docs/results.
+        pages: Markdown files; default: README.md, docs/pretrained.md and docs/results.
         check: Write nothing; exit code 1 if a file is out of date.
     """
-    named = pages or (Path("README.md"), *sorted(Path("docs/results").glob("*.md")))
+    named = pages or filled_pages(Path("."))
     changed = list(chain.from_iterable(fill(page, Path("results/data"), check) for page in named))
     print("\n".join(map(str, changed)) or "nothing changed")
     sys.exit(check and bool(changed))

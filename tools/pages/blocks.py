@@ -24,6 +24,7 @@ from tools.pages.gained import gains_table
 from tools.pages.ladder import ladder_figure, ladder_table, suites_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
+from tools.pages.pretrained import pretrained_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import curves_figure, digest_of, read_studies
 from tools.pages.validity import validity_table
@@ -38,7 +39,11 @@ _TABLES = {
     "offline": offline_table,
     "rows": rows_table,
 }
-_WITHOUT_STUDY = {"validity": validity_table, "leaderboard": leaderboard_table}
+_WITHOUT_STUDY = {
+    "validity": validity_table,
+    "leaderboard": leaderboard_table,
+    "pretrained": pretrained_table,
+}
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),
@@ -58,6 +63,11 @@ class Block:
     show: str = "table"
     on: str | None = None  # Only this suite or class.
     split: str | None = None  # Only this split of meta-tests.
+
+
+def filled_pages(root: Path) -> list[Path]:
+    """List the pages of the repository whose blocks are kept up to date."""
+    return [root / "README.md", root / "docs" / "pretrained.md", *sorted((root / "docs" / "results").glob("*.md"))]
 
 
 def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
