@@ -2,8 +2,8 @@
 
 ``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. A choice suite has two or four tasks, which
 are the same in both splits. Each of the goal's two numbers is small or large: both are equally small or large with two
-tasks, and they vary independently with four. In a ``-shared`` suite both numbers have the same value, anywhere between
-small and large. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on it
+tasks, and they vary independently with four. In a ``-shared`` suite both numbers have the same value, anywhere in the
+class's range. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on it
 shows what adaptation can reach.
 """
 
@@ -12,16 +12,16 @@ from collections.abc import Iterable
 from itertools import product
 from typing import Literal, NamedTuple
 
-_OPENING = ("right_angle", "left_angle", 0.5, 1.2)
-_CLOSING = ("right_angle", "left_angle", 0.18, 0.82)
-CHOICES: dict[str, tuple[str, str, float, float]] = {
+_OPENING = ("right_angle", "left_angle", 0.5, 1.2, (0.3, 1.4))
+_CLOSING = ("right_angle", "left_angle", 0.18, 0.82, (0.0, 1.0))
+CHOICES: dict[str, tuple[str, str, float, float, tuple[float, float]]] = {
     "DoorOpenOutward": _OPENING,
     "DoorOpenInward": _OPENING,
     "DoorCloseOutward": _CLOSING,
     "DoorCloseInward": _CLOSING,
-    "Switch": ("switch1_angle", "switch2_angle", 0.18, 0.48),
+    "Switch": ("switch1_angle", "switch2_angle", 0.18, 0.48, (0.1, 0.5585)),
 }
-"""Classes with choice and shared suites: the two hidden components, and their small and large value, rad."""
+"""Classes with choice and shared suites: the two hidden components, their small and large value, and range, rad."""
 ANY_CLASS = "CLASS"
 """The name of any class in messages."""
 _VARIANTS = ("choice2", "choice4", "shared")
@@ -92,7 +92,7 @@ class OfOneClass(NamedTuple):
         """Return name, split and fixed components of each listed task; none if tasks are drawn."""
         if self.variant == "v2":
             return []
-        first, second, small, large = CHOICES[self.class_name]
+        first, second, small, large, _ = CHOICES[self.class_name]
         if self.variant == "shared":
             return self._shared_tasks()
         values = {"small": small, "large": large}
@@ -104,14 +104,14 @@ class OfOneClass(NamedTuple):
         return tasks
 
     def _shared_tasks(self) -> list[_Task]:
-        """Return tasks evenly spaced between the small and the large value, alternately for training and testing."""
-        first, second, small, large = CHOICES[self.class_name]
+        """Return tasks evenly spaced over the class's range, alternately for training and testing."""
+        first, second, _, _, (lowest, highest) = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
         for number in range(_SHARED_TASKS):
             for split in splits:
                 share = (number + 0.25 + 0.5 * (split == "test")) / _SHARED_TASKS
-                angle = small + share * (large - small)
+                angle = lowest + share * (highest - lowest)
                 tasks.append((f"{split}-{number:02}", split, {first: angle, second: angle}))
         return tasks
 

@@ -41,10 +41,10 @@ def test_a_blind_ceiling_is_not_biased_by_its_choice() -> None:
 
 @pytest.mark.parametrize(
     ("suite", "share"),
-    [("ML1-Switch-choice2", 0.5), ("ML1-DoorOpenOutward-choice4", 0.25), ("ML1-DoorOpenOutward-shared", 0.44)],
+    [("ML1-Switch-choice2", 0.5), ("ML1-DoorOpenOutward-choice4", 0.25), ("ML1-DoorOpenOutward-shared", 0.28)],
 )
 def test_the_ceiling_of_listed_tasks_knows_which_goals_they_have(suite: str, share: float) -> None:
-    """Of 50 angles over 0.7 rad, 22 lie within 0.15 rad of one angle: they are 0.014 rad apart."""
+    """Of 50 angles over 1.1 rad, 14 lie within 0.15 rad of one angle: they are 0.022 rad apart."""
     benchmark = Benchmark(suite)
     (task,) = benchmark.task_classes("test").values()
     tasks = np.stack([each.variation for each in benchmark.test_tasks])
