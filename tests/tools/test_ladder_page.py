@@ -46,12 +46,12 @@ def cells(line: str) -> list[str]:
 
 def learners(shown: float = 0.9, blind: float = 0.1) -> list[Any]:
     runs = []
-    for seed in (0, 1):
-        runs.append(run("ppo", seed, shown + 0.02 * seed, suite=SUITE.replace("ML", "MT")))
+    for seed in (0, 1, 2):
+        runs.append(run("ppo", seed, shown + 0.01 * seed, suite=SUITE.replace("ML", "MT")))
         runs.append(run("ppo", seed, blind))
         runs.append(run("icl", seed, 0.1, 0.8, 0.9))
         runs += [
-            run(name, seed, 0.1, level, level + 0.01 * seed) for name, level in (("a", 0.7), ("b", 0.4), ("c", 0.2))
+            run(name, seed, 0.1, level, level + 0.005 * seed) for name, level in (("a", 0.7), ("b", 0.4), ("c", 0.2))
         ]
     return runs
 
@@ -62,7 +62,7 @@ def test_lines_stand_between_goal_shown_and_blind() -> None:
     rows = [cells(line) for line in lines[4:10]]
     assert [row[0] for row in rows] == [SHOWN, "icl", "a", "b", "c", BLIND]
     assert rows[1][1] == "teachers, rewards of other goals" and rows[2][1] == "own rewards"
-    assert rows[2][2:5] == ["2", "1,000", "2"]
+    assert rows[2][2:5] == ["3", "1,000", "2"]
     assert rows[2][5:9] == ["10 % (10 to 10)", "70 % (70 to 70)", "70.5 % (70 to 71)", ""]
     assert rows[2][-1].startswith(f"{100 * (0.705 - 0.1) / (0.91 - 0.1):.0f} %")
     assert rows[0][-1] == rows[-1][-1] == ""
@@ -96,7 +96,8 @@ def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None
     [
         (learners(shown=0.5), "goal-shown PPO reaches 51%"),
         (learners(blind=0.3), "blind PPO reaches 30%, at most 25%"),
-        (learners()[:4], "0 pairs of reward-only learners"),
+        ([each for each in learners() if each.arm in ("ppo", "a", "b")], "1 pairs of reward-only learners"),
+        (learners()[:12], "Not judged yet: 2 of 3 seeds"),
         ([run("a", 0, 0.1, 0.2, 0.3)], "Not judged yet"),
     ],
 )
@@ -105,10 +106,10 @@ def test_what_a_suite_lacks_is_told(runs: list[Any], told: str) -> None:
 
 
 def test_seeds_that_overlap_are_not_separated_and_hidden_rewards_have_a_column() -> None:
-    runs = [run("a", 0, 0.1, 0.5, 0.5, hidden=0.3), run("a", 1, 0.1, 0.9, 0.9, hidden=0.5)]
-    runs += [run("b", 0, 0.1, 0.4, 0.6), run("b", 1, 0.1, 0.4, 0.2)]
+    runs = [run("a", seed, 0.1, 0.5, level, hidden=level - 0.2) for seed, level in enumerate((0.5, 0.9, 0.7))]
+    runs += [run("b", seed, 0.1, 0.4, level) for seed, level in enumerate((0.6, 0.2, 0.4))]
     lines = table(*runs)
-    assert cells(lines[4])[8] == "40 % (30 to 50)" and cells(lines[5])[8] == ""
+    assert cells(lines[4])[8] == "50 % (30 to 70)" and cells(lines[5])[8] == ""
     assert cells(lines[-1])[-1] == "no"
 
 

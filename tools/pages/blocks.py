@@ -117,7 +117,7 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
         parts = [[study] for study in studies]
     several = len(parts) > 1
     for number, part in enumerate(parts):
-        on = ", ".join(study.on for study in part)
+        on = ", ".join(dict.fromkeys(study.on for study in part))
         if several:
             yield from ["", f"**{on}**", ""] if number else [f"**{on}**", ""]
         if block.show in _TABLES:

@@ -37,6 +37,7 @@ _VALIDITY = {"blind": "blind at best", "named": "named by its start", "identifie
 _GOAL_SHOWN_AT_LEAST = 0.6
 _BLIND_AT_MOST = 0.15
 _PAIRS_AT_LEAST = 3
+_SEEDS_AT_LEAST = 3
 
 
 @dataclass
@@ -197,13 +198,17 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
 
 
 def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:
-    """Yield a row for each pair of reward-only meta-learners; separated: no seed of one reaches a seed of the other."""
-    learners = [name for name, line in lines.items() if line.given == _OWN and name != BLIND]
+    """Yield a row for each pair of reward-only meta-learners with enough seeds.
+
+    Two learners are separated if no seed of one reaches a seed of the other.
+    """
+    judged = [name for name, line in lines.items() if len(line.shares) >= _SEEDS_AT_LEAST]
+    learners = [name for name in judged if lines[name].given == _OWN and name != BLIND]
     for first, second in combinations(learners, 2):
         one = lines[first].last
         other = lines[second].last
         found = crossed_estimate(_better, [one], [other])
-        apart = min(len(one), len(other)) > 1 and bool(one.min() > other.max())
+        apart = bool(one.min() > other.max())
         yield [first, second, found.text(form=".2f"), "yes" if apart else "no"]
 
 
@@ -215,6 +220,8 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
     """Return a sentence that says whether the suite is good by the ladder's rule, and why not."""
     if SHOWN not in lines or BLIND not in lines:
         return "Not judged yet: blind or goal-shown PPO is missing."
+    if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:
+        return f"Not judged yet: {seeds} of {_SEEDS_AT_LEAST} seeds of every learner."
     reasons = []
     shown = float(lines[SHOWN].last.mean())
     blind = float(lines[BLIND].last.mean())
