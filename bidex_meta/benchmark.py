@@ -214,7 +214,10 @@ class Benchmark:
 
     @property
     def padded_size(self) -> int:
-        """Return the size to which observations are padded, before a one-hot: that of the widest class."""
+        """Return the size to which observations are padded: the observation size of the widest class.
+
+        The task id is not counted.
+        """
         return max(task_class.observation_size for task_class in self._classes.values())
 
     def make_world(

@@ -81,7 +81,7 @@ class Learner(Contract):
 
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
-        """Describe the networks' reading of an observation; encoders of observation groups are added here."""
+        """Return how the networks read an observation; encoders of observation groups are added here."""
         if shape.num_id_columns:
             size = vars(config).get("task_embedding", 0)
         else:

@@ -36,7 +36,10 @@ class Joined:
         return len(self.rewards)
 
     def fingerprint(self) -> dict[str, float]:
-        """Return sums by which a checkpoint recognises the data that its run must be resumed with."""
+        """Return checksums of the data.
+
+        A checkpoint stores them, so that its run is only resumed with the same data.
+        """
         parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
         sums = {name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()}
         return {"transitions": len(self), **sums}
@@ -118,7 +121,10 @@ class _Columns(NamedTuple):
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
-        """Return the columns of an observation of ``size`` entries, by groups' names and index ranges."""
+        """Return which columns of an observation with ``size`` entries hold the state, and which hold the point cloud.
+
+        ``groups`` lists the name and the index ranges of each observation group.
+        """
         every = np.arange(size)
         for name, parts in groups:
             if name in POINT_ENTRIES:

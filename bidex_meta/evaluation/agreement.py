@@ -39,10 +39,11 @@ class Agreement:
 def agreements(recorded: Mapping[str, ClassSummary], again: Mapping[str, ClassSummary]) -> list[Agreement]:
     """Compare two evaluations of one policy on the same tasks and starts, by class.
 
-    At worst they are independent samples. So means may differ by the root of the sum of the squares of both half
-    intervals. The limit is widened (Bonferroni) such that one in twenty honest repetitions has any measure of any class
-    beyond the limit. In simulations of twenty classes the rate was one in eighteen with 200 episodes per class, one in
-    fourteen with 60, and one in seven with 20. Raises BidexError if the classes differ.
+    At worst, the two evaluations are independent samples. Their means may therefore differ by the root of the sum of
+    the squares of both half intervals. This limit is widened (Bonferroni) so that in only one of twenty correct
+    repetitions some measure of some class exceeds it. In simulations of twenty classes, the rate was one in eighteen
+    with 200 episodes per class, one in fourteen with 60, and one in seven with 20. Raises BidexError if the classes
+    differ.
     """
     if set(recorded) != set(again):
         raise BidexError(

@@ -153,14 +153,20 @@ def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Inter
 
 
 def success_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in success from the first group; None for the first group and for other classes."""
+    """Return the difference in success from the first group.
+
+    The result is None for the first group, and for groups with other classes.
+    """
     if not _comparable(group, first):
         return None
     return iqm_difference(group.success, first.success)
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in normalised score as :func:`success_over`; None also if either score is unknown."""
+    """Return the difference in normalised score from the first group.
+
+    The result is None in the same cases as in :func:`success_over`, and if either score is unknown.
+    """
     if not _comparable(group, first) or group.scores is None or first.scores is None:
         return None
     return iqm_difference(group.scores, first.scores)

@@ -104,7 +104,10 @@ def mean(sample: np.ndarray) -> np.ndarray:
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the mean of ``a`` minus the mean of ``b`` for each resample, a statistic of :func:`estimate`."""
+    """Return the mean of ``a`` minus the mean of ``b`` for each resample.
+
+    This function can be the ``statistic`` of :func:`estimate`.
+    """
     return mean(a) - mean(b)
 
 

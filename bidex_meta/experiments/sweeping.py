@@ -270,7 +270,10 @@ class QueuedJob(Job):
                 signal.signal(number, handler)
 
     def checkpoint(self) -> Any:
-        """Return the job that submitit queues again, after the run's process has ended."""
+        """Return the job that submitit is to queue again.
+
+        submitit calls this method after the run's process has ended.
+        """
         import submitit
 
         return submitit.helpers.DelayedSubmission(QueuedJob(self.run, self.command))

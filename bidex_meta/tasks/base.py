@@ -252,9 +252,10 @@ class TaskClass(ABC):
         return self.episode_space.size + self.start_draws + (more if self.rules.jittered else 0)
 
     def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Run ``start``, then apply the additions of the suite's rules; ``draws`` are (n, self.draws).
+        """Run ``start``, then apply what the suite's rules add.
 
-        The first draws are those of ``episode_space``, which ``frozen`` contains already.
+        ``draws`` has shape (n, self.draws). Its first columns belong to ``episode_space``; ``frozen`` already contains
+        the values that follow from them.
         """
         draws = draws[:, self.episode_space.size :]
         self.start(draws[:, : self.start_draws], frozen, qpos)

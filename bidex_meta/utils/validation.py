@@ -162,7 +162,10 @@ def _plain(hint: object) -> bool:
 
 
 def _refuse_unknown(content: object, kind: object, where: str, place: str = "") -> None:
-    """Raise BidexError for the first name in a table that is no field of its dataclass, with the nearest field."""
+    """Raise BidexError for the first name in a table that is not a field of the dataclass ``kind``.
+
+    The message suggests the most similar field, or lists all fields.
+    """
     if get_origin(kind) is Annotated:
         _refuse_unknown(content, get_args(kind)[0], where, place)
     elif dataclasses.is_dataclass(kind) and isinstance(content, dict):

@@ -40,7 +40,10 @@ class Slots(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """A step of n environments, before rewards are scaled and broken ones cleaned: (n, d), float32 and bool (n,)."""
+    """One step of n environments, before rewards are scaled and values of broken environments are replaced.
+
+    Observations have shape (n, d) and are float32, as are rewards (n,); flags are bool (n,).
+    """
 
     obs: Tensor
     reward: Tensor

@@ -221,8 +221,9 @@ def own_numbers(
 ) -> None:
     """Raise BidexError if a user's own class returned numbers that are not finite in environments with sound physics.
 
-    ``values`` by name, each (n, ...), belong to these ``rows`` of ``unstable``, which returns the environments with
-    broken physics, bool (num,). Shipped classes are not checked, because their formulas are tested.
+    ``values`` maps names to tensors (n, ...) with one row per environment in ``rows``. ``unstable()`` returns a mask,
+    bool (num,), of all environments with broken physics. Shipped classes are not checked, because their formulas are
+    tested.
     """
     if type(task).__module__.startswith("bidex_meta."):
         return

@@ -108,10 +108,11 @@ class Cloud:
         self._size = len(surfaces.points)
 
     def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Return clouds of n environments, world frame, metres: (n, *shape), float32; zeros if nothing is visible.
+        """Return the clouds of n environments in the world frame, in metres: (n, *shape), float32.
 
-        Fewer visible candidates than points are repeated, of more an even share is taken. Hidden ones change no bit.
-        Positions (n, nbody, 3), metres, and rotation matrices (n, nbody, 3, 3) are of the model's bodies.
+        If there are fewer visible candidates than points, candidates are repeated; if there are more, an evenly spread
+        subset is taken. Hidden candidates do not affect the result. If nothing is visible, the cloud is all zeros.
+        ``position`` (n, nbody, 3), in metres, and ``rotation`` (n, nbody, 3, 3) are those of the model's bodies.
         """
         if position.device.type == "cpu" and len(position) > _CHUNK:
             pairs = zip(position.split(_CHUNK), rotation.split(_CHUNK), strict=True)

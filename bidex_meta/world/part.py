@@ -72,9 +72,10 @@ class Part:
         num_envs: int,
         sights: list[DepthSensor] | None = None,
     ) -> None:
-        """``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are the world's.
+        """Allocate the tensors of the part.
 
-        ``sights``: depth sensor of each of its slots; None: observations show objects' states.
+        ``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are those of the world. ``sights``
+        holds the depth sensor of each slot, or is None if observations show the objects' states.
         """
         self.group = group
         self._engine = group.engine
@@ -199,10 +200,11 @@ class Part:
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Return observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
+        """Return the observations of engine rows without the task id, shape (n, width), float32.
 
-        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a), ``rotation`` what
-        ``base_rotations`` did; ``out`` (n, width) is written into where it is given.
+        ``rows`` are ascending; None stands for all rows. ``states`` and ``rotation`` are the results of ``states()``
+        and ``base_rotations`` for these rows, and ``action`` (n, a) holds their last actions. If ``out`` (n, width) is
+        given, the result is written into it.
         """
         sensors = self._engine.sensordata
         values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)

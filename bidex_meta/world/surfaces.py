@@ -237,9 +237,10 @@ def body_kinds(model: mujoco.MjModel) -> list[float]:
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spread ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
+    """Spread ``count`` points over a model's visible surfaces.
 
-    Raises BidexError for fewer points than visible geoms, or none visible.
+    Hands, objects and fixtures have fixed shares of the points; within each of these groups, points are in proportion
+    to area. Raises BidexError if no geom is visible, or if there are fewer points than visible geoms.
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:

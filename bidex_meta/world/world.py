@@ -235,9 +235,10 @@ class World(BatchedWorld):
         self._stepper.forget()  # recordings hold the old starts and pools
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        """Replace the pools of tasks of some slots, from the next full reset on; see ``PooledWorld``.
+        """Replace the task pools of some slots; see ``PooledWorld``.
 
-        Episodes draw no new tasks from then on.
+        The change takes effect at the next full reset. In a suite with ``tasks_per_class = 0``, episodes then play the
+        tasks of the pools instead of new tasks.
         """
         current = [replace(slot, tasks=tasks) for slot, tasks in zip(self.slots, self.pools, strict=True)]
         self._set_pools(with_pools(current, pools))
@@ -502,7 +503,7 @@ def _with_entries(slot: Slot, env_ids: slice) -> Slot:
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text; of an object's file only the name, because a run may move."""
+    """Return an option of a class as text. For an object's file this is only its name, because folders may move."""
     if isinstance(value, str):
         return Path(value).stem
     return str(value)

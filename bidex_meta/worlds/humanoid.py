@@ -126,9 +126,9 @@ class HumanoidWorld(ForeignWorld):
         return (height > _LOWEST) & (height < _HIGHEST)
 
     def _feel(self, moved: Tensor) -> None:
-        """Compute the external forces on the bodies of the rows of a mask.
+        """Compute the external forces on all bodies, for the environments in a mask.
 
-        MuJoCo's step leaves them out, and Gymnasium reads them after it.
+        MuJoCo's step does not compute these forces, but Gymnasium reads them after a step.
         """
         for row in moved.nonzero()[:, 0].tolist():
             self._engine.batch.get_data(row, self._data)

@@ -250,7 +250,10 @@ class ICL(TrialLearner):
         return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
+        """Return the state as in the base class, with the data set.
+
+        The data set makes its own copy, because a second copy at the same time may not fit in memory.
+        """
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:

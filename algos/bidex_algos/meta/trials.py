@@ -1,7 +1,7 @@
 """Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-A row whose episode is over waits, and its memory does not change. Waiting is not recorded: slot t holds the memory's
-t-th step.
+An environment whose episode is over waits, and its memory does not change. Steps spent waiting are not recorded, so
+index t holds the t-th step that the memory has seen.
 """
 
 from dataclasses import dataclass
