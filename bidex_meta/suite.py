@@ -123,7 +123,7 @@ class Suite:
     """True if observations show touch sensors of both hands."""
 
     def __post_init__(self) -> None:
-        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
+        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite with other rules."""
         object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
 
     @property
@@ -173,7 +173,7 @@ class Suite:
     def with_train_tasks(self, count: int | None) -> "Suite":
         """Return the suite with another ``train_tasks``; None leaves the suite unchanged.
 
-        Raises BidexError if a class lists its tasks, or the count is no whole number from 0 to a million.
+        Raises BidexError if a class lists its tasks, or the count is not an integer from 0 to a million.
         """
         if count is None:
             return self

@@ -102,7 +102,7 @@ def gathered(
 
 
 def check_touch(dataset: Dataset, touch: bool) -> None:
-    """Raise BidexError unless a data set shows touch sensors as a world does: ``touch`` says whether.
+    """Raise BidexError unless a data set and a world both show touch sensors (``touch``), or neither does.
 
     Padding would hide the different widths.
     """
@@ -165,7 +165,7 @@ class _Form:
                 self._factors[number] = theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0)
 
     def _check_observations(self, may_pad: bool) -> None:
-        """Raise BidexError for other clouds or state sizes; with ``may_pad`` the world's states may be wider."""
+        """Raise BidexError if clouds or state sizes differ; with ``may_pad`` the world's states may be wider."""
         name = self.dataset.name
         own = self._own
         theirs = self._theirs
@@ -204,7 +204,7 @@ class _Form:
 
 
 def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
-    """Yield the world's slot of each name."""
+    """Yield, for each name, the world's slot of this name."""
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)
         return

@@ -1,4 +1,4 @@
-"""Room for contacts and constraints, which mujoco_warp allocates once at the start."""
+"""Buffer sizes for contacts and constraints, which mujoco_warp allocates once at the start."""
 
 import math
 from collections.abc import Sequence

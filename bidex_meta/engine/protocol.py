@@ -55,7 +55,7 @@ class Engine(Protocol):
         ...
 
     def warnings(self) -> Tensor:
-        """Return the number of kinds of warnings of each simulation since its last reset. Shape (num,), int64."""
+        """Return how many kinds of warnings each simulation has raised since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:

@@ -87,7 +87,7 @@ def _rounding(value: float) -> float:
 
 
 def _half(interval: Interval | None) -> float:
-    """Return half the width of an interval, 0 without one: a single episode says nothing of other episodes."""
+    """Return half the width of an interval, or 0 if there is none because there is only one episode."""
     if interval is None:
         return 0.0
     low, high = interval

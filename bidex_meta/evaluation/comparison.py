@@ -177,7 +177,7 @@ def _comparable(group: Group, first: Group) -> bool:
 
 
 def scored_classes(run: Run) -> dict[str, ClassSummary]:
-    """Return the ``results`` of the run's evaluation, with scores by the present references."""
+    """Return the ``results`` of the run's evaluation, with scores computed from the installed references."""
     config = run.config()
     evaluation = run.evaluation()
     if isinstance(evaluation, PolicyEvaluation):

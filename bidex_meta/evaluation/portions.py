@@ -25,8 +25,8 @@ def task_of_row(world: TaskWorld) -> Tensor:
 class Portions:
     """Groups of adaptations that are played together, to the first ``tasks`` of each pool (None: all), in all trials.
 
-    ``rollouts`` is the number of episodes of each task in a shot; None: one in each environment of the task, with all
-    tasks at once. All numbers are at least 1. The world is not changed.
+    ``rollouts`` is the number of episodes of each task in a shot; None stands for one episode in each environment of
+    the task, with all tasks at once. All numbers are at least 1. The world is not changed.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:

@@ -15,9 +15,9 @@ _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
 def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
-    """Return what an evaluation's numbers depend on besides the policy: ``conditions`` of ``evaluation.json``.
+    """Return the conditions, besides the policy, that an evaluation's numbers depend on, as in ``evaluation.json``.
 
-    ``num_envs`` is the number of environments that was asked for; None: the default.
+    ``num_envs`` is the requested number of environments; None stands for the default.
     """
     wanted = [*_PACKAGES]
     identity: Json = worlds.identity()

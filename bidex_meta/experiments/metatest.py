@@ -143,7 +143,7 @@ def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Return the number of environments that plays as many adaptations of each class at once as possible.
+    """Return the number of environments with which the largest number of adaptations is played at once.
 
     There are ``adaptations`` (tasks times trials) per class. Each takes ``rollouts`` environments, or several rounds in
     fewer environments. ``limit`` is the maximum number of environments, but each class gets at least one.

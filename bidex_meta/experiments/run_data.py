@@ -25,7 +25,7 @@ _FORM = ("suite", "task", "base", "object", "points", "touch")
 
 
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
-    """Our entry in the metadata of a data set of a world of some source, and ``more``; all ready for JSON.
+    """Return our entry in a data set's metadata, with the items of ``more``, ready for JSON.
 
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``touch``, whether observations show

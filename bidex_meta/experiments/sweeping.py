@@ -241,7 +241,7 @@ class QueuedJob(Job):
     """A job of a batch system, which is queued again if its time is up before the run's end.
 
     The batch system's signal arrives while this job waits for the run's process. A handler that waited for the same
-    process would block forever. Our handler therefore only tells the run to save and end; submitit's handler is called
+    process would block forever. Our handler therefore only asks the run to save and end; submitit's handler is called
     after the run has ended.
     """
 

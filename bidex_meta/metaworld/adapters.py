@@ -30,7 +30,7 @@ class ForMetaWorld:
     """Adapts one of our agents to ``metaworld.evaluation``, which passes and expects NumPy arrays.
 
     ``agent`` is an Agent for ``evaluation``, or a MetaLearningAgent for ``metalearning_evaluation``. ``task_of_row``
-    numbers the task of each environment from 0 on; if it is None, each environment has its own task.
+    holds each environment's task number (0, 1, ...); if it is None, each environment has its own task.
     """
 
     @checked_arguments

@@ -56,7 +56,7 @@ class Checkpoints:
     def room(self, size: int) -> Iterator[None]:
         """Reserve ``size`` bytes for the first checkpoint until it is saved, so that saving cannot fail.
 
-        Raises BidexError if there is no such room.
+        Raises BidexError if there is not enough space.
         """
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)

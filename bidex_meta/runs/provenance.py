@@ -2,7 +2,7 @@
 
 A record is ``versions.json`` of a run, ``conditions`` of an evaluation, or the present installation and suite:
 ``packages`` (versions by name), ``physics``, ``suite_version`` and ``suite_digest``. An entry that only one of two
-records has is no difference.
+records has does not count as a difference.
 """
 
 from collections import defaultdict

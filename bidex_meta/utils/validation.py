@@ -102,7 +102,7 @@ def parse(content: object, kind: type[Kind], where: str, exact: bool = False) ->
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
     """Return an argument of any integer type as an int within bounds.
 
-    Raises BidexError if it is no whole number (1.0, True and "1" are none), or out of bounds.
+    Raises BidexError if it is not an integer (1.0, True and "1" are not), or out of bounds.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]

@@ -169,7 +169,7 @@ def frames(
 ) -> Iterator[np.ndarray]:
     """Yield pictures (height, width, 3) uint8 of a witness.
 
-    ``at`` lists the numbers of steps after which to draw, from 0 on; None: after each.
+    ``at`` lists the step numbers (0, 1, ...) after which a picture is drawn; None stands for every step.
     """
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):

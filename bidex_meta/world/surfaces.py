@@ -33,7 +33,7 @@ def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
 
 
 def area(model: mujoco.MjModel, geom: int) -> float:
-    """Return the area of a geom's surface, m²; for an ellipsoid to 1.1 % (Thomsen's formula)."""
+    """Return the area of a geom's surface, m²; for an ellipsoid the error is up to 1.1 % (Thomsen's formula)."""
     a, b, c = (float(x) for x in model.geom_size[geom])
     p = 1.6075
     kind = int(model.geom_type[geom])

@@ -1,6 +1,6 @@
 """The batched world of hands: all environments of a suite, stepped together.
 
-The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
+An observation is made in these steps: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
 ``TaskClass.observe`` (goal blocks) -> ``World._write_ids`` (task id) -> the learner's network.
 """
 
@@ -112,7 +112,8 @@ class World(BatchedWorld):
     def __init__(self, slots: Sequence[Slot], config: WorldConfig | None = None) -> None:
         """Build the world of some task classes with their pools of tasks; no episode is started before ``reset``.
 
-        Raises BidexError for fewer environments than slots, an unknown device, engine or mode, or too narrow a padding.
+        Raises BidexError for fewer environments than slots, an unknown device, engine or mode, or padding that is too
+        narrow.
         """
         check_argument("slots", slots, Annotated[Sequence[Slot], Meta(min_length=1)])
         check_argument("config", config, WorldConfig | None)
@@ -377,7 +378,7 @@ class World(BatchedWorld):
             obs[:, -self.num_id_columns :] = self._one_hot
 
     def check_formulas(self) -> None:
-        """Raise BidexError if a class of the user's own gives numbers that are not finite in the present state.
+        """Raise BidexError if a user's own class returns numbers that are not finite in the present state.
 
         On the CPU every step and reset checks this. On a GPU the check would stall each step; a learner calls it when
         its loss is no longer finite.
@@ -433,7 +434,7 @@ class World(BatchedWorld):
 
     @property
     def randomised(self) -> dict[str, Tensor]:
-        """Factors, and the delay in control steps, drawn for the running episodes, each (num_envs,)."""
+        """Factors and the delay in control steps that were drawn for the running episodes, each (num_envs,)."""
         if self._randomiser is None:
             return {}
         return {name: value.clone() for name, value in self._randomiser.drawn.items()}
@@ -455,7 +456,7 @@ class World(BatchedWorld):
         return [pools[slot] for slot in range(self.num_tasks)]
 
     def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
-        """Return in a sentence what a task of a slot asks for, without what the world hides; None: the class."""
+        """Return in a sentence what a task of a slot (None: the class) asks for, without what the world hides."""
         return self.slots[slot].task_class.instruction(variation, self.hides_goals)
 
     def instructions(self) -> list[str]:
@@ -498,7 +499,7 @@ class World(BatchedWorld):
 
 
 def _with_entries(slot: Slot, env_ids: slice) -> Slot:
-    """Return the slot with as many tasks in its pool as it has environments."""
+    """Return the slot with a pool that has one task per environment."""
     return replace(slot, tasks=slot.tasks[np.arange(env_ids.stop - env_ids.start) % len(slot.tasks)])
 
 

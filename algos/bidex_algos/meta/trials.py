@@ -88,7 +88,7 @@ class Player(Protocol):
     """Chooses the actions in a trial."""
 
     def begin(self, shown: Tensor) -> None:
-        """Begin an episode in all environments; ``shown`` (N,) tells in which ones the policy sees rewards."""
+        """Begin an episode in all environments; ``shown`` (N,) marks those in which the policy sees rewards."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return unclamped actions (N, a) for raw observations (N, d), and the memory's next state (N, memory).
