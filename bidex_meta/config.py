@@ -210,7 +210,7 @@ class RunConfig(Generic[LearnerSettings]):
     def goal(self, last: Mapping[str, Json]) -> int:
         """Return the steps that a run trains for.
 
-        These are the steps of its last metrics if time or a metric ended it, else ``steps``.
+        These are the steps of the last metrics if time or a metric ended the run, otherwise ``steps``.
         """
         if self.minutes is not None or self.early_end(last):
             return last["step"]

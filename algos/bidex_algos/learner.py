@@ -109,7 +109,7 @@ class Learner(Contract):
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
     def iterate(self) -> dict[str, float]:
-        """Collect experience, learn from it and return metrics; a FloatingPointError if a loss is not finite."""
+        """Collect experience, learn from it and return metrics; raise FloatingPointError if a loss is not finite."""
         started = time.perf_counter()
         steps = self.env_steps
         self._collected = 0.0

@@ -130,7 +130,7 @@ def _needed(columns: Sequence[_Column]) -> int:
 
 
 def _widths(columns: Sequence[_Column], width: int) -> list[int]:
-    """Return the columns' widths: the least widths, plus the room left, which goes to the most wrapped columns."""
+    """Return the columns' widths: the least widths; the remaining width goes to the most wrapped columns."""
     widths = [column.least for column in columns]
     wanted = [max(map(len, [*column.cells, column.header]), default=1) for column in columns]
     for _ in range(width - _needed(columns)):

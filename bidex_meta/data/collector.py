@@ -274,7 +274,10 @@ class RunCollector(EpisodeCollector):
 
 
 def spread_environments(world: VectorWorld, share: float) -> list[int]:
-    """Return a share, above 0 (1 or more: all), of a world's environments, evenly over slots, at least one per slot."""
+    """Return a share, above 0, of a world's environments, evenly over slots and at least one per slot.
+
+    A share of 1 or more returns all environments.
+    """
     chosen: list[int] = []
     slots = world.task_id.tolist()
     for slot in range(world.num_tasks):

@@ -135,7 +135,7 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """Converts a data set's episodes to a world's form; ``slots`` are the world's, ``plain`` excludes the one-hot."""
+    """Converts a data set's episodes to a world's form; the world has ``slots``; ``plain`` excludes the one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset = dataset

@@ -51,7 +51,7 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Return which simulations broke since their reset (bad numbers or no room for contacts), bool (num,)."""
+        """Return which simulations broke since their reset (bad numbers or too many contacts), bool (num,)."""
         ...
 
     def warnings(self) -> Tensor:

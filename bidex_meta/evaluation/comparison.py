@@ -53,7 +53,7 @@ class Group:
 def read_groups(runs: Sequence[Run]) -> list[Group]:
     """Return evaluated runs by group, in the order they are named.
 
-    Raises BidexError if one is not evaluated, two are the same, or a group's seeds cover different classes.
+    Raises BidexError if a run is not evaluated, two runs are the same, or a group's seeds cover different classes.
     """
     kinds = [run_kind(run.config(), run.evaluation().split) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
@@ -137,7 +137,7 @@ def _check_copies(runs: Sequence[Run]) -> None:
 
 
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
-    """Return the content of a picture of groups: per title the label, interquartile mean and interval of each group."""
+    """Return the content of a picture of groups, by title: label, interquartile mean and interval of each group."""
     pictured: dict[str, list[tuple[str, float, Interval | None]]] = {}
     for group in groups:
         for title, values, factor in (("success, IQM (%)", group.success, 100.0), ("score, IQM", group.scores, 1.0)):

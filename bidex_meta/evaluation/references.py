@@ -87,7 +87,10 @@ def store(path: Path, classes: dict[str, Json], made: Json) -> None:
 
 
 def load_from(path: Path) -> dict[str, Json]:
-    """Read the references in a file by class; empty without a file. Raises BidexError for a file of something else."""
+    """Read the references in a file by class; return an empty dict without a file.
+
+    Raises BidexError if the file does not hold references.
+    """
     if not exists(path):
         return {}
     try:

@@ -59,7 +59,7 @@ class ClassResult:
         return self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
-        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` of few tasks.
+        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` if tasks are few.
 
         Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """

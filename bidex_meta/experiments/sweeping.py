@@ -167,9 +167,10 @@ def state_of(run: PlannedRun) -> State:
 
 
 def hours_left(states: Sequence[State]) -> list[float]:
-    """Return the hours that each run still trains, NaN where no run tells a speed.
+    """Return the hours that each run still trains, or NaN if no run has a known speed.
 
-    The speed is the run's own, else the mean over the runs on its suite, else the mean over all runs.
+    The speed is that of the run itself if known, otherwise the mean over the runs on its suite, otherwise the mean over
+    all runs.
     """
     speeds = [(state.run.subject, state.speed) for state in states if state.speed]
     hours = []

@@ -112,7 +112,7 @@ def _keep(path: Path, lines: Sequence[bytes]) -> None:
 
 
 def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
-    """Return every line that is not empty, and its numbers by name, None if unreadable; the file may be missing."""
+    """Return every line that is not empty with its numbers by name (None if unreadable); the file may be missing."""
     if missing and not exists(path):
         return []
     lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")

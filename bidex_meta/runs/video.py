@@ -37,7 +37,7 @@ def write_image(path: Path, frame: np.ndarray) -> None:
 
 
 def film_suffix() -> str:
-    """Return the default suffix of a film: .mp4 if MP4 can be written, else .webp."""
+    """Return the default suffix of a film: .mp4 if MP4 can be written, otherwise .webp."""
     if find_spec("imageio_ffmpeg"):
         return ".mp4"
     return ".webp"

@@ -181,7 +181,7 @@ class TaskClass(ABC):
         self._order = [drawn.index(name) for name in self.wide_space.names]
 
     def varied(self, shares: Tensor) -> Tensor:
-        """Return variations (n, variation_space.size) at shares in [0, 1), (n, at least this size), of the space."""
+        """Return the variations (n, variation_space.size) at the given shares, in [0, 1), of the variation space."""
         space = self.variation_space
         low = constant(space.low, shares)
         high = constant(space.high, shares)
@@ -276,7 +276,7 @@ class TaskClass(ABC):
             joints.copy_(torch.where(meets[:, None], steady[side], joints))
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, tuple[float, float, float]]]:
-        """Return boxes so close to a hand that joint noise might push its fingers into them; none by default.
+        """Return boxes so close to a hand that joint noise might push fingers into them; empty by default.
 
         Each entry is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A
         hand that noise would push into its box starts without noise.
@@ -284,7 +284,7 @@ class TaskClass(ABC):
         return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the layout's blocks that no sensor gives, by name, each (n, size); none by default."""
+        """Return the layout's blocks that sensors do not give, by name, each (n, size); empty by default."""
         return {}
 
     @abstractmethod
@@ -300,7 +300,7 @@ class TaskClass(ABC):
         raise NotImplementedError
 
     def hides(self) -> tuple[Hidden, ...]:
-        """Return the parts of a task that only goal entries show, with success tolerances; none by default."""
+        """Return the parts of a task that only goal entries show, with success tolerances; empty by default."""
         return ()
 
     def hidden_columns(self) -> list[int]:
@@ -315,7 +315,7 @@ class TaskClass(ABC):
     def instruct(self, goal: Mapping[str, float] | None) -> str:
         """Return what a task asks for as a sentence without a full stop; ``summary`` by default.
 
-        ``goal`` holds the components of ``hides`` by name. None: the sentence must not say what they are.
+        ``goal`` holds the components of ``hides`` by name. If it is None, the sentence must not reveal them.
         """
         return self.summary
 
@@ -345,7 +345,7 @@ class TaskClass(ABC):
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals to draw in pictures of a state; none by default. Suites that hide goals draw none."""
+        """Return the goals to draw in pictures of a state; empty by default. Suites that hide goals draw no goals."""
         return []
 
     def __repr__(self) -> str:

@@ -35,7 +35,7 @@ class AgentView:
         return tuple(sorted(columns))
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
-        """Return the groups as they stand in its own observation, which is :attr:`columns` side by side."""
+        """Return the observation groups by their places in the agent's own observation (:attr:`columns`)."""
         index = {column: i for i, column in enumerate(self.columns)}
         parts = [(slice(index[part.start], index[part.stop - 1] + 1) for part in group.where) for group in self.groups]
         return tuple(ObservationGroup(g.name, _joined(where)) for g, where in zip(self.groups, parts, strict=True))

@@ -146,7 +146,7 @@ def make_meta_policy(
 
 
 class MetaLearner(Learner):
-    """Learns parameters from which one gradient step on a task's own data improves much; runs in one process."""
+    """Learns parameters that one gradient step on a task's own data improves strongly; runs in one process."""
 
     world: PooledWorld
     config: OuterConfig

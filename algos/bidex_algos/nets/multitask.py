@@ -278,8 +278,8 @@ class Towers(Headed):
 class Transformer(Headed):
     """One token per group of the observation; every token attends to all (Vaswani et al. 2017, arXiv 1706.03762).
 
-    Each entry of ``hidden`` adds a block with ``modules`` attention heads; all entries are one width. Tokens are
-    normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745), independent of ``layer_norm``. The
+    Each entry of ``hidden`` adds a block with ``modules`` attention heads; all entries must be the same width. Tokens
+    are normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745), independent of ``layer_norm``. The
     output layer reads the mean of the tokens.
     """
 

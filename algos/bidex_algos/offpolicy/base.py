@@ -73,7 +73,7 @@ class OffPolicyConfig(NetworkConfig):
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Returns of a task fade after ``horizon`` newer ones. ``gamma`` is a number, or one per environment (N,).
+    Returns of a task are forgotten after ``horizon`` newer returns. ``gamma`` is a number, or one per environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
