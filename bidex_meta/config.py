@@ -231,7 +231,7 @@ def read_config(path: Path) -> RunConfig[JsonObject]:
 
 
 def config_of(content: object, where: str) -> RunConfig[JsonObject]:
-    """Return a run's config from what a file holds; ``where`` is for messages. Raises BidexError if it is none."""
+    """Return a run's config from a file's content; raise BidexError, which names ``where``, if it is not a config."""
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
         raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")

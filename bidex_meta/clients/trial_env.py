@@ -104,7 +104,7 @@ class TrialWorld(PooledWorldWrapper):
         return self.world.episodes.number % self.episodes_per_task
 
     def _forget(self, mask: Tensor) -> None:
-        """Begin trials in the environments of a mask; what the previous trials have shown is erased."""
+        """Begin trials in the environments of a mask; forget what the previous trials have shown."""
         self._clock.begin(mask)
         self._last = self._last.masked_fill(mask[:, None], 0.0)
         if not self._sums:

@@ -43,7 +43,7 @@ class CpuEngine(Engine):
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Build the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
+        """Build the batch; ``rows`` gives each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
         if refresh:
             self._after_step = mujoco.mjtStage.mjSTAGE_VEL

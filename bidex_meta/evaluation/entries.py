@@ -140,7 +140,7 @@ class _Listed:
         return {"new": self.new}
 
     def summaries(self) -> dict[str, ClassSummary]:
-        """Return what a repetition compares: the results of each run, part, shot and class. They have no returns."""
+        """Return the results, without returns, that a repetition compares: of each run, part, shot and class."""
         found = {}
         for where, part, shot, name, row in self._rows():
             episodes = self.episodes * part.trials

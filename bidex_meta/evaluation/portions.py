@@ -23,7 +23,7 @@ def task_of_row(world: TaskWorld) -> Tensor:
 
 
 class Portions:
-    """Groups of adaptations that are played together, to the first ``tasks`` of each pool (None: all), in all trials.
+    """Groups of adaptations, to the first ``tasks`` of each pool (None: all) in all trials, that are played together.
 
     ``rollouts`` is the number of episodes of each task in a shot; None stands for one episode in each environment of
     the task, with all tasks at once. All numbers are at least 1. The world is not changed.

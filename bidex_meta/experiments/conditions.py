@@ -32,7 +32,7 @@ def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
 
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
-    """Return how a run's record differs from this installation and the run's own worlds, here ``worlds`` if known."""
+    """Return how a run's record differs from this installation and the run's own worlds (``worlds`` if known)."""
     return differences(versions_of(folder), conditions(worlds or open_worlds(folder.config().to_json())))
 
 

@@ -131,9 +131,9 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
 
 
 def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
-    """Return the number of episodes of each task in a shot: as asked, else the default.
+    """Return the number of episodes of each task in a shot: the requested number, or the default.
 
-    ``most`` is the largest number of environments of a class. An environment that only adapts from its own episodes
+    ``most`` is the largest number of environments of a class. An environment that adapts only from its own episodes
     plays one episode in a shot, so there are no more episodes than environments.
     """
     rollouts = asked or adaptation.rollouts

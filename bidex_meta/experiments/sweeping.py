@@ -74,7 +74,7 @@ class SweepResult:
 def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = None) -> SweepResult:
     """Train the unfinished runs of a plan, each in a separate process, and evaluate each run at its end.
 
-    A call after an interruption goes on where the last call stopped. After Ctrl-C each run saves and stops.
+    A call after an interruption continues where the last call stopped. After Ctrl-C each run saves and stops.
 
     Args:
         plan: ``SweepPlan.of(folder, configs)``, or ``SweepPlan.read(file)`` for a study file.
@@ -239,7 +239,7 @@ class Job:
 
 
 class QueuedJob(Job):
-    """A job of a batch system, which is queued again if its time is up before the run's end.
+    """A job of a batch system, which is queued again if its time is up before the run ends.
 
     The batch system's signal arrives while this job waits for the run's process. A handler that waited for the same
     process would block forever. Our handler therefore only asks the run to save and end; submitit's handler is called

@@ -92,7 +92,7 @@ class BatchedWorld(VectorEnv, ABC):
         stagger: bool,
         seed: object,
     ) -> None:
-        """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds what it steps.
+        """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds its own simulation.
 
         ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation);
         with ``stagger`` first episodes begin at a random elapsed step (not in DISABLED). Raises BidexError for fewer
@@ -305,7 +305,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment: its own entry if there is one for each, else the world's value."""
+        """Return an attribute for each environment: its entry if there is one per environment, or the world's value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:

@@ -149,7 +149,7 @@ class Starts:
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
-        """Return where in their spaces the new tasks of episodes (k,) lie, in [0, 1), (k, size); None: none are new."""
+        """Return shares (k, size), in [0, 1), that place the new tasks of episodes (k,) in their spaces, or None."""
         if self._task_keys is None:
             return None
         return uniform(self._task_keys[env_ids], episode // self._episodes_per_task, self._task_size)

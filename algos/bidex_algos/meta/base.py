@@ -56,7 +56,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; those of one task adapt together. None: each adapts by itself."""
+        """Set the task (N,) of each environment; environments of a task adapt together (None: each one separately)."""
         if task_of_row is None:
             self.rows = None
         else:

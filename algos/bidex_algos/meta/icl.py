@@ -73,7 +73,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); teachers that know it label."""
+    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); its teachers know the task."""
 
     name = "icl"
     remedy = "lower learning_rate"

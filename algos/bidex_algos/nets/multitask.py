@@ -16,7 +16,7 @@ from bidex_meta.utils import maths
 
 
 class StackedLinear(nn.Module):
-    """``count`` (K) parallel linear layers of one form, with orthogonal weights of a ``gain`` and zero biases."""
+    """``count`` (K) parallel linear layers of the same size, with orthogonal weights of a ``gain``, zero biases."""
 
     def __init__(
         self, count: int, inputs: int, outputs: int, gain: float, generator: torch.Generator, bias: bool = True

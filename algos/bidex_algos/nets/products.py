@@ -44,7 +44,7 @@ def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Apply layers of one form to a batch each: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
+    """Apply K layers, each to its own batch: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
     if _pays(x[0], weight[0]):
         if bias is None:
             biases = [None] * len(x)

@@ -254,7 +254,7 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """Take one step of the named optimisers down ``loss`` summed over processes; also sum ``numbers`` (n,)."""
+        """Take one step of the named optimisers on ``loss``, summed over processes; also sum ``numbers`` (n,)."""
         weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
             self.adams[name].zero_grad()

@@ -131,7 +131,7 @@ class AdaptiveAdam:
         self.actor.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
-        """Take one step along gradients clipped to this norm; its size follows the last step's KL (None: none yet)."""
+        """Take one step along clipped gradients; the step size follows the KL of the last step (None at first)."""
         self.follow(kl)
         nn.utils.clip_grad_norm_(self.weights, max_grad_norm)
         self.actor.step()
