@@ -40,16 +40,17 @@ class Timestep(NamedTuple):
 class MetaLearningAgent(Agent, Protocol):
     """An agent that adapts to tasks.
 
-    Calls come in this order: ``assign`` (only in our evaluation), ``init``; then for each shot ``reset`` of all
-    environments, ``adapt_action`` and ``step`` until every environment has played its episodes, and ``adapt``.
-    Evaluations before, between and after shots call ``reset`` and ``eval_action``. An agent that learns within an
-    episode also has ``observe(timestep)``, which these evaluations call after each step to show its reward.
+    The methods are called in this order: first ``assign`` (only in our evaluation) and ``init``; then, for each shot,
+    ``reset`` of all environments, ``adapt_action`` and ``step`` until every environment has played its episodes, and
+    ``adapt``. Evaluations before, between and after shots call ``reset`` and ``eval_action``. An agent that learns
+    within an episode also has ``observe(timestep)``, which these evaluations call after each step to show its reward.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
         """Learn which environments share a task: tasks are numbers from 0, int64 ``(num_envs,)``.
 
-        None: each environment has its own task, as in Meta-World's evaluation, which does not call this method.
+        None means that each environment has its own task, as in Meta-World's evaluation, which does not call this
+        method.
         """
 
     def init(self) -> None:
@@ -71,16 +72,17 @@ class TrialAgent(Protocol):
     """An agent of your own that learns about a task while it plays. ``meta_test`` asks nothing else of it.
 
     A trial is a few episodes of one task in each of N environments, with rewards shown in all of them. ``reset`` begins
-    trials of other tasks and tells N. Then each step calls ``act`` and ``observe``. The next episode of a trial begins
-    without a call, after ``terminated`` or ``truncated``. Where ``valid`` is False, ignore the environment: its episode
-    is over and it waits for the others, or its physics broke. Tensors are on the device of the world.
+    trials of other tasks; the size of its mask is N. Then each step calls ``act`` and ``observe``. The next episode of
+    a trial begins without a call, after ``terminated`` or ``truncated``. If ``valid`` is False, ignore the environment:
+    its episode is over and the environment waits for the others, or its physics broke. Tensors are on the device of the
+    world.
 
-    ``copy.deepcopy`` must copy what the agent has learned: copies play the judged episodes, and the agent itself learns
-    from exploring episodes alone.
+    ``copy.deepcopy`` must copy what the agent has learned: copies play the evaluation episodes, and the agent itself
+    learns only from exploring episodes.
     """
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin trials of other tasks in the environments of a mask, bool ``(N,)``: forget the last ones."""
+        """Begin trials of other tasks in the environments of a mask, bool ``(N,)``: forget the previous trials."""
 
     def act(self, obs: Tensor) -> Tensor:
         """Return actions ``(N, action)`` in [-1, 1] for observations ``(N, observation)``."""

@@ -36,7 +36,7 @@ Entry = TypeVar("Entry")
 class Task(NamedTuple):
     """One task class with one variation. `data` holds plain numbers; reading it runs no code.
 
-    Tasks are equal if class and variation are, whatever their sentences tell.
+    Tasks are equal if their class and variation are equal; their sentences do not matter.
 
     Examples:
         >>> from bidex_meta import Benchmark
@@ -118,11 +118,11 @@ class Benchmark:
     """A suite with its task classes, tasks and worlds.
 
     `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of your own suite file, or a `Suite`.
-    `seed`, a whole number from 0, chooses the tasks and is the default seed of the worlds. The same name and seed give
+    `seed`, a non-negative integer, chooses the tasks and is the default seed of the worlds. The same name and seed give
     the same tasks in every process; no global random generator is used. The classes make single environments, as in
-    Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a `metaworld.Benchmark`.
-    `tasks_per_class` is the number of train tasks per class; 0: training draws a new task in each episode or trial, and
-    `train_tasks` are tasks that training never draws; None: as the suite's file says.
+    Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a `metaworld.Benchmark`. `tasks_per_class`
+    is the number of train tasks per class; 0: training draws a new task in each episode or trial, and `train_tasks` are
+    tasks that training never draws; None: as the suite's file says.
 
     Raises BidexError for an unknown suite, a faulty suite file or seed, or `tasks_per_class` with listed tasks.
 
@@ -214,7 +214,10 @@ class Benchmark:
 
     @property
     def padded_size(self) -> int:
-        """Return the size to which observations are padded, before a one-hot: that of the widest class."""
+        """Return the size to which observations are padded: the observation size of the widest class.
+
+        The task id is not counted.
+        """
         return max(task_class.observation_size for task_class in self._classes.values())
 
     def make_world(
@@ -384,7 +387,7 @@ def make_task_world(
     your own class as `"package.module:Class"` (docs/own-task.md). In addition to arguments of `Benchmark.make_world`:
 
     - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50;
-      `"fresh"`: each episode draws a new task, which is none of the 50. None: uniform in training worlds, fixed in
+      `"fresh"`: each episode draws a new task, which is not one of the 50. None: uniform in training worlds, fixed in
       evaluation worlds.
     - `moving_base`: whether the hands' bases move; None: as the class defines it.
     - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state.

@@ -210,7 +210,7 @@ class RunConfig(Generic[LearnerSettings]):
     def goal(self, last: Mapping[str, Json]) -> int:
         """Return the steps that a run trains for.
 
-        These are the steps of its last metrics if time or a metric ended it, else ``steps``.
+        These are the steps of the last metrics if time or a metric ended the run, otherwise ``steps``.
         """
         if self.minutes is not None or self.early_end(last):
             return last["step"]
@@ -231,7 +231,7 @@ def read_config(path: Path) -> RunConfig[JsonObject]:
 
 
 def config_of(content: object, where: str) -> RunConfig[JsonObject]:
-    """Return a run's config from what a file holds; ``where`` is for messages. Raises BidexError if it is none."""
+    """Return a run's config from a file's content; raise BidexError, which names ``where``, if it is not a config."""
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
         raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")

@@ -1,4 +1,4 @@
-"""The one exception for bad input (a line that names the expected, the received and the mend), and exit codes."""
+"""The exception for bad input (one line: what was expected, what came, and how to fix it), and exit codes."""
 
 import difflib
 from collections.abc import Iterable, Mapping

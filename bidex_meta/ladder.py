@@ -62,7 +62,7 @@ RUNGS = (
 
 
 class OfOneClass(NamedTuple):
-    """A suite of a single class: its name in parts."""
+    """The parsed name of a suite with a single class."""
 
     template: str
     """Name of the suite that it is made from."""

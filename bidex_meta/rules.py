@@ -62,7 +62,7 @@ def plain_name(name: str) -> str:
 
 
 def versioned_name(name: str, rules: Rules) -> str:
-    """Return a class's name with ``-v2``, before the object's name if there is one, where the rules are version 2's."""
+    """Return a class's name, with ``-v2`` (before an object's name) if the rules are those of version 2."""
     task_class, dash, thing = plain_name(name).partition("-")
     if rules == V2:
         return f"{task_class}-v2{dash}{thing}"
@@ -70,7 +70,7 @@ def versioned_name(name: str, rules: Rules) -> str:
 
 
 def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Return in words how other rules, by name, differ from ``rules``; empty if they are equal."""
+    """Describe how other rules, by name, differ from ``rules``; return an empty text if they are equal."""
     pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
     return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 

@@ -123,7 +123,7 @@ class Suite:
     """True if observations show touch sensors of both hands."""
 
     def __post_init__(self) -> None:
-        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite of other rules."""
+        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite with other rules."""
         object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
 
     @property
@@ -154,9 +154,9 @@ class Suite:
         return self.tasks_per_class or 0
 
     def task_names(self, split: Split) -> dict[str, list[str]]:
-        """Return the names of the tasks of each slot of a split: those that the file lists, else numbers.
+        """Return the task names of each slot of a split: those that the file lists, or numbers if it lists none.
 
-        A slot is a class, or a listed task if each has an entry of its own in the one-hot.
+        A slot is a class, or a listed task if each listed task has its own entry in the one-hot.
         """
         drawn = list(map(str, range(self.drawn_tasks(split))))
         pools = {}
@@ -171,9 +171,9 @@ class Suite:
         return slots
 
     def with_train_tasks(self, count: int | None) -> "Suite":
-        """Return the suite with another ``train_tasks``; None leaves the suite unchanged.
+        """Return the suite with ``train_tasks`` replaced; None leaves the suite unchanged.
 
-        Raises BidexError if a class lists its tasks, or the count is no whole number from 0 to a million.
+        Raises BidexError if a class lists its tasks, or the count is not an integer from 0 to a million.
         """
         if count is None:
             return self
@@ -223,7 +223,7 @@ def file_names() -> list[str]:
 
 @checked_arguments
 def metaworld_classes(suite: str) -> tuple[str, ...]:
-    """Return the classes of one of Meta-World's suites; raises BidexError for another, with the nearest name."""
+    """Return the classes of one of Meta-World's suites; for another name, raise BidexError with the nearest name."""
     if suite not in METAWORLD_SUITES:
         raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
     return METAWORLD_SUITES[suite]

@@ -8,7 +8,7 @@ from bidex_meta.world.contract import VectorWorld
 
 
 def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tensor:
-    """Return ``gamma``, or the discount of each entry of ``task_id`` (n,) if classes of the world have their own."""
+    """Return ``gamma``, or the discount for each entry of ``task_id`` (n,) if classes have their own discounts."""
     if all(own is None for own in world.gammas):
         return gamma
     return torch.tensor([gamma if own is None else own for own in world.gammas], device=task_id.device)[task_id]

@@ -12,7 +12,7 @@ from bidex_meta.training.learner import State
 
 
 class Labelled:
-    """The last ``steps`` vector steps of environments ``rows`` (L,), each of one task (``task_id`` (L,), ascending).
+    """The last ``steps`` vector steps of environments ``rows`` (L,), whose tasks are ``task_id`` (L,), ascending.
 
     ``tasks`` (K,) are the tasks that have an environment in ``rows``.
     """
@@ -63,7 +63,7 @@ class Labelled:
         return {"added": self.added, "steps": self.steps, "rows": self.rows.clone(), **kept}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raises BidexError if it has other environments or another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if its environments or sizes differ."""
         here = (self.steps, self.rows.tolist())
         there = (state["steps"], state["rows"].tolist())
         if here != there:

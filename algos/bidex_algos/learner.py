@@ -81,7 +81,7 @@ class Learner(Contract):
 
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
-        """Describe the networks' reading of an observation; encoders of observation groups are added here."""
+        """Return how the networks read an observation; encoders of observation groups are added here."""
         if shape.num_id_columns:
             size = vars(config).get("task_embedding", 0)
         else:
@@ -109,7 +109,7 @@ class Learner(Contract):
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
     def iterate(self) -> dict[str, float]:
-        """Collect experience, learn from it and return metrics; a FloatingPointError if a loss is not finite."""
+        """Collect experience, learn from it and return metrics; raise FloatingPointError if a loss is not finite."""
         started = time.perf_counter()
         steps = self.env_steps
         self._collected = 0.0

@@ -33,8 +33,8 @@ class Transitions:
 class Replay:
     """The last ``steps`` vector steps of all environments, with a separate part per task (``task_id``, (N,)).
 
-    ``cut_share`` is the room for last observations of episodes cut by a time limit, as a share of all transitions. If
-    the room is too small, the oldest lose their weight. ``added`` counts the vector steps added.
+    ``cut_share`` is the space for last observations of episodes cut by a time limit, as a share of all transitions. If
+    the space is too small, the oldest lose their weight. ``added`` counts the vector steps added.
     """
 
     def __init__(
@@ -227,7 +227,10 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """Make a replay of ``asked`` vector steps, or as many as ``memory`` (10^9 bytes) holds; raise BidexError if 0."""
+    """Make a replay of ``asked`` vector steps, or the number that fits into ``memory`` (10^9 bytes).
+
+    Raises BidexError if not even one step fits.
+    """
     rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
     if 0 in present:

@@ -17,7 +17,7 @@ from bidex_meta.training.launch import say
 
 @dataclass(frozen=True)
 class CompareFlags:
-    """Compare evaluated runs by group with the first group; runs that only differ in the seed form a group.
+    """Compare groups of evaluated runs with the first group; runs that differ only in the seed form a group.
 
     Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
     """

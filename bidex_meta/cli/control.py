@@ -19,7 +19,7 @@ class ControlFlags:
 
     Example: bidex-meta control runs/ML1-wide/promp/*
 
-    For suites whose classes stand in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
+    This is for suites whose classes are in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
     """
 
     runs: RunPaths  # Run folders that differ in the seed alone.

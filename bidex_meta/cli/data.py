@@ -21,11 +21,11 @@ _ACTIONS = ("list", "info", "check")
 
 @dataclass(frozen=True)
 class DataFlags:
-    """List data sets; describe one; check one.
+    """List data sets, or describe or check one data set.
 
     Example: bidex-meta data info CatchUnderarm/random-v0
 
-    They lie in the folder that BIDEX_DATA names, else in data/; a path will do too.
+    Data sets are in the folder that BIDEX_DATA names, otherwise in data/. You can also give a path.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="list|info|check")]

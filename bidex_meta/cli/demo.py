@@ -27,7 +27,7 @@ class DemoFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play the shipped policy, or film it where there is no screen."""
+    """Play the shipped policy, or film it if there is no screen."""
     flags = parse(DemoFlags, arguments, "demo")
     if flags.out is None and gl_backend.has_screen():
         play_live.main([])

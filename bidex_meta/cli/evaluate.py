@@ -19,7 +19,7 @@ from bidex_meta.training.learner import Capability
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateFlags(Options):
-    """Success and return of a run's policy (mean action), the same number of episodes for every task.
+    """Measure success and return of a run's policy (mean action), with the same number of episodes for every task.
 
     Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
 

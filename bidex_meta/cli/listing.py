@@ -15,7 +15,7 @@ from bidex_meta.worlds import listed
 
 @dataclass(frozen=True)
 class ListFlags:
-    """The suites, tasks, hidden parts of tasks, algos or objects there are.
+    """List the available suites, tasks, hidden parts of tasks, algos or objects.
 
     Example: bidex-meta list tasks --json
     """

@@ -43,7 +43,7 @@ def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Age
 def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
     """Return the worlds in which a policy is shown, the class of each slot, and the class to show.
 
-    The worlds are those of the named suite or task, else of the policy's run.
+    The worlds are those of the named suite or task, or those of the policy's run if none is named.
     """
     if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")

@@ -67,7 +67,7 @@ RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metav
 
 @dataclasses.dataclass(frozen=True)
 class LookFlags:
-    """What a policy is looked at in."""
+    """Flags that choose the world in which a policy is shown."""
 
     run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
     """Run folder whose policy is shown; the same as --policy RUN."""
@@ -166,7 +166,7 @@ def peek(arguments: Sequence[str], flag: str) -> str | None:
 
 
 def peek_all(arguments: Sequence[str], flag: str) -> list[str]:
-    """Return, as ``peek``, all values of a flag that may be given several times, in the given order."""
+    """Return all values of a flag that may be given several times, in the given order; see ``peek``."""
     pairs = zip_longest(arguments, arguments[1:])
     found = [value if word == flag else word.partition("=")[2] for word, value in pairs if word.split("=")[0] == flag]
     return [value for value in found if value]

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlayFlags(LookFlags):
-    """Look at a policy live: in MuJoCo's viewer, or in the browser where there is no screen.
+    """Look at a policy live: in MuJoCo's viewer, or in the browser if there is no screen.
 
     Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
 
-    bidex-meta play alone shows the policy that comes with bidex-meta in MT20, an episode of each class after another.
+    Without arguments, bidex-meta play shows the policy that comes with bidex-meta, one episode of each class of MT20.
     bidex-meta play --task SwingCup --policy random needs no run either.
     """
 

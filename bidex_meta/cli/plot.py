@@ -16,11 +16,11 @@ from bidex_meta.runs.stored import StoredRun, open_runs
 
 @dataclass(frozen=True)
 class PlotFlags:
-    """Return and success of every task against environment steps, or against shots of adaptation, as a picture.
+    """Draw return and success of every task against environment steps, or against shots of adaptation.
 
     Example: bidex-meta plot runs/MT4/mtppo/* --out curves.png
 
-    Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
+    Runs that differ only in the seed are one line, with the 95 % bootstrap interval over runs.
     """
 
     runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.

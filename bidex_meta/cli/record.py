@@ -13,7 +13,7 @@ class RecordFlags(RecordConfig):
 
     Example: bidex-meta record random --task CatchUnderarm
 
-    Killed or interrupted, the same command goes on where it stopped and ends with the same data.
+    If the command is killed or interrupted, run it again: it continues where it stopped and ends with the same data.
     """
 
     estimate: Switch = False  # Print what it would take, and stop.

@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Few, Pixels
 
 @dataclass(frozen=True)
 class RenderFlags(LookFlags):
-    """A picture of a task's start, or a film of an episode; of a run all classes beside each other.
+    """Draw a picture of a task's start, or a film of an episode. For a run, show all its classes side by side.
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
 

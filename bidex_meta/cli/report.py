@@ -15,11 +15,11 @@ from bidex_meta.runs.atomic import write_atomic
 
 @dataclass(frozen=True)
 class ReportFlags:
-    """Runs as one HTML page: final table, curves, adaptation, throughput, differences of configs, films.
+    """Write an HTML page about runs: final table, curves, adaptation, throughput, differences of configs, films.
 
     Example: bidex-meta report runs/MT4/mtppo/* runs/MT4/mttrpo/* --out mt4.html
 
-    The page needs no network and no other file. Runs that differ in the seed alone are one line, with intervals.
+    The page needs no network and no other file. Runs that differ only in the seed are one line, with intervals.
     """
 
     runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _check_printed(flags: RunFlags) -> None:
-    """Refuse a config as ``train`` would, but for the memory of this machine."""
+    """Refuse a config as ``train`` would, but do not check the memory of this machine."""
     check(flags.config, with_memory=False)
     if flags.resume is not None:
         check_resumed(RunFolder.open(flags.resume), flags.config)

@@ -18,11 +18,12 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write the leaderboard's entry of runs, which play their own and as many new tasks, or of a meta-test.
+    """Write a leaderboard entry of runs, which play their own tasks and as many new tasks, or of a meta-test.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
-    The runs differ in nothing but the seed. A meta-test of an agent that is no run is taken as it is, not verified.
+    The runs may differ only in the seed. A meta-test of an agent that is not a run is taken as it is, without
+    verification.
     """
 
     runs: RunPaths  # Run folders, a seed each.
@@ -79,7 +80,7 @@ def _folders(flags: SubmitFlags) -> list[RunFolder]:
 
 
 def _check(flags: SubmitFlags, path: Path) -> None:
-    """Repeat an entry, print what is not equal and the verdict; exit code 1 if something differs."""
+    """Repeat an entry, and print differences and the verdict; return exit code 1 if something differs."""
     if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
         raise BidexError("--check takes an entry, its runs and --device, and all else from the entry. Leave it out.")
     found = check(path, _folders(flags), flags.device)

@@ -20,7 +20,7 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SweepFlags:
-    """Run all that a file asks for: suites x learners x seeds x overrides. Started again, it goes on where it stopped.
+    """Run what a file asks for: suites x learners x seeds x overrides. Run the command again to continue.
 
     Example: bidex-meta sweep results/sweeps/multitask.toml --workers 2
 

@@ -117,7 +117,7 @@ class _Column:
 
     @property
     def least(self) -> int:
-        """Least width in terminal columns: the widest cell, or for prose the longest word and some room."""
+        """Least width in terminal columns: the widest cell, or for prose the longest word plus a margin."""
         words = self.header.split()
         if self.is_prose:
             words += " ".join(self.cells).split()
@@ -130,7 +130,7 @@ def _needed(columns: Sequence[_Column]) -> int:
 
 
 def _widths(columns: Sequence[_Column], width: int) -> list[int]:
-    """Return the columns' widths: the least widths, plus the room left, which goes to the most wrapped columns."""
+    """Return the columns' widths: the least widths; the remaining width goes to the most wrapped columns."""
     widths = [column.least for column in columns]
     wanted = [max(map(len, [*column.cells, column.header]), default=1) for column in columns]
     for _ in range(width - _needed(columns)):
@@ -198,7 +198,7 @@ _SPARE = ("once", "at end", "length", "episodes", "random return", "score")
 
 
 def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
-    """Return a short form of ``evaluation_table``, with intervals if there is room."""
+    """Return a short form of ``evaluation_table``, with intervals if they fit."""
     headers = ["task", "success", "random", "return [95 %]", "random return"]
     table = Sheet(headers, title, "[..] 95 % bootstrap interval over tasks")
     rows = policy.to_json()
@@ -213,7 +213,7 @@ def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
 
 
 def gained(measures: Mapping[str, Difference | None]) -> list[str]:
-    """Return the cells of the gains in success, return and score."""
+    """Return cells with the gains in success, return and score."""
     success, earned, score = (measures[name] for name in ("success", "return", "score"))
     percents = NONE
     if success is not None:

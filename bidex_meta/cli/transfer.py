@@ -20,12 +20,12 @@ _SPARE = ("seeds", "return")  # columns that a narrow terminal leaves out first
 
 @dataclass(frozen=True)
 class TransferFlags:
-    """Learn held-out classes from a run's policy and from nothing: by reinforcement, and from a few demonstrations.
+    """Learn held-out classes from a run's policy and from scratch: by reinforcement, and from a few demonstrations.
 
     Example: bidex-meta transfer results/ML20-mtppo-seed0 --classes LiftUnderarm --out runs/transfer
 
-    Started again, it goes on where it stopped. What follows -- are flags of `bidex-meta run` for every run, such as
-    `-- --learner.critic-first 20000` (docs/transfer.md).
+    If the command is interrupted, run it again to continue. Flags after -- are flags of `bidex-meta run` for every run,
+    such as `-- --learner.critic-first 20000` (docs/transfer.md).
     """
 
     run: RunPath  # Run folder on a suite with held-out classes: its policy is measured.

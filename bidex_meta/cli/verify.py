@@ -15,11 +15,11 @@ from bidex_meta.utils.validation import Environments
 
 @dataclass(frozen=True)
 class VerifyFlags:
-    """Evaluates a run's checkpoint again as its evaluation.json was made, and compares the two class by class.
+    """Repeat the recorded evaluation of a run's checkpoint, and compare the two evaluations class by class.
 
     Example: bidex-meta verify runs/MT4/mtppo/2026-11-21_10-00-00_seed0
 
-    Exit code 0 where all is equal bit for bit or within the intervals, 1 where something differs.
+    The exit code is 0 if all is equal bit for bit or within the intervals, and 1 if something differs.
     """
 
     run: RunPath  # Run folder.
@@ -31,7 +31,7 @@ class VerifyFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Verify a run and print a table or JSON; exit code 1 if something differs."""
+    """Verify a run and print a table or JSON; return exit code 1 if something differs."""
     flags = parse(VerifyFlags, arguments, "verify")
     found = verify(
         flags.run, evaluation=flags.evaluation, device=flags.device, engine=flags.engine, num_envs=flags.num_envs

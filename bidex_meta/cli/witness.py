@@ -17,7 +17,7 @@ from bidex_meta.witness.store import load_witness, witness_path
 
 @dataclass(frozen=True)
 class WitnessFlags:
-    """Replay the witness of a task, recorded actions that solve it, from its start and from ten shifted ones.
+    """Replay a task's witness (recorded actions that solve the task) from its start and from ten shifted starts.
 
     Example: bidex-meta witness --task CatchUnderarm
     """

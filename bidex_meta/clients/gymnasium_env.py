@@ -44,9 +44,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._over = True
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Start an episode, the same for the same seed; return the observation (d,), float32, and an empty info.
+        """Start an episode; return the observation (d,), float32, and an empty info.
 
-        There are no options.
+        The same seed always gives the same episode. There are no options.
         """
         check_single_reset(seed, options)
         super().reset(seed=seed, options=options)

@@ -60,7 +60,7 @@ class HandsEnv(ParallelEnv):
 
     @checked_arguments
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
-        """Start an episode, the same for the same seed; return observations by agent, and empty infos.
+        """Start an episode; return observations by agent, and empty infos. A seed always gives the same episode.
 
         Options have no effect.
         """

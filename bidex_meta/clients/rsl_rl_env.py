@@ -24,7 +24,7 @@ class RslRlVecEnv(VecEnv):
     episode ended). `policy` names the world's `observation_groups` for the policy (none: all); the critic gets all
     groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md); "Mean
     reward" counts shortened episodes, `log` does not. Raises BidexError for a mode other than SAME_STEP, an unknown
-    group, or an `episode_length_buf` that holds other values than whole numbers from 0 on.
+    group, or an `episode_length_buf` whose values are not non-negative integers.
     """
 
     @checked_arguments
@@ -100,7 +100,7 @@ class RslRlVecEnv(VecEnv):
 
 
 class EpisodeLog:
-    """Log of a world's ended episodes, from a full reset on, under the tags of Isaac Lab, mjlab and rsl-rl."""
+    """Log of the episodes that ended since a full reset, under the tags of Isaac Lab, mjlab and rsl-rl."""
 
     def __init__(self, world: VectorWorld) -> None:
         self._world = world

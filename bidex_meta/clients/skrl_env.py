@@ -24,9 +24,9 @@ class SkrlEnv(Wrapper):
     on it. skrl does not read `final_obs`, so the world must be in mode NEXT_STEP: an ended environment returns its last
     observation, and its next step starts the next episode, with reward 0, whatever the action.
 
-    `infos` are the world's; if full episodes ended, `episode` has their means as skrl's trainers log them. `seed` is
-    the seed of the first reset (None: the world's). `stagger` shortens first episodes (docs/clients.md), which skrl's
-    "Total reward" counts. Raises BidexError for a world in another autoreset mode.
+    `infos` are those of the world; if full episodes ended, `episode` has their means in the form that skrl's trainers
+    log. `seed` is the seed of the first reset (None: the world's). `stagger` shortens first episodes (docs/clients.md),
+    which skrl's "Total reward" counts. Raises BidexError for a world in another autoreset mode.
     """
 
     @checked_arguments

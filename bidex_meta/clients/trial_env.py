@@ -39,8 +39,8 @@ class TrialWorld(PooledWorldWrapper):
 
     `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` goes into the other adapters, such as
     `SB3VecEnv`. Return and length are those of the trial, success is that of its last episode. Within a trial the next
-    episode starts in the step that ends one, and neither `terminated` nor `truncated` tells of it. The trial ends when
-    its last episode does, or when physics breaks. First episodes are not shortened.
+    episode starts in the step that ends the previous one, and neither `terminated` nor `truncated` is set. The trial
+    ends when its last episode does, or when physics breaks. First episodes are not shortened.
 
     Raises BidexError for a world in another autoreset mode than SAME_STEP, or one that shows its goals.
     """
@@ -104,7 +104,7 @@ class TrialWorld(PooledWorldWrapper):
         return self.world.episodes.number % self.episodes_per_task
 
     def _forget(self, mask: Tensor) -> None:
-        """Begin trials in the environments of a mask; what the previous trials have shown is erased."""
+        """Begin trials in the environments of a mask; forget what the previous trials have shown."""
         self._clock.begin(mask)
         self._last = self._last.masked_fill(mask[:, None], 0.0)
         if not self._sums:
@@ -184,7 +184,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._left = 0  # episodes that the running trial has yet to end
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Start a trial of another task, with a seed the same one every time; return an observation and an empty info.
+        """Start a trial of another task; return an observation and an empty info. A seed always gives the same trial.
 
         There are no options.
         """

@@ -76,7 +76,10 @@ class _ShownState(TaskState):
 
 
 def verify(dataset: Dataset, most: int | None = None) -> Findings:
-    """Check all digests, and ``most`` evenly spread episodes (None: all); raise BidexError if a file is damaged."""
+    """Check all digests, and the contents of at most ``most`` evenly spread episodes (all if ``most`` is None).
+
+    Raises BidexError if a file is damaged.
+    """
     findings = Findings(unsealed=dataset.check_digests())
     formulas = _Formulas(dataset)
     table = dataset.table
@@ -92,7 +95,7 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
 
 
 def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, Episode]]:
-    """Yield at most ``most`` evenly spread episodes (None: all), each with its number."""
+    """Yield at most ``most`` evenly spread episodes (all if ``most`` is None), each with its number."""
     if most is None:
         every = 1
     else:

@@ -219,7 +219,7 @@ def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writ
 
 
 def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
-    """Return the maximum memory of the running episodes of the environments ``rows`` (None: all), bytes."""
+    """Return the maximum memory, in bytes, that running episodes of the environments ``rows`` (None: all) take."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
     if rows is None:
         limits = world.max_episode_steps

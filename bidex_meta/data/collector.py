@@ -28,11 +28,11 @@ class EpisodeCollector(PooledWorldWrapper):
     """Collects whole episodes without changing what the world does.
 
     A transition in which physics broke is left out, and its episode ends as truncated before that transition. Only the
-    episodes of ``rows``, the environments to collect from (None: all), are in memory: a step of one environment takes
-    4 (d + a + 2) bytes. ``sink`` receives each episode when the episode has ended; episodes that end in the same step
+    episodes of ``rows``, the environments to collect from (None: all), are in memory: a step of one environment takes 4
+    (d + a + 2) bytes. ``sink`` receives each episode when the episode has ended; episodes that end in the same step
     arrive by ascending environment. ``left_out`` counts uncollected transitions and episodes by reason; ``policy`` is
-    the number of the acting policy; ``active``, bool (rows,), marks the environments whose new episodes are collected:
-    all at first.
+    the number of the acting policy; ``active``, bool (rows,), marks the environments whose new episodes are collected
+    (at first all of them).
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
@@ -241,7 +241,7 @@ class RunCollector(EpisodeCollector):
         return self._writer
 
     def open(self, folder: Path, parts: int = 0) -> None:
-        """Set the folder, before the first reset, and delete this process's parts from number ``parts`` on."""
+        """Set the folder, before the first reset, and delete this process's parts with number ``parts`` or higher."""
         self.folder = folder
         self._writer = DatasetWriter(folder, self.process, keep=parts)
         if self.process == 0:  # the data set is no longer complete
@@ -274,7 +274,10 @@ class RunCollector(EpisodeCollector):
 
 
 def spread_environments(world: VectorWorld, share: float) -> list[int]:
-    """Return a share, above 0 (1 or more: all), of a world's environments, evenly over slots, at least one per slot."""
+    """Return a share, above 0, of a world's environments, evenly over slots and at least one per slot.
+
+    A share of 1 or more returns all environments.
+    """
     chosen: list[int] = []
     slots = world.task_id.tolist()
     for slot in range(world.num_tasks):

@@ -201,7 +201,10 @@ class Dataset:
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:
-        """Read all episodes one by one; raise BidexError for damaged files, or observations or actions not flat."""
+        """Read all episodes one by one.
+
+        Raises BidexError if a file is damaged, or observations or actions are not flat.
+        """
         other_formats.check_spaces(self.content, self.name)
         number = 0
         sizes = None

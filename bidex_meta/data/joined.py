@@ -36,7 +36,10 @@ class Joined:
         return len(self.rewards)
 
     def fingerprint(self) -> dict[str, float]:
-        """Return sums by which a checkpoint recognises the data that its run must be resumed with."""
+        """Return checksums of the data.
+
+        A checkpoint stores them, so that its run is only resumed with the same data.
+        """
         parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
         sums = {name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()}
         return {"transitions": len(self), **sums}
@@ -99,7 +102,7 @@ def gathered(
 
 
 def check_touch(dataset: Dataset, touch: bool) -> None:
-    """Raise BidexError unless a data set shows touch sensors as a world does: ``touch`` says whether.
+    """Raise BidexError unless a data set and a world both show touch sensors (``touch``), or neither does.
 
     Padding would hide the different widths.
     """
@@ -118,7 +121,10 @@ class _Columns(NamedTuple):
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
-        """Return the columns of an observation of ``size`` entries, by groups' names and index ranges."""
+        """Return which columns of an observation with ``size`` entries hold the state, and which hold the point cloud.
+
+        ``groups`` lists the name and the index ranges of each observation group.
+        """
         every = np.arange(size)
         for name, parts in groups:
             if name in POINT_ENTRIES:
@@ -129,7 +135,7 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """Converts a data set's episodes to a world's form; ``slots`` are the world's, ``plain`` excludes the one-hot."""
+    """Converts a data set's episodes to a world's form; the world has ``slots``; ``plain`` excludes the one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset = dataset
@@ -159,7 +165,7 @@ class _Form:
                 self._factors[number] = theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0)
 
     def _check_observations(self, may_pad: bool) -> None:
-        """Raise BidexError for other clouds or state sizes; with ``may_pad`` the world's states may be wider."""
+        """Raise BidexError if clouds or state sizes differ; with ``may_pad`` the world's states may be wider."""
         name = self.dataset.name
         own = self._own
         theirs = self._theirs
@@ -198,7 +204,7 @@ class _Form:
 
 
 def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
-    """Yield the world's slot of each name."""
+    """Yield, for each name, the world's slot of this name."""
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)
         return

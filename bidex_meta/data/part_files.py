@@ -92,7 +92,7 @@ def part_path(folder: Path, process: int, number: int) -> Path:
 
 
 def remove_parts(folder: Path, process: int, keep: int) -> None:
-    """Delete a process's parts from number ``keep`` on, and its half-written files."""
+    """Delete a process's parts with number ``keep`` or higher, and its half-written files."""
     for path in _files(folder):
         match = _PART.fullmatch(path.name)
         if (match and int(match[1]) == process and int(match[2]) >= keep) or path.name.startswith(f".part-{process}-"):

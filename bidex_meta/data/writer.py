@@ -1,4 +1,4 @@
-"""Write a data set: its path and name, then its parts, each complete or absent, and last the index."""
+"""Write a data set: first its path and name, then its parts (each complete or absent), and finally the index."""
 
 import contextlib
 import json

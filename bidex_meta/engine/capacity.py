@@ -1,4 +1,4 @@
-"""Room for contacts and constraints, which mujoco_warp allocates once at the start."""
+"""Buffer sizes for contacts and constraints, which mujoco_warp allocates once at the start."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from bidex_meta.utils.validation import Whole
 @checked_arguments
 @dataclass(frozen=True)
 class Capacity:
-    """Room per world, or the largest part of the room that was in use."""
+    """Buffer sizes per world, or the largest part of the buffers that was in use."""
 
     contacts: (
         Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world
@@ -21,9 +21,10 @@ class Capacity:
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:
-    """Return the room for worlds of several kinds: 1.5 times the largest need of any kind.
+    """Return the buffer sizes for worlds of several kinds: 1.5 times the largest size that any kind needs.
 
-    A trained policy holds objects that rough actions only touch, and room is cheap: 0.10 to 0.18 MB per world in all.
+    The margin is needed because a trained policy holds objects that random actions only touch. The buffers take little
+    memory: 0.10 to 0.18 MB per world in all.
     """
     contacts, convex, rows = (1.5 * max(each) for each in zip(*map(astuple, seen), strict=True))
     return Capacity(16 * math.ceil(contacts / 16), max(2, math.ceil(convex)), 16 * math.ceil(rows / 16))

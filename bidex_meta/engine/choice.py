@@ -15,9 +15,9 @@ def choose_engine(
 ) -> tuple[torch.device, EngineMaker]:
     """Return the device and its engine maker; ``threads`` are the threads of C MuJoCo, None takes all CPUs.
 
-    ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" is C
-    MuJoCo on the CPU, mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing device, C MuJoCo on a
-    GPU, or an impossible number of threads.
+    ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" selects
+    C MuJoCo on the CPU and mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing device, C MuJoCo on
+    a GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)

@@ -31,9 +31,10 @@ class CpuEngine(Engine):
     positions and velocities those of the new state; a persistent batch takes its next step from there. Without
     ``refresh`` the stage is left out, as in ``mj_step``: derived values are then from before the last substep.
 
-    ``unstable`` reports a row with a number out of bounds. The row is put at rest at the model's reference pose, before
-    a step by ``_quarantine``, within a step by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving
-    for their contacts takes up to thousands of times as long as a normal step, while all rows wait.
+    ``unstable`` reports a row with a number out of bounds. The row is put at rest at the model's reference pose: before
+    a step by ``_quarantine``, and within a step by MuJoCo's autoreset. Otherwise all geoms of a row with NaN would
+    touch, and solving for their contacts would take up to thousands of times as long as a normal step, while all rows
+    wait.
     """
 
     device = torch.device("cpu")
@@ -42,7 +43,7 @@ class CpuEngine(Engine):
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Build the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
+        """Build the batch; ``rows`` gives each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
         if refresh:
             self._after_step = mujoco.mjtStage.mjSTAGE_VEL
@@ -103,7 +104,7 @@ class CpuEngine(Engine):
             self._failed[torch.as_tensor(error.ids)] = True
 
     def _quarantine(self) -> None:
-        """Put rows with a number out of bounds, written by hand or left by the last step, on a safe state."""
+        """Put rows into a safe state if a number, written by hand or left by the last step, is out of bounds."""
         # Few operations over all rows: a row whose norm is within the least bound is within all of them.
         size = torch.linalg.vector_norm(self._numbers, dim=1)
         turns = self._numbers.index_select(1, self._quaternions).unflatten(1, (-1, 4))
@@ -201,7 +202,7 @@ _WITH_THREADS: "weakref.WeakSet[CpuEngine]" = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    """Mark batches in a child process: stepping or freeing one would wait forever for the parent's threads."""
+    """Mark batches in a child process: stepping or freeing a batch would wait forever for the parent's threads."""
     for engine in _WITH_THREADS:
         engine._forked = True
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine._batch))

@@ -15,8 +15,8 @@ _LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
 def model_identity(model: mujoco.MjModel) -> str:
     """Return 12 hexadecimal digits of all solver options and all numbers of bodies, joints, geoms and actuators.
 
-    Names, looks and MuJoCo's version do not enter. Numbers enter with six digits, so that a processor that rounds the
-    compiler's sums differently gives the same digits.
+    Names, appearance and MuJoCo's version do not matter. Numbers are rounded to six digits, so that a processor that
+    rounds the compiler's sums differently gives the same digits.
     """
     digest = hashlib.sha256()
     numbers = {name: value for name, value in _members(model).items() if name.startswith(_PARTS)}

@@ -51,11 +51,11 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Return which simulations broke since their reset (bad numbers or no room for contacts), bool (num,)."""
+        """Return which simulations broke since their reset (bad numbers or too many contacts), bool (num,)."""
         ...
 
     def warnings(self) -> Tensor:
-        """Return the number of kinds of warnings of each simulation since its last reset. Shape (num,), int64."""
+        """Return how many kinds of warnings each simulation has raised since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:

@@ -1,7 +1,7 @@
 """MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
 
 Deliberate differences from C: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
-freedom), a solver tolerance of 1e-6 (its minimum), fixed room for contacts. Tests use the Warp CPU device.
+freedom), a solver tolerance of 1e-6 (its minimum), contact buffers of fixed size. Tests use the Warp CPU device.
 """
 # ruff: noqa: D102 (``Engine`` says what the methods do)
 

@@ -39,10 +39,11 @@ class Agreement:
 def agreements(recorded: Mapping[str, ClassSummary], again: Mapping[str, ClassSummary]) -> list[Agreement]:
     """Compare two evaluations of one policy on the same tasks and starts, by class.
 
-    At worst they are independent samples. So means may differ by the root of the sum of the squares of both half
-    intervals. The limit is widened (Bonferroni) such that one in twenty honest repetitions has any measure of any class
-    beyond the limit. In simulations of twenty classes the rate was one in eighteen with 200 episodes per class, one in
-    fourteen with 60, and one in seven with 20. Raises BidexError if the classes differ.
+    At worst, the two evaluations are independent samples. Their means may therefore differ by the root of the sum of
+    the squares of both half intervals. This limit is widened (Bonferroni) so that in only one of twenty correct
+    repetitions some measure of some class exceeds it. In simulations of twenty classes, the rate was one in eighteen
+    with 200 episodes per class, one in fourteen with 60, and one in seven with 20. Raises BidexError if the classes
+    differ.
     """
     if set(recorded) != set(again):
         raise BidexError(
@@ -86,7 +87,7 @@ def _rounding(value: float) -> float:
 
 
 def _half(interval: Interval | None) -> float:
-    """Return half the width of an interval, 0 without one: a single episode says nothing of other episodes."""
+    """Return half the width of an interval, or 0 if there is none because there is only one episode."""
     if interval is None:
         return 0.0
     low, high = interval

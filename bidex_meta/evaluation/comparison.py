@@ -53,7 +53,7 @@ class Group:
 def read_groups(runs: Sequence[Run]) -> list[Group]:
     """Return evaluated runs by group, in the order they are named.
 
-    Raises BidexError if one is not evaluated, two are the same, or a group's seeds cover different classes.
+    Raises BidexError if a run is not evaluated, two runs are the same, or a group's seeds cover different classes.
     """
     kinds = [run_kind(run.config(), run.evaluation().split) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
@@ -137,7 +137,7 @@ def _check_copies(runs: Sequence[Run]) -> None:
 
 
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
-    """Return the content of a picture of groups: per title the label, interquartile mean and interval of each group."""
+    """Return the content of a picture of groups, by title: label, interquartile mean and interval of each group."""
     pictured: dict[str, list[tuple[str, float, Interval | None]]] = {}
     for group in groups:
         for title, values, factor in (("success, IQM (%)", group.success, 100.0), ("score, IQM", group.scores, 1.0)):
@@ -153,14 +153,20 @@ def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Inter
 
 
 def success_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in success from the first group; None for the first group and for other classes."""
+    """Return the difference in success from the first group.
+
+    The result is None for the first group, and for groups with other classes.
+    """
     if not _comparable(group, first):
         return None
     return iqm_difference(group.success, first.success)
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in normalised score as :func:`success_over`; None also if either score is unknown."""
+    """Return the difference in normalised score from the first group.
+
+    The result is None in the same cases as in :func:`success_over`, and if either score is unknown.
+    """
     if not _comparable(group, first) or group.scores is None or first.scores is None:
         return None
     return iqm_difference(group.scores, first.scores)
@@ -171,7 +177,7 @@ def _comparable(group: Group, first: Group) -> bool:
 
 
 def scored_classes(run: Run) -> dict[str, ClassSummary]:
-    """Return the ``results`` of the run's evaluation, with scores by the present references."""
+    """Return the ``results`` of the run's evaluation, with scores computed from the installed references."""
     config = run.config()
     evaluation = run.evaluation()
     if isinstance(evaluation, PolicyEvaluation):

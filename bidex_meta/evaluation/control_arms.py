@@ -75,12 +75,12 @@ def _returns(evaluation: Evaluation) -> str:
 
 
 def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, Json]:
-    """Return the results of each arm in a class over all runs (one for each seed), and the gain of own data.
+    """Return the results of each arm in a class over all runs (one run per seed), and the gain from own data.
 
     Arms are ``before``, ``own``, ``foreign`` (the mean over the train tasks), and each train task by its name in
     ``names``. Each arm has ``return`` and ``success``, means over runs, and ``runs``, the mean return of each run.
-    Every arm but ``own`` has ``own_minus``: by measure the Difference of ``own`` and this arm, over runs, adaptations
-    and episodes; None if a measure is missing.
+    Every arm but ``own`` has ``own_minus``: for each measure, the Difference of ``own`` and this arm over runs,
+    adaptations and episodes, or None if the measure is missing.
     """
     by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
     by_arm["foreign"] = [run.foreign for run in runs]
@@ -101,7 +101,7 @@ def _own_minus(
     runs: Sequence[Control], others: Sequence[Sequence[ClassResult]], class_name: str,
     of: Callable[[ClassResult], np.ndarray | None]
 ) -> Difference | None:  # fmt: skip
-    """Return the paired difference of adaptation to own data and the mean of others."""
+    """Return the paired difference between adaptation to own data and the mean of the other arms."""
     differences = []
     for run, of_run in zip(runs, others, strict=True):
         own = of(run.own.classes[class_name])

@@ -140,7 +140,7 @@ class _Listed:
         return {"new": self.new}
 
     def summaries(self) -> dict[str, ClassSummary]:
-        """Return what a repetition compares: the results of each run, part, shot and class. They have no returns."""
+        """Return the results, without returns, that a repetition compares: of each run, part, shot and class."""
         found = {}
         for where, part, shot, name, row in self._rows():
             episodes = self.episodes * part.trials
@@ -198,7 +198,7 @@ class _Listed:
                 yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
 
     def _pools(self, where: str) -> dict[str, int]:
-        """Return the number of tasks of each class of a part."""
+        """Return the number of tasks per class in a part."""
         suite = _suite(self.suite)
         if suite is None:
             return dict.fromkeys(METAWORLD_SUITES[self.suite], _TASKS_OF_METAWORLD)
@@ -211,7 +211,7 @@ class _Listed:
         return {slot: len(tasks) for slot, tasks in suite.task_names(split).items()}
 
     def _train_tasks(self) -> int | None:
-        """Return the number of train tasks per class, if it is not the suite's."""
+        """Return the number of train tasks per class, if it differs from that of the suite."""
         return None
 
     def _tasks(self, pool: int) -> range:
@@ -291,7 +291,7 @@ def evaluation_seed(weights: Iterable[str]) -> int:
 
 
 def class_row(solved: list[list[int]], episodes: int) -> Json:
-    """Return the results of a class, ready for JSON, from the successful ones of ``episodes`` of each task, per run."""
+    """Return the results of a class, ready for JSON, from the number of successes per run and task, of ``episodes``."""
     mean = _mean(_table(solved, episodes))
     return {"success": mean.value, "interval": mean.interval, "solved": solved}
 

@@ -47,5 +47,5 @@ class Protocol:
                 whole_number(name, value, least, None if name in ("seed", "shots", "max_adapt_steps") else _MOST)
 
     def changed(self, **given: str | int | None) -> "Protocol":
-        """Return the protocol with the entries that are given; None leaves an entry as it is."""
+        """Return the protocol with the given entries replaced; None leaves an entry unchanged."""
         return replace(self, **{name: value for name, value in given.items() if value is not None})

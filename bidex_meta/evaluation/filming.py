@@ -39,7 +39,8 @@ def film_row(
 ) -> Iterator[np.ndarray]:
     """Yield frames of environment ``row`` during at most ``steps`` steps; stop earlier if the episode ends.
 
-    The world is in autoreset mode DISABLED. A frame is yielded after each ``every`` steps; None: only the last state.
+    The world is in autoreset mode DISABLED. A frame is yielded every ``every`` steps. If ``every`` is None, only the
+    last state is yielded.
     """
     drawn = cast(RenderedWorld, world)
     obs, _ = world.reset(seed=seed)
@@ -67,8 +68,8 @@ def film_tiles(
 
     An environment's name is green while its episode counts as a success: from the first success to the end of the
     episode, or, if success counts at the end, while the goal is held. The world is in autoreset mode DISABLED.
-    ``width`` and ``height`` are those of a tile. With ``large`` an additional picture, as high as all tiles, stands on
-    the left. It shows one environment after the other, each for an equal share of the steps.
+    ``width`` and ``height`` are those of a tile. With ``large`` there is an additional picture on the left, as high as
+    all tiles. It shows one environment after the other, each for an equal share of the steps.
     """
     drawn = cast(RenderedWorld, world)
     names = [world.task_names[int(world.task_id[row])] for row in rows]

@@ -3,8 +3,8 @@
 The bootstrap resamples runs (seeds), adaptations (a task, or one of several trials of it: its episodes share its luck)
 and, within each, episodes. Intervals over few adaptations are too narrow. We simulated five adaptations of ten episodes
 whose results depended more on the adaptation than on the episode: a nominal 95 % interval held the truth in 81 to 88 %
-of cases, and with three runs in 82 %. If adaptations do not differ, the interval is rather too wide. With a single
-adaptation it does not cover the results that another adaptation would give.
+of cases, and with three runs in 82 %. If adaptations do not differ, the interval is slightly too wide. With a single
+adaptation, the interval does not cover the results that another adaptation would give.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +26,8 @@ MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
 def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str, np.ndarray]) -> Gains:
     """Return ``after`` minus ``before`` of two policies that played the same tasks and starts in the same order.
 
-    ``adaptations``: per class the number of each episode's adaptation, ``(episodes,)``; all have as many episodes.
+    ``adaptations`` holds, per class, the number of each episode's adaptation, ``(episodes,)``; all adaptations have the
+    same number of episodes.
     """
     classes: dict[str, dict[str, Difference | None]] = {name: {} for name in after.classes}
     aggregate: dict[str, Difference | None] = {}
@@ -53,7 +54,7 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
 
 
 def _over_classes(means: list[float], resampled: list[np.ndarray], classes: int) -> Difference | None:
-    """Return the mean over classes; None if a class is missing, as the rest would pass for a mean over all."""
+    """Return the mean over classes; None if a class is missing, because the rest is not a mean over all."""
     if len(means) < classes:
         return None
     if len(resampled) == classes:

@@ -1,7 +1,7 @@
 """The leaderboard: reading and sealing the files of entries, and the statistics that rank entries.
 
 Interquartile mean, performance profile and probability of improvement are those of Agarwal et al. 2021 (arXiv
-2108.13264). Intervals resample runs, and the tasks of each class. So a single run has an interval too.
+2108.13264). Intervals resample runs and the tasks of each class, so that a single run also has an interval.
 """
 
 import hashlib

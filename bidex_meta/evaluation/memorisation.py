@@ -1,8 +1,9 @@
 """Probes that guess a task from the first observations of its episodes.
 
 A learner that can name the task from its first observation may learn the train tasks by heart instead of adapting (Yin
-et al. 2020, arXiv 1912.03820). There are two probes, of the task and of what it hides: the nearest neighbour among
-other episodes, and a ridge regression on them. Neither does better than chance if nothing shows the task.
+et al. 2020, arXiv 1912.03820). There are two probes. The nearest neighbour among other episodes guesses the task, and a
+ridge regression on other episodes guesses what the task hides. If observations do not reveal the task, neither probe
+does better than chance.
 """
 
 import math
@@ -34,9 +35,10 @@ class Memorised:
 def memorised(world: World, episodes: int | None = None, seed: int = 0) -> dict[str, Memorised]:
     """Return how well probes guess tasks from first observations, by class; the world has one environment per task.
 
-    The world is reset ``episodes`` times, each time with new starts; None: until each class has 500 guesses, so that a
-    class with few tasks is measured as precisely as one with many. A probe that guesses the task's name learns from
-    the other resets. A probe that guesses the hidden values learns from the other tasks.
+    The world is reset ``episodes`` times, each time with new starts. If ``episodes`` is None, it is reset until each
+    class has 500 guesses, so that a class with few tasks is measured as precisely as a class with many. A probe that
+    guesses the task's name learns from the other resets. A probe that guesses the hidden values learns from the other
+    tasks.
     """
     if episodes is None:
         fewest = min(rows.stop - rows.start for rows in world.slot_env_ids)
@@ -58,7 +60,7 @@ def memorised(world: World, episodes: int | None = None, seed: int = 0) -> dict[
 
 
 def _standardised(starts: np.ndarray) -> np.ndarray:
-    """Return observations (episodes, n, d) with mean 0 and deviation 1; entries that never change are 0."""
+    """Return observations (episodes, n, d) with mean 0 and standard deviation 1; entries that never change are 0."""
     deviation = starts.std((0, 1))
     changing = deviation > 1e-9
     return np.where(changing, (starts - starts.mean((0, 1))) / np.where(changing, deviation, 1.0), 0.0)
@@ -83,7 +85,7 @@ def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple
 
 
 def _r2(guess: np.ndarray, values: np.ndarray) -> float:
-    """Return the mean over columns of the explained share of the variance, without columns that never change."""
+    """Return the explained share of the variance, averaged over the columns that change."""
     left = ((values - guess) ** 2).mean((0, 1))
     all_of_it = values.var((0, 1))
     changing = all_of_it > 1e-12

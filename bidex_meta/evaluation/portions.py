@@ -23,10 +23,10 @@ def task_of_row(world: TaskWorld) -> Tensor:
 
 
 class Portions:
-    """Groups of adaptations that are played together, to the first ``tasks`` of each pool (None: all), in all trials.
+    """Groups of adaptations, to the first ``tasks`` of each pool (None: all) in all trials, that are played together.
 
-    ``rollouts`` is the number of episodes of each task in a shot; None: one in each environment of the task, with all
-    tasks at once. All numbers are at least 1. The world is not changed.
+    ``rollouts`` is the number of episodes of each task in a shot; None stands for one episode in each environment of
+    the task, with all tasks at once. All numbers are at least 1. The world is not changed.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
@@ -71,7 +71,7 @@ class Portions:
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
     def labelled(self, episodes: Episodes, portion: int) -> Episodes:
-        """Return a portion's episodes without repeated ones; add ``adaptation``; ``task`` is the index in the pool."""
+        """Return a portion's episodes without repetitions; add ``adaptation``; ``task`` is the index in the pool."""
         parts = []
         for slot, adaptations in enumerate(self._adaptations):
             own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}

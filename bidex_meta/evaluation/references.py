@@ -38,7 +38,7 @@ class Reference:
 
     @property
     def floor(self) -> float:
-        """Return the return that scores 0: the better one of random actions and zero actions."""
+        """Return the return that scores 0: the better return of random actions and zero actions."""
         if self.zero is None:
             return self.random
         return max(self.random, self.zero)
@@ -53,11 +53,12 @@ class Reference:
 def counted_returns(
     returns: np.ndarray, broken: np.ndarray, reference: Reference | None, finished: np.ndarray
 ) -> np.ndarray:
-    """Correct the returns (episodes,) of a class's episodes such that breaking physics gains nothing.
+    """Correct the returns (episodes,) of a class's episodes so that breaking physics gains nothing.
 
-    A ``broken`` episode (bool) ends early, which would be an advantage if rewards are negative. So it counts with the
-    return of random actions. If that is unknown, it counts with the return of the worst ``finished`` episode (n,) of
-    this policy and the policies that it is compared with. A lower return of the episode itself stays as it is.
+    A ``broken`` episode (bool) ends early, which would be an advantage if rewards are negative. Such an episode
+    therefore counts with the return of random actions. If that is unknown, it counts with the return of the worst
+    ``finished`` episode (n,) of this policy and of the policies that are compared with it. If the episode's own return
+    is lower, it is not changed.
     """
     if reference is None:
         others = finished
@@ -73,9 +74,10 @@ def load(kind: Kind) -> dict[str, Json]:
 
 
 def store(path: Path, classes: dict[str, Json], made: Json) -> None:
-    """Write references, by class ``return`` and other measures; references of other classes in the file stay.
+    """Write references (``return`` and other measures, by class); the file's references of other classes stay.
 
-    ``made`` says how they were measured and is stored with each class. Raises BidexError if the file is something else.
+    ``made`` describes the measurement and is stored with each class. Raises BidexError if the file does not hold
+    references.
     """
     known = load_from(path)
     for name, numbers in classes.items():
@@ -85,7 +87,10 @@ def store(path: Path, classes: dict[str, Json], made: Json) -> None:
 
 
 def load_from(path: Path) -> dict[str, Json]:
-    """Read the references in a file by class; empty without a file. Raises BidexError for a file of something else."""
+    """Read the references in a file by class; return an empty dict without a file.
+
+    Raises BidexError if the file does not hold references.
+    """
     if not exists(path):
         return {}
     try:
@@ -123,10 +128,10 @@ def references_of(world: object) -> dict[str, Reference]:
 
 
 def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, ClassSummary]:
-    """Return an evaluation's results by class with scores by the present references, so that runs can be compared.
+    """Return an evaluation's results by class, with scores computed from the installed references.
 
-    References exist for classes with moving bases. The bases moved if the run's config says so, or if the evaluation
-    has a score. Other results are returned unchanged.
+    This makes runs comparable. References exist for classes with moving bases. The bases moved if the run's config says
+    so, or if the evaluation has a score. Other results are returned unchanged.
     """
     if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes

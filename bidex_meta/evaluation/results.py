@@ -1,4 +1,4 @@
-"""Results of an evaluation: per class the episodes, and statistics of them."""
+"""Results of an evaluation: the episodes of each class, and their statistics."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class ClassResult:
         return self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
-        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` of few tasks.
+        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` if tasks are few.
 
         Episodes of one task are alike, so resampling them separately would make intervals too narrow.
         """
@@ -69,13 +69,13 @@ class ClassResult:
         return means
 
     def task_means(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of ``values`` (episodes,) in each task, by rising number of the task."""
+        """Return the mean of ``values`` (episodes,) in each task, in ascending order of task number."""
         _, task = np.unique(self.tasks, return_inverse=True)
         return np.bincount(task, values) / np.bincount(task)
 
     @property
     def solved(self) -> list[int]:
-        """Return the number of successful episodes of each task, by rising number of the task."""
+        """Return the number of successful episodes of each task, in ascending order of task number."""
         _, task = np.unique(self.tasks, return_inverse=True)
         return np.bincount(task, self.successes).astype(int).tolist()
 
@@ -127,9 +127,9 @@ def results_by_class(
     names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None,
     compared: Sequence[dict[str, np.ndarray]] = ()
 ) -> dict[str, ClassResult]:  # fmt: skip
-    """Return results by slot name for episodes of ``play_tasks``; broken episodes count as ``counted_returns``.
+    """Return results by slot name for episodes of ``play_tasks``; ``counted_returns`` corrects broken episodes.
 
-    ``compared``: episodes of the policies that this one is compared with.
+    ``compared`` holds the episodes of the policies with which this policy is compared.
     """
     classes = {}
     for slot, name in enumerate(names):

@@ -36,11 +36,11 @@ def bootstrap(
     generator: np.random.Generator | None = None,
     batch: int = _BATCH,
 ) -> np.ndarray:
-    """Return ``statistic`` of each of ``RESAMPLES`` resamples, shape ``(RESAMPLES, ...)``.
+    """Return ``statistic`` for each of ``RESAMPLES`` resamples, shape ``(RESAMPLES, ...)``.
 
-    A level ``(a, b, n)`` draws n of n units with replacement, separately within each of b units of each of a units, so
-    runs that hold tasks that hold episodes are the levels ``(runs,)``, ``(runs, tasks)``, ``(runs, tasks, episodes)``.
-    Whatever has no level, for example the classes of a suite, stays fixed.
+    A level ``(a, b, n)`` draws n out of n units with replacement, separately within each of the a x b groups. For
+    example, runs that contain tasks that contain episodes are the levels ``(runs,)``, ``(runs, tasks)``, ``(runs,
+    tasks, episodes)``. Units without a level, for example the classes of a suite, are not resampled.
 
     Args:
         statistic: Takes the drawn indices of each level, int64 ``(resamples, *level)``, and returns one value or one
@@ -104,7 +104,10 @@ def mean(sample: np.ndarray) -> np.ndarray:
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the mean of ``a`` minus the mean of ``b`` for each resample, a statistic of :func:`estimate`."""
+    """Return the mean of ``a`` minus the mean of ``b`` for each resample.
+
+    This function can be the ``statistic`` of :func:`estimate`.
+    """
     return mean(a) - mean(b)
 
 
@@ -142,11 +145,11 @@ def _iqm_of_tables(values: np.ndarray) -> np.ndarray:
 
 
 def aggregate(samples: Sequence[np.ndarray | None]) -> Aggregate | None:
-    """Return mean, interval and interquartile mean over classes of the classes' means.
+    """Return the mean over classes of the class means, with interval and interquartile mean.
 
     Args:
         samples: One sample ``(n,)`` per class, of tasks or episodes (``ClassResult.drawn``). If one of them is None the
-            result is None, because a mean over some of the classes would pass for a mean over all.
+            result is None, because a mean over some classes could be mistaken for a mean over all.
     """
     known = [sample for sample in samples if sample is not None]
     if not known or len(known) < len(samples):

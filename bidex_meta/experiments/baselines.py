@@ -1,4 +1,4 @@
-"""Measure the references of the normalised score: policies that have learned nothing, and the best known ones."""
+"""Measure the references of the normalised score: untrained policies, and the best known policies."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -90,7 +90,7 @@ def _docstring(module: str, name: str) -> str:
 
 
 def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | None]:
-    """Return the module and the value of an attribute of a class or of its nearest base class that has the value."""
+    """Return module and value of a class attribute, which may be inherited from the nearest base class that has it."""
     module, node = _found(module, name)
     if not isinstance(node, ast.ClassDef):
         return module, None

@@ -15,9 +15,9 @@ _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
 def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
-    """Return what an evaluation's numbers depend on besides the policy: ``conditions`` of ``evaluation.json``.
+    """Return the conditions, besides the policy, that an evaluation's numbers depend on, as in ``evaluation.json``.
 
-    ``num_envs`` is the number of environments that was asked for; None: the default.
+    ``num_envs`` is the requested number of environments; None stands for the default.
     """
     wanted = [*_PACKAGES]
     identity: Json = worlds.identity()
@@ -32,7 +32,7 @@ def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
 
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
-    """Return how a run's record differs from this installation and the run's own worlds, here ``worlds`` if known."""
+    """Return how a run's record differs from this installation and the run's own worlds (``worlds`` if known)."""
     return differences(versions_of(folder), conditions(worlds or open_worlds(folder.config().to_json())))
 
 

@@ -45,8 +45,8 @@ class Export:
 def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last") -> Export:
     """Write a run's policy as an ONNX file: raw observations in, mean actions out, float32.
 
-    ``out`` is the file; None: ``policy.onnx`` in the run's folder. Raises BidexError for policies that remember or
-    adapt, and if the file's actions differ from torch's.
+    ``out`` is the file; the default is ``policy.onnx`` in the run's folder. Raises BidexError for policies that
+    remember or adapt, and if the file's actions differ from those of torch.
     """
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")

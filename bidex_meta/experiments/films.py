@@ -42,7 +42,7 @@ class Film:
         return width, self.height or width * 3 // 4
 
     def check(self) -> None:
-        """Raise BidexError if films cannot be written, or not in this size."""
+        """Raise BidexError if films cannot be written, or cannot have this size."""
         if self.out.suffix.lower() != ".mp4":
             return
         width, height = self.size

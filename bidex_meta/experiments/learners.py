@@ -134,7 +134,7 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
 
 
 def resolve_device(asked: str, on_gpu: bool) -> str:
-    """Return the device that a name means: ``auto`` is ``cuda`` if a GPU exists and ``on_gpu``, else ``cpu``.
+    """Return the device that a name means: ``auto`` is ``cuda`` if a GPU exists and ``on_gpu``, otherwise ``cpu``.
 
     ``on_gpu`` says whether the worlds profit from a GPU (``Worlds.on_gpu``). Other names are returned unchanged. Raises
     BidexError for an unknown or missing device, or if there are fewer GPUs than processes.

@@ -131,9 +131,9 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
 
 
 def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
-    """Return the number of episodes of each task in a shot: as asked, else the default.
+    """Return the number of episodes of each task in a shot: the requested number, or the default.
 
-    ``most`` is the largest number of environments of a class. An environment that only adapts from its own episodes
+    ``most`` is the largest number of environments of a class. An environment that adapts only from its own episodes
     plays one episode in a shot, so there are no more episodes than environments.
     """
     rollouts = asked or adaptation.rollouts
@@ -143,7 +143,7 @@ def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Return the number of environments that plays as many adaptations of each class at once as possible.
+    """Return the number of environments with which the largest number of adaptations is played at once.
 
     There are ``adaptations`` (tasks times trials) per class. Each takes ``rollouts`` environments, or several rounds in
     fewer environments. ``limit`` is the maximum number of environments, but each class gets at least one.

@@ -257,7 +257,7 @@ def _report(size: int, before: int, now: Progress, seconds: float) -> None:
 
 
 def _source_config(settings: RecordConfig) -> Json:
-    """Return the config of the source: the run's, or the settings'."""
+    """Return the config of the source: that of the runs or, without a run, one built from the recording's settings."""
     if settings.runs:
         configs = []
         for run in settings.runs:

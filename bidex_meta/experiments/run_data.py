@@ -25,7 +25,7 @@ _FORM = ("suite", "task", "base", "object", "points", "touch")
 
 
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
-    """Our entry in the metadata of a data set of a world of some source, and ``more``; all ready for JSON.
+    """Return our entry in a data set's metadata, with the items of ``more``, ready for JSON.
 
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``touch``, whether observations show
@@ -69,7 +69,10 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
-    """Return data sets as a config holds them; folders get whole paths, because a run may resume in another folder."""
+    """Return data sets in the form that a config stores: paths of folders are made absolute.
+
+    A run may be resumed from another working folder.
+    """
     return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 
 

@@ -14,10 +14,10 @@ from bidex_meta.worlds import Worlds
 
 
 def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollector:
-    """Return the world with a collector around it, of as many environments as give ``config.record`` transitions.
+    """Wrap the world in a collector with the number of environments that yields ``config.record`` transitions.
 
-    ``folder`` is the run's. Raises BidexError if there is no room for the transitions on the disk, or in memory for
-    the running episodes.
+    ``folder`` is the run's folder. Raises BidexError if the disk is too small for the transitions, or memory for the
+    running episodes.
     """
     rows = spread_environments(world, config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]

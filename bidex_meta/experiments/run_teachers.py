@@ -25,7 +25,7 @@ SCRIPTS = "scripts"
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
-    """Return teachers as a config holds them; run folders get whole paths."""
+    """Return teachers in the form that a config stores: paths of run folders are made absolute."""
     return tuple(name if name == SCRIPTS else run_data.whole_paths([name])[0] for name in names)
 
 

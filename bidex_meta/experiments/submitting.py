@@ -293,7 +293,7 @@ def _played(runs: Sequence[_Run], track: Track, episodes: int | None, device: st
 
 
 def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
-    """Return the worlds of a run's own tasks, and those of as many tasks as the suite has, which ``seed`` draws."""
+    """Return worlds of a run's own tasks, and worlds of the same number of new tasks, which ``seed`` draws."""
     config = stored.to_json()
     config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
     return open_worlds(config), open_worlds({**config, "task_seed": seed, "tasks_per_class": None})

@@ -74,7 +74,7 @@ class SweepResult:
 def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = None) -> SweepResult:
     """Train the unfinished runs of a plan, each in a separate process, and evaluate each run at its end.
 
-    A call after an interruption goes on where the last call stopped. After Ctrl-C each run saves and stops.
+    A call after an interruption continues where the last call stopped. After Ctrl-C each run saves and stops.
 
     Args:
         plan: ``SweepPlan.of(folder, configs)``, or ``SweepPlan.read(file)`` for a study file.
@@ -167,9 +167,10 @@ def state_of(run: PlannedRun) -> State:
 
 
 def hours_left(states: Sequence[State]) -> list[float]:
-    """Return the hours that each run still trains, NaN where no run tells a speed.
+    """Return the hours that each run still trains, or NaN if no run has a known speed.
 
-    The speed is the run's own, else the mean over the runs on its suite, else the mean over all runs.
+    The speed is that of the run itself if known, otherwise the mean over the runs on its suite, otherwise the mean over
+    all runs.
     """
     speeds = [(state.run.subject, state.speed) for state in states if state.speed]
     hours = []
@@ -238,10 +239,10 @@ class Job:
 
 
 class QueuedJob(Job):
-    """A job of a batch system, which is queued again if its time is up before the run's end.
+    """A job of a batch system, which is queued again if its time is up before the run ends.
 
     The batch system's signal arrives while this job waits for the run's process. A handler that waited for the same
-    process would block forever. Our handler therefore only tells the run to save and end; submitit's handler is called
+    process would block forever. Our handler therefore only asks the run to save and end; submitit's handler is called
     after the run has ended.
     """
 
@@ -270,7 +271,10 @@ class QueuedJob(Job):
                 signal.signal(number, handler)
 
     def checkpoint(self) -> Any:
-        """Return the job that submitit queues again, after the run's process has ended."""
+        """Return the job that submitit is to queue again.
+
+        submitit calls this method after the run's process has ended.
+        """
         import submitit
 
         return submitit.helpers.DelayedSubmission(QueuedJob(self.run, self.command))

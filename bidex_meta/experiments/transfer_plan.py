@@ -71,7 +71,7 @@ def arms_of(folders: Sequence[RunFolder]) -> list[Arm]:
 
 
 def held_out(worlds: Worlds, asked: Sequence[str]) -> list[str]:
-    """Return the held-out classes of a suite (tested, not trained on), all or the requested ones.
+    """Return the held-out classes of a suite (tested, not trained on): all of them, or those requested.
 
     Raises BidexError if the suite has no held-out class.
     """
@@ -140,10 +140,10 @@ def _toml(value: object) -> str:
 
 
 def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path, count: int) -> Dataset | None:
-    """Return demonstrations of a class: a given data set, else at least ``count`` episodes of the class's script.
+    """Return demonstrations of a class: a given data set, or at least ``count`` episodes of the class's script.
 
-    Returns None if there is neither a data set nor a script. BidexError is raised for a data set of other rules,
-    because an episode that succeeds under other rules may fail here.
+    Returns None if there is neither a data set nor a script. BidexError is raised for a data set that was recorded
+    under other rules, because an episode that succeeds under other rules may fail here.
     """
     worlds = open_worlds(WorldsConfig(suite=str(file)))
     task = worlds.task_classes()[name]

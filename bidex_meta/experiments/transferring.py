@@ -65,7 +65,7 @@ def transfer(
 ) -> TransferResult:
     """Train on held-out classes from a run's policy and from scratch, and compare the two.
 
-    A call after an interruption goes on where the last call stopped.
+    A call after an interruption continues where the last call stopped.
 
     Args:
         run: A run on a suite with held-out classes, whose policy is measured.

@@ -70,7 +70,7 @@ def verify(
     engine: str | None = None,
     num_envs: int | None = None,
 ) -> Verification:
-    """Evaluate a run's checkpoint again as its evaluation was made, and compare the two class by class.
+    """Repeat the recorded evaluation of a run's checkpoint, and compare the two evaluations class by class.
 
     Args:
         run: The run's folder.

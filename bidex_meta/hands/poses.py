@@ -30,9 +30,10 @@ PALM_DOWN_BACK = (math.pi, 0.0, 0.0)
 @checked_arguments
 @dataclass(frozen=True)
 class HandPose:
-    """Start pose of one hand: the mount's origin in the world, metres, and roll, pitch, yaw of the actor, radians.
+    """Start pose of one hand.
 
-    R = Rz(yaw) Ry(pitch) Rx(roll), before the mount's own turn.
+    ``position`` is the mount's origin in the world, in metres. ``rpy`` is the roll, pitch and yaw of the hand's actor
+    as in Isaac Gym, in radians: R = Rz(yaw) Ry(pitch) Rx(roll), to which the mount's own rotation is then applied.
     """
 
     position: tuple[Finite, Finite, Finite]

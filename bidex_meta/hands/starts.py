@@ -1,4 +1,4 @@
-"""Joint angles at the start of an episode, and room for an object on the hand (docs/figures.md, start noise)."""
+"""Joint angles at the start of an episode, and space for an object on the hand (docs/figures.md, start noise)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -97,7 +97,7 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
 
 def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """Do what ``make_room`` does for the convex hull of some balls, and lay the thumb flat and clear it too.
+    """Do the same as ``make_room`` for the convex hull of some balls; also lay the thumb flat and out of the way.
 
     Arguments: the object's origin (n, 3) in the mount frame; the balls' centres relative to it (n, k, 3), turned with
     the object; their radii (k,), 0 for corners; metres.

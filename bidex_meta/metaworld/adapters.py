@@ -30,7 +30,7 @@ class ForMetaWorld:
     """Adapts one of our agents to ``metaworld.evaluation``, which passes and expects NumPy arrays.
 
     ``agent`` is an Agent for ``evaluation``, or a MetaLearningAgent for ``metalearning_evaluation``. ``task_of_row``
-    numbers the task of each environment from 0 on; if it is None, each environment has its own task.
+    holds each environment's task number (0, 1, ...); if it is None, each environment has its own task.
     """
 
     @checked_arguments
@@ -74,7 +74,10 @@ class ForMetaWorld:
         return _array(action), {k: _array(v) if isinstance(v, Tensor) else v for k, v in outputs.items()}
 
     def step(self, timestep: tuple) -> None:
-        """Pass on one transition of every environment: Meta-World's Timestep, or its first six entries."""
+        """Pass one transition of every environment to the agent.
+
+        ``timestep`` is Meta-World's Timestep, or a tuple of its first six entries.
+        """
         obs, action, reward, terminated, truncated, outputs = timestep[:6]
         tensors = [self._tensor(value) for value in (obs, action, reward, terminated, truncated)]
         outputs = {k: self._tensor(v) if isinstance(v, np.ndarray) else v for k, v in outputs.items()}
@@ -130,7 +133,7 @@ class FromMetaWorld:
         return torch.as_tensor(action, device=obs.device), outputs
 
     def step(self, timestep: Timestep) -> None:
-        """Pass on one transition of every environment."""
+        """Pass one transition of every environment to the agent."""
         assert self._over is not None  # reset comes first
         running = ~self._over
         ended = (timestep.terminated | timestep.truncated) & running

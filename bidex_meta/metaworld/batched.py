@@ -1,4 +1,7 @@
-"""Meta-World's MT suites as a world, stepped one by one, with Meta-World's own tasks, rewards and physics."""
+"""A world that runs Meta-World's MT suites, with Meta-World's own tasks, rewards and physics.
+
+The world steps its environments one after another.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,14 +31,16 @@ from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 
 
 class MetaWorldWorld(ForeignWorld):
-    """A suite of Meta-World's on the CPU, a key of ``suite.METAWORLD_SUITES``: a world whose slots are the classes.
+    """A world that runs one of Meta-World's suites on the CPU; each class is a slot.
+
+    ``suite`` is a key of ``suite.METAWORLD_SUITES``.
 
     Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are its "v2" in
     [0, 10]; an episode is 500 steps, ended only by the time limit. Starts are part of Meta-World's tasks: an episode
-    depends only on its task and actions. A task's variation is its number among the class's fifty. ``seed`` chooses
-    Meta-World's tasks, and the draws of tasks until ``reset(seed=...)``; other keywords are those of ``World``.
-    Raises BidexError for an unknown suite or mode, for fewer environments than classes, or if Meta-World is not
-    installed.
+    depends only on its task and actions. A task's variation is its number among the class's fifty tasks. ``seed``
+    determines Meta-World's tasks, and which tasks are drawn until ``reset(seed=...)`` is called; other keywords are
+    those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments than classes, or if
+    Meta-World is not installed.
     """
 
     def __init__(

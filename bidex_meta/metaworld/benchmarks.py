@@ -2,7 +2,7 @@
 
 As in Meta-World, `MT1` and `ML1` take any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
 `("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. Hands move, as in every suite;
-`seed` chooses the tasks, None: 0.
+`seed` chooses the tasks (None stands for 0).
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""`metaworld.evaluation` on environments of this benchmark: its own functions, given the names of our classes.
+"""`metaworld.evaluation` on environments of this benchmark: Meta-World's own functions, with our class names.
 
 With several environments per class these functions count the first episodes that finish, and success ends an episode,
 so easy tasks are counted more often than hard ones. `bidex_meta.evaluation` plays each task equally often.

@@ -22,7 +22,7 @@ _BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNIN
 
 
 def mended() -> ModuleType:
-    """Return Meta-World's module, its environments fixed in this process; ModuleNotFoundError if not installed.
+    """Return Meta-World's module with its environments fixed; raise ModuleNotFoundError if it is not installed.
 
     Meta-World 3.0.0 sets the hand's weld by eleven numbers for a whole row of ``eq_data``, which is twelve wide since
     MuJoCo 3.17, so no environment could be made. The fix writes the numbers to the first eleven entries.

@@ -1,7 +1,7 @@
 """Meta-World's functions that make environments: `make_mt_envs`, `make_ml_envs`, and the makers of its Gymnasium ids.
 
-Single environments in Meta-World's own wrappers run in Gymnasium's vector environments; each keyword has Meta-World's
-meaning.
+Each environment is wrapped in Meta-World's own wrappers, and Gymnasium's vector environments run them together.
+Keywords mean the same as in Meta-World.
 """
 
 import warnings

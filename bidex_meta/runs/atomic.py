@@ -46,9 +46,9 @@ def temporary_name(path: Path) -> Path:
 
 @contextlib.contextmanager
 def room_for(folder: Path, size: int, count: int) -> Iterator[None]:
-    """Hold the room of ``count`` files of ``size`` bytes in a folder until its leftovers are removed.
+    """Reserve disk space for ``count`` files of ``size`` bytes in a folder until its leftovers are removed.
 
-    Raises BidexError if the disk, a quota or a limit of the process does not grant this room.
+    Raises BidexError if the disk, a quota or a limit of the process does not grant this space.
     """
     remove_leftovers(folder)
     free = shutil.disk_usage(folder).free

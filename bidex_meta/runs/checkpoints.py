@@ -42,7 +42,7 @@ class Checkpoints:
 
     @property
     def best(self) -> Path:
-        """Return the path of the policy that did best in an evaluation during training; it exists if there was one."""
+        """Return the path of the policy with the best evaluation during training; the file may not exist."""
         return self.folder / "best.pt"
 
     @checked_arguments
@@ -56,7 +56,7 @@ class Checkpoints:
     def room(self, size: int) -> Iterator[None]:
         """Reserve ``size`` bytes for the first checkpoint until it is saved, so that saving cannot fail.
 
-        Raises BidexError if there is no such room.
+        Raises BidexError if there is not enough space.
         """
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)
@@ -99,7 +99,7 @@ class Checkpoints:
         self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": results})
 
     def found_of_best(self) -> dict[str, float] | None:
-        """Return the results of the policy in ``best.pt``; None if there is no readable one."""
+        """Return the results of the policy in ``best.pt``; None if there is no readable file."""
         content = _read(self.best, "none is known") if exists(self.best) else None
         if content is None:
             return None
@@ -210,7 +210,7 @@ def _check_archive(file: IO[bytes]) -> None:
 def weights_digest(policy: State) -> str:
     """Return 32 hexadecimal digits of a policy's tensors, which identify copies of one run.
 
-    Numbers enter in half precision, in which published policies are stored.
+    Numbers are rounded to half precision, in which published policies are stored.
     """
     return _digest({"weights": _halved(policy.get("weights", policy))})[:32]
 

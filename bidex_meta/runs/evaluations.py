@@ -46,7 +46,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A measure over all classes of an evaluation: statistics of the classes' means."""
+    """A measure over all classes of an evaluation: statistics of the class means."""
 
     mean: Finite
     interval: Interval | None
@@ -115,7 +115,7 @@ class SplitSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """The environment of an evaluation that its numbers depend on; None: not recorded, or the default."""
+    """Conditions that an evaluation's numbers depend on; None means that an entry is not recorded, or the default."""
 
     device: Text | None = None
     engine: Engine | None = None

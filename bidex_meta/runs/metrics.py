@@ -87,10 +87,10 @@ def training_seconds(rows: Sequence[Json]) -> float:
 
 @checked_arguments
 def mend(path: Path, step: Whole) -> list[Json]:
-    """Return the lines up to ``step`` of a run that resumes from there, even if its metrics are damaged.
+    """Return the lines up to ``step`` for a run that resumes from this step, even if its metrics are damaged.
 
-    If the metrics are no file, or a line before the last cannot be read, they are kept as ``metrics.jsonl.damaged`` and
-    reported: damaged metrics must not prevent resuming from a good checkpoint.
+    If the metrics are not a file, or a line before the last cannot be read, they are kept as ``metrics.jsonl.damaged``
+    and reported: damaged metrics must not prevent resuming from a good checkpoint.
     """
     try:
         lines = _lines(path)
@@ -112,7 +112,7 @@ def _keep(path: Path, lines: Sequence[bytes]) -> None:
 
 
 def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
-    """Return every line that is not empty, and its numbers by name, None if unreadable; the file may be missing."""
+    """Return every line that is not empty with its numbers by name (None if unreadable); the file may be missing."""
     if missing and not exists(path):
         return []
     lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")

@@ -84,9 +84,9 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
 def draw_panels(
     panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
 ) -> "Figure":
-    """Draw a metric, labelled ``title``, against environment steps; a panel per name, all on one scale.
+    """Draw a metric, labelled ``title``, against environment steps, with one panel per name, all on one scale.
 
-    ``unit``: the size of one unit of ``Curve.steps``, and its name.
+    ``unit`` is the size of one unit of ``Curve.steps``, and the unit's name.
     """
     labels = list(dict.fromkeys(label for label, _ in chain.from_iterable(panels.values())))
     figure = _figure(5.2 * len(panels), 3.6)
@@ -117,7 +117,7 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> "Figure":
 def draw_adaptation(evaluation: Evaluated, where: object) -> "Figure":
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is no meta-test;
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is not a meta-test;
     ``where`` names its source.
     """
     if not isinstance(evaluation, MetaTestEvaluation):
@@ -163,7 +163,7 @@ def _figure(width: float, height: float) -> "Figure":
 
 
 def _task_panels(blocks: Sequence[Sequence[str]]) -> "tuple[Figure, list[list[tuple[Axes, Axes]]]]":
-    """Return a figure with a panel of return above one of success for each name; each block begins a new row."""
+    """Return a figure with, for each name, a panel of return above a panel of success; each block begins a row."""
     columns = [min(_COLUMNS, len(names)) for names in blocks]
     heights = [-(-len(names) // width) for names, width in zip(blocks, columns, strict=True)]
     figure = _figure(3.2 * max(columns), 4.0 * sum(heights))
@@ -226,7 +226,7 @@ def _draw_groups(
 
 
 def _colour(number: int) -> tuple[float, float, float]:
-    """Return the colour of a group: ten strong colours, then ten light ones, then again from the first."""
+    """Return the colour of a group: ten strong colours, then ten light colours, then the same again."""
     colours = _matplotlib().colormaps["tab20"].colors
     return (colours[0::2] + colours[1::2])[number % len(colours)]
 

@@ -35,10 +35,11 @@ class PlainConsole(Console):
 
 
 class Progress:
-    """A display of steps per second, time left, mean return and success, and both per task, on stderr or ``stream``.
+    """Displays steps per second, time left, and return and success (mean and per task), on stderr or ``stream``.
 
-    Total steps and seconds are those of the whole run; its training time is the metric ``Perf/training_time``. If there
-    is a time limit, progress is shown against it. Speed counts from ``start_step`` on, the first step of this process.
+    Total steps and seconds are those of the whole run; the run's training time is the metric ``Perf/training_time``. If
+    there is a time limit, progress is shown against it. Speed is measured from ``start_step``, the first step of this
+    process.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""Records of the versions that a run or an evaluation was made with, and their differences, for all readers of runs.
+"""Records of the versions that a run or an evaluation was made with, and the differences between them.
 
 A record is ``versions.json`` of a run, ``conditions`` of an evaluation, or the present installation and suite:
 ``packages`` (versions by name), ``physics``, ``suite_version`` and ``suite_digest``. An entry that only one of two
-records has is no difference.
+records has does not count as a difference.
 """
 
 from collections import defaultdict
@@ -40,7 +40,7 @@ class Difference(NamedTuple):
 
 
 def differences(then: Record, now: Record) -> list[Difference]:
-    """Return the entries of both records whose values differ; packages missing in ``now`` do not count."""
+    """Return the entries of both records whose values differ; packages that ``now`` lacks do not count."""
     before = _values(then)
     differing = []
     for name, value in _values(now).items():
@@ -68,7 +68,7 @@ def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
 
 
 def check_alike(runs: Sequence[Run]) -> None:
-    """Raise BidexError if runs that should be seeds of one experiment were made with different worlds."""
+    """Raise BidexError if runs that are to be seeds of one experiment were made with different worlds."""
     records = split_by_worlds(runs)
     for run, record in zip(runs, records, strict=True):
         for name, value in record.items():

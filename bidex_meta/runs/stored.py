@@ -114,7 +114,7 @@ Run = RunFolder | StoredRun
 
 
 def open_runs(path: Path) -> list[Run]:
-    """Open the run of a folder, all runs of a study's file, or one of them (``FILE:RUN``).
+    """Open the run of a folder, all runs of a study's file, or one run of such a file (``FILE:RUN``).
 
     Raises BidexError if there is no such run, or its file is damaged.
     """

@@ -37,7 +37,7 @@ def write_image(path: Path, frame: np.ndarray) -> None:
 
 
 def film_suffix() -> str:
-    """Return the default suffix of a film: .mp4 if MP4 can be written, else .webp."""
+    """Return the default suffix of a film: .mp4 if MP4 can be written, otherwise .webp."""
     if find_spec("imageio_ffmpeg"):
         return ".mp4"
     return ".webp"
@@ -78,7 +78,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float) -> Non
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; returns the frame count.
+    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; return the frame count.
 
     Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError if imageio-ffmpeg is missing,
     and OSError if the file cannot be written; an earlier file then stays.

@@ -36,7 +36,7 @@ class Error(NamedTuple):
 
 
 def at_least(value: Tensor, least: float, tolerance: float) -> Error:
-    """Return the error of a value that must exceed ``least``, zero from ``least`` + ``tolerance`` on."""
+    """Return the error of a value that must exceed ``least``; it is zero at ``least`` + ``tolerance`` and above."""
     return Error((least + tolerance - value).clamp(min=0.0), tolerance)
 
 
@@ -46,7 +46,7 @@ def within(errors: list[Error]) -> Tensor:
 
 
 def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> dict[str, Tensor]:
-    """Return the terms (n,) of the reward of version 2, in [0, 1]: the sum is 1 if ``solved``, else at most 0.9.
+    """Return the terms (n,) of the reward of version 2, in [0, 1]: their sum is 1 if ``solved``, otherwise at most 0.9.
 
     ``solved`` is 1 or 0. If it is 0, the terms are ``far`` and ``near``, means over the class's errors e in units of
     their tolerances, of 1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes

@@ -181,7 +181,7 @@ class TaskClass(ABC):
         self._order = [drawn.index(name) for name in self.wide_space.names]
 
     def varied(self, shares: Tensor) -> Tensor:
-        """Return variations (n, variation_space.size) at shares in [0, 1), (n, at least this size), of the space."""
+        """Return the variations (n, variation_space.size) at the given shares, in [0, 1), of the variation space."""
         space = self.variation_space
         low = constant(space.low, shares)
         high = constant(space.high, shares)
@@ -252,9 +252,10 @@ class TaskClass(ABC):
         return self.episode_space.size + self.start_draws + (more if self.rules.jittered else 0)
 
     def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Run ``start``, then apply the additions of the suite's rules; ``draws`` are (n, self.draws).
+        """Run ``start``, then apply what the suite's rules add.
 
-        The first draws are those of ``episode_space``, which ``frozen`` contains already.
+        ``draws`` has shape (n, self.draws). Its first columns belong to ``episode_space``; ``frozen`` already contains
+        the values that follow from them.
         """
         draws = draws[:, self.episode_space.size :]
         self.start(draws[:, : self.start_draws], frozen, qpos)
@@ -275,7 +276,7 @@ class TaskClass(ABC):
             joints.copy_(torch.where(meets[:, None], steady[side], joints))
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, tuple[float, float, float]]]:
-        """Return boxes so close to a hand that joint noise might push its fingers into them; none by default.
+        """Return boxes so close to a hand that joint noise might push fingers into them; empty by default.
 
         Each entry is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A
         hand that noise would push into its box starts without noise.
@@ -283,7 +284,7 @@ class TaskClass(ABC):
         return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the layout's blocks that no sensor gives, by name, each (n, size); none by default."""
+        """Return the layout's blocks that sensors do not give, by name, each (n, size); empty by default."""
         return {}
 
     @abstractmethod
@@ -299,7 +300,7 @@ class TaskClass(ABC):
         raise NotImplementedError
 
     def hides(self) -> tuple[Hidden, ...]:
-        """Return the parts of a task that only goal entries show, with success tolerances; none by default."""
+        """Return the parts of a task that only goal entries show, with success tolerances; empty by default."""
         return ()
 
     def hidden_columns(self) -> list[int]:
@@ -314,7 +315,7 @@ class TaskClass(ABC):
     def instruct(self, goal: Mapping[str, float] | None) -> str:
         """Return what a task asks for as a sentence without a full stop; ``summary`` by default.
 
-        ``goal`` holds the components of ``hides`` by name. None: the sentence must not say what they are.
+        ``goal`` holds the components of ``hides`` by name. If it is None, the sentence must not reveal them.
         """
         return self.summary
 
@@ -344,7 +345,7 @@ class TaskClass(ABC):
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals to draw in pictures of a state; none by default. Suites that hide goals draw none."""
+        """Return the goals to draw in pictures of a state; empty by default. Suites that hide goals draw no goals."""
         return []
 
     def __repr__(self) -> str:

@@ -131,7 +131,7 @@ class PushBlock(_TwoBlocks):
         return super().freeze(variation) | {"goal1": first, "goal2": second}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the goals of both blocks with wide variation, else nothing."""
+        """Return the goals of both blocks with wide variation, otherwise an empty dict."""
         if not self.rules.wide:
             return {}
         goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)

@@ -146,9 +146,10 @@ class _Door(ReachTask):
 
 
 def _on_leaf(base: Tensor, leaf: int, angle: Tensor, point: Point) -> Tensor:
-    """Return poses (n, 7) of a point of a leaf, given in its frame, metres, at an angle (n, 1) of its hinge.
+    """Return the poses (n, 7) of a point on a door leaf when the hinge is at an angle (n, 1), in radians.
 
-    ``base``: the door's poses (n, 7); ``leaf``: 0 for the right one, 1 for the left one. Quaternions (x, y, z, w).
+    ``base`` holds the door's poses (n, 7); ``leaf`` is 0 for the right leaf and 1 for the left leaf. ``point`` is given
+    in the leaf's frame, in metres. Quaternions are (x, y, z, w).
     """
     half = 0.5 * (angle if leaf else -angle)
     turn = multiply(base[:, 3:], torch.cat((torch.zeros_like(half), torch.zeros_like(half), half.sin(), half.cos()), 1))

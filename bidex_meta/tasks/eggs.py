@@ -30,7 +30,10 @@ JOINT_DRAWS = 24
 
 
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
-    """Return, for ``""``, or ``"1"`` and ``"2"``, the blocks of ``object`` or ``object1``, ... and its goal."""
+    """Return the observation blocks of each object and its goal.
+
+    ``numbers`` holds ``""`` for a single ``object``, or ``"1"`` and ``"2"`` for ``object1`` and ``object2``.
+    """
     blocks: list[Block] = []
     for i in numbers:
         blocks += (*object_blocks(f"object{i}"), *goal_blocks(f"goal{i}"))

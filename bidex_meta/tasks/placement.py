@@ -53,6 +53,6 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
 
 def place_all(names: Iterable[str], qpos: dict[str, Tensor], frozen: dict[str, Tensor], draws: Tensor) -> None:
-    """Place several objects, each by the frozen numbers of its name and its share of the draws, ``DRAWS`` each."""
+    """Place several objects; each uses the frozen numbers under its name and ``DRAWS`` of the draws."""
     for name, jitter in zip(names, draws.split(DRAWS, dim=1), strict=True):
         place(qpos[name], frozen[name], jitter)

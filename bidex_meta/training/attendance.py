@@ -1,4 +1,4 @@
-"""Watch which processes of a run are alive, for the message after one of them was lost."""
+"""Watch which processes of a run are alive, for the message that reports a lost process."""
 
 import os
 import signal

@@ -113,7 +113,7 @@ def report_loss() -> list[int] | None:
 
 
 def on_loss(function: Callable[[], None]) -> None:
-    """Set the function to call before a process ends that cannot stop when asked, because it waits for a lost one."""
+    """Set a function that is called before a process ends because it waits for a lost process and cannot stop."""
     if _attendance is not None:
         _attendance.on_loss = function
 
@@ -138,7 +138,7 @@ def _reduced(x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
 
 
 def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pool mean, biased variance and count over the processes; three tensors of one shape."""
+    """Pool mean, biased variance and count over the processes; the three tensors have the same shape."""
     if world_size() == 1:
         return mean, var, count
     n = count.double()

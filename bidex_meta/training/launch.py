@@ -35,7 +35,7 @@ class Launch:
 
 
 def launch() -> Launch:
-    """Read this process's description from the environment, on every call."""
+    """Return this process's rank and the number of processes, read from the environment variables on every call."""
     # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
     if "MASTER_ADDR" not in os.environ:
         return Launch()

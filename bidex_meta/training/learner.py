@@ -32,7 +32,7 @@ class LearnerConfig(Checked):
         return type(self).__name__.removesuffix("Config").lower()
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory of a learner that stores ``width`` numbers per step of an environment."""
+        """Estimate the memory, in bytes, of a learner that stores ``width`` numbers per step of an environment."""
         return 0
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
@@ -42,7 +42,7 @@ class LearnerConfig(Checked):
 
 @dataclass(frozen=True)
 class Sources:
-    """Sources that a learner learns from in addition to its own experience; None: no such source."""
+    """Sources from which a learner learns in addition to its own experience; None means no such source."""
 
     data: Any = None
     """Transitions of data sets (``bidex_meta.data.joined.Joined``), for offline learners."""

@@ -54,7 +54,7 @@ def checked_arguments(target: Target) -> Target:
 
     ``int`` stands for any whole number, NumPy's too; ``float`` for any real number except NaN; neither for True and
     False. A protocol stands for whatever has its attributes. ``Annotated`` adds bounds. Up to 1,000 elements of a
-    collection are checked. Annotations that say nothing (``Any``) and missing ones allow everything.
+    collection are checked. ``Any`` and missing annotations allow everything.
     """
     if isinstance(target, type):
         target.__init__ = checked_arguments(target.__init__)  # type: ignore[misc]

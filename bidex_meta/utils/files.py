@@ -142,7 +142,7 @@ def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Json]) 
 
 
 def bounded(content: Json) -> Json:
-    """Return the same content; raises ValueError if it is nested too deep, or has a whole number beyond 64 bits."""
+    """Return the same content; raise ValueError if it is nested too deeply, or has an integer beyond 64 bits."""
     level = [content]
     for _ in range(_DEEPEST):
         if not level:

@@ -1,7 +1,7 @@
-"""The choice of how MuJoCo draws on this machine: a screen, else EGL, else OSMesa, made before the first picture.
+"""The choice of how MuJoCo draws (a screen, otherwise EGL, otherwise OSMesa), made before the first picture.
 
-MuJoCo chooses at import, by ``MUJOCO_GL`` alone, and its import fails if the variable names a missing library. Most
-runs draw nothing and must not fail on that.
+MuJoCo chooses at import, only by ``MUJOCO_GL``, and its import fails if the variable names a missing library. Most runs
+draw nothing and must not fail on that.
 """
 
 import os

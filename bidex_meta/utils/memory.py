@@ -63,7 +63,7 @@ def _free_of_groups() -> Iterator[int]:
 
 
 def _cpu_quotas() -> Iterator[float]:
-    """Yield the cores' worth of time that each quota allows."""
+    """Yield, for each quota, the number of cores whose time it allows."""
     for group in _groups("cpu"):
         version_1 = _numbers(group / "cpu.cfs_quota_us") + _numbers(group / "cpu.cfs_period_us")
         for quota in (_numbers(group / "cpu.max"), version_1):

@@ -68,7 +68,7 @@ def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
 
 
 def own_fault(error: BaseException) -> str | None:
-    """Return message and location of an error that was raised in a class of the user's own or below it, else None."""
+    """Return message and location of an error raised in a user's own class or below it, or None for other errors."""
     at = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError):
         at.append((error.filename or "", error.lineno))

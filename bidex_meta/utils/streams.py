@@ -1,4 +1,4 @@
-"""The standard streams of the command line: closed ones, odd encodings and widths, and ones without a reader."""
+"""The standard streams of the command line: closed streams, odd encodings and widths, streams without a reader."""
 
 import contextlib
 import io
@@ -48,7 +48,7 @@ def bound_width() -> None:
 
 
 def output_width(unknown: int) -> int:
-    """Return the width of stdout in columns: COLUMNS, else the terminal's, else ``unknown``."""
+    """Return the width of stdout in columns: COLUMNS if set, otherwise that of the terminal, otherwise ``unknown``."""
     if "COLUMNS" in os.environ or sys.stdout.isatty():
         return shutil.get_terminal_size().columns
     return unknown

@@ -102,7 +102,7 @@ def parse(content: object, kind: type[Kind], where: str, exact: bool = False) ->
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
     """Return an argument of any integer type as an int within bounds.
 
-    Raises BidexError if it is no whole number (1.0, True and "1" are none), or out of bounds.
+    Raises BidexError if it is not an integer (1.0, True and "1" are not), or out of bounds.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -162,7 +162,10 @@ def _plain(hint: object) -> bool:
 
 
 def _refuse_unknown(content: object, kind: object, where: str, place: str = "") -> None:
-    """Raise BidexError for the first name in a table that is no field of its dataclass, with the nearest field."""
+    """Raise BidexError for the first name in a table that is not a field of the dataclass ``kind``.
+
+    The message suggests the most similar field, or lists all fields.
+    """
     if get_origin(kind) is Annotated:
         _refuse_unknown(content, get_args(kind)[0], where, place)
     elif dataclasses.is_dataclass(kind) and isinstance(content, dict):

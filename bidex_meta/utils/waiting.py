@@ -17,7 +17,7 @@ _SECONDS = 14.0
 
 
 class _Watch:
-    """The command's activity, its begin, and the time of the last printed line."""
+    """The command's activity, when it began, and when the last line was printed."""
 
     def __init__(self, what: str, clock: Callable[[], float]):
         self.clock = clock

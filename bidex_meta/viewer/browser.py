@@ -69,7 +69,10 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Browser:
-    """A ``Screen`` as a web server (``host`` 0.0.0.0: for all), on the next free port."""
+    """A ``Screen`` that a browser shows, served on the first free port from ``port`` upwards.
+
+    With ``host`` 0.0.0.0, other machines can connect.
+    """
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
         viser = import_module("viser")

@@ -65,7 +65,7 @@ class Simulator:
         self._engine.reset(self._everyone, self._start.expand(num, -1))
 
     def starts(self, shifted: int, seed: int = SEED) -> list[State]:
-        """Return the start state, followed by ``shifted`` shifted ones.
+        """Return the start state, followed by ``shifted`` shifted starts.
 
         In a shifted start every object or fixture is moved by 0.1 mm in the plane.
         """
@@ -169,7 +169,7 @@ def frames(
 ) -> Iterator[np.ndarray]:
     """Yield pictures (height, width, 3) uint8 of a witness.
 
-    ``at`` lists the numbers of steps after which to draw, from 0 on; None: after each.
+    ``at`` lists the step numbers (0, 1, ...) after which a picture is drawn; None stands for every step.
     """
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):
@@ -181,7 +181,7 @@ def frames(
 
 
 def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
-    """Play a witness of a class from its start and from ten shifted ones."""
+    """Play a witness of a class from its start and from ten shifted starts."""
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
     actions = torch.from_numpy(witness.actions)[:, None].expand(-1, simulator.num, -1)

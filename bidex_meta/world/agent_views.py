@@ -1,7 +1,7 @@
-"""Views of several agents on a world: what each observes and which actions are its own (appendix A.2).
+"""Views of several agents on a world: the observation entries and the actions of each agent (appendix A.2).
 
 The smallest agents are a hand's fingers and its palm (with wrist and base). An agent observes the whole block of each
-hand it has a unit of, and all that is of no hand: object, goal, task id. All share the reward.
+hand of which it has a unit, and all entries that belong to no hand: object, goal, task id. All agents share the reward.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ class AgentView:
 
     @property
     def columns(self) -> tuple[int, ...]:
-        """The entries of the world's observation that it sees, ascending."""
+        """Entries of the world's observation that the agent sees, ascending."""
         columns: list[int] = []
         for group in self.groups:
             for part in group.where:
@@ -35,7 +35,7 @@ class AgentView:
         return tuple(sorted(columns))
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
-        """Return the groups as they stand in its own observation, which is :attr:`columns` side by side."""
+        """Return the observation groups by their places in the agent's own observation (:attr:`columns`)."""
         index = {column: i for i, column in enumerate(self.columns)}
         parts = [(slice(index[part.start], index[part.stop - 1] + 1) for part in group.where) for group in self.groups]
         return tuple(ObservationGroup(g.name, _joined(where)) for g, where in zip(self.groups, parts, strict=True))
@@ -45,8 +45,8 @@ def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Ag
     """Return the agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
 
     ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or units by agent; a world without hands has the
-    units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError for a unit that is
-    unknown, missing or there twice, and where only some bases move.
+    units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError if a unit is unknown,
+    missing or named twice, or if only some bases move.
     """
     units = _units(groups, num_actions)
     views = []

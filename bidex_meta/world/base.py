@@ -40,7 +40,10 @@ class Slots(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """A step of n environments, before rewards are scaled and broken ones cleaned: (n, d), float32 and bool (n,)."""
+    """One step of n environments, before rewards are scaled and values of broken environments are replaced.
+
+    Observations have shape (n, d) and are float32, as are rewards (n,); flags are bool (n,).
+    """
 
     obs: Tensor
     reward: Tensor
@@ -56,8 +59,8 @@ class Transition(NamedTuple):
 class BatchedWorld(VectorEnv, ABC):
     """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
 
-    Worlds pickle and copy: a copy is built again and continues bit for bit. Of the attributes that were set from
-    outside, only ``stagger`` is copied.
+    Worlds pickle and copy: a copy is built again and continues bit for bit. ``stagger`` is the only attribute set from
+    outside that is copied.
     """
 
     single_observation_space: Box
@@ -89,7 +92,7 @@ class BatchedWorld(VectorEnv, ABC):
         stagger: bool,
         seed: object,
     ) -> None:
-        """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds what it steps.
+        """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds its own simulation.
 
         ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation);
         with ``stagger`` first episodes begin at a random elapsed step (not in DISABLED). Raises BidexError for fewer
@@ -192,7 +195,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @abstractmethod
     def _start(self, mask: Tensor, stagger: bool) -> None:
-        """Start the environments of a mask (``_count_episodes``) and write their observations into ``_obs``."""
+        """Start episodes in the environments of a mask (``_count_episodes``), and write observations into ``_obs``."""
 
     def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
         """Count new episodes in the environments of a mask.
@@ -221,7 +224,7 @@ class BatchedWorld(VectorEnv, ABC):
     def _move(self, active: Tensor, broken: Tensor) -> Outcome:
         """Step the ``active`` environments under ``_action`` and ``_finish``, before new episodes start.
 
-        ``broken``: the active environments whose action was not finite.
+        ``broken`` are the active environments whose action was not finite.
         """
 
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> Outcome:
@@ -262,15 +265,16 @@ class BatchedWorld(VectorEnv, ABC):
         return reward, terminated, truncated, info
 
     def state_dict(self) -> State:
-        """Return tensors and plain values, copied, from which the world continues bit for bit."""
+        """Return copies of the tensors and plain values from which the world continues bit for bit."""
         state = {"made": self._made(), "seed": self.seed, "episodes": self.episodes.state_dict()}
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     def _made(self) -> dict[str, str]:
         """Return the settings that decide the world's future besides its state, as texts by name.
 
-        A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out
-        because a run may continue with others, and modes because an evaluation may finish episodes of training.
+        A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out,
+        because a run may continue with others. Modes are left out, because an evaluation may finish episodes of
+        training.
         """
         made = {"slots": ", ".join(self.task_names)}
         for name, steps, scale in zip(*self._slots[:3], strict=True):
@@ -279,7 +283,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
-        """Restore a ``state_dict`` of a world that was made alike; all of it or nothing."""
+        """Restore a ``state_dict`` of a world made in the same way. If an error is raised, nothing has changed."""
 
     def _restore(self, state: State) -> None:
         self._set_seed(int(state["seed"]))
@@ -301,7 +305,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment: its own entry if there is one for each, else the world's value."""
+        """Return an attribute for each environment: its entry if there is one per environment, or the world's value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:
@@ -323,7 +327,7 @@ class BatchedWorld(VectorEnv, ABC):
 
 
 def split_envs(num_envs: int, slots: int) -> list[slice]:
-    """Return the contiguous environments of each slot, an even split; the first slots take the remainder."""
+    """Return the contiguous environments of each slot; the split is even, and the first slots take the remainder."""
     share, rest = divmod(num_envs, slots)
     stops = [share * (i + 1) + min(i + 1, rest) for i in range(slots)]
     return [slice(stop - share - (i < rest), stop) for i, stop in enumerate(stops)]

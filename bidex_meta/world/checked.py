@@ -35,7 +35,7 @@ _ROWS = 11
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
-    """Return the number of environments; raise BidexError unless it is a whole number, at least one per slot."""
+    """Return the number of environments; raise BidexError unless it is an integer and at least one per slot."""
     number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
     if number < len(slots):
         raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
@@ -43,7 +43,7 @@ def num_envs(given: object, slots: Sequence[str]) -> int:
 
 
 def seed(given: object) -> int:
-    """Return the seed of a world; raise BidexError unless it is a whole number from 0 on."""
+    """Return the seed of a world; raise BidexError unless it is a non-negative integer."""
     return whole_number("seed", given, 0, _LARGEST_SEED)
 
 
@@ -60,7 +60,7 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
 
 
 def episodes_per_task(given: object, task_sampling: str, mode: AutoresetMode) -> None:
-    """Raise BidexError unless the number is whole, from 1, and is 1 in a world whose environments keep their tasks."""
+    """Raise BidexError unless the number is a positive integer, and 1 if the world's environments keep their tasks."""
     number = whole_number("episodes_per_task", given, 1, MOST_EPISODES)
     keeps = task_sampling == "fixed" or mode == AutoresetMode.DISABLED
     if number > 1 and keeps:
@@ -86,13 +86,19 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.dev
 
 
 def one_row(action: np.ndarray) -> np.ndarray | Tensor:
-    """Return the action (a,) of a single environment as a batch (1, a); anything but an array of numbers unchanged."""
+    """Return the action (a,) of a single environment as a batch (1, a).
+
+    Anything but an array of numbers is returned unchanged.
+    """
     given = dense(action, torch.device("cpu"))
     return action if given is None else given[None]
 
 
 def clean(action: Tensor) -> tuple[Tensor, Tensor]:
-    """Return actions (n, a) clipped to [-1, 1], 0 for non-finite numbers, and which environments had one, bool (n,)."""
+    """Return actions (n, a) clipped to [-1, 1], and which environments had a non-finite number, bool (n,).
+
+    Non-finite numbers become 0.
+    """
     # Zero times a number is zero unless the number is infinite or NaN.
     broken = (0.0 * action).sum(dim=1) != 0.0
     return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
@@ -103,7 +109,7 @@ def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> l
 
     ``task_id`` (n,): slot of each environment.
 
-    Raises BidexError for another world's state, or a damaged one.
+    Raises BidexError if the state belongs to another world or is damaged.
     """
     fits(given, own)
     if given["slots"] != own["slots"]:
@@ -221,8 +227,9 @@ def own_numbers(
 ) -> None:
     """Raise BidexError if a user's own class returned numbers that are not finite in environments with sound physics.
 
-    ``values`` by name, each (n, ...), belong to these ``rows`` of ``unstable``, which returns the environments with
-    broken physics, bool (num,). Shipped classes are not checked, because their formulas are tested.
+    ``values`` maps names to tensors (n, ...) with one row per environment in ``rows``. ``unstable()`` returns a mask,
+    bool (num,), of all environments with broken physics. Shipped classes are not checked, because their formulas are
+    tested.
     """
     if type(task).__module__.startswith("bidex_meta."):
         return

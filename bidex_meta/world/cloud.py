@@ -18,8 +18,7 @@ FIELD_OF_VIEW = 60.0
 class Camera:
     """An upright pinhole camera with a square image that shows distances from ``near`` to ``far``; world, metres.
 
-    Attributes:
-        eye: Its position.
+    Attributes: eye: Position of the camera.
         target: Point in the middle of its image.
         field_of_view: Full angle of the image, degrees.
     """
@@ -46,7 +45,7 @@ class Camera:
 
 
 def camera_of(task: TaskClass) -> Camera:
-    """Return the depth camera of a class: its own, or one that looks down at the target of its pictures."""
+    """Return the depth camera of a class: its own camera, or one that looks down at the target of its pictures."""
     if task.depth_camera is not None:
         return Camera(*task.depth_camera)
     away = np.array(_DIRECTION) / np.linalg.norm(_DIRECTION)
@@ -71,9 +70,9 @@ class Cloud:
     """Clouds of environments of one model.
 
     A candidate is visible if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of
-    a coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
+    a coarse depth buffer. Shapes do not depend on values, so that CUDA graphs can record the computation.
 
-    A cloud has ``count`` points; with ``kinds`` each has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
+    A cloud has ``count`` points; with ``kinds`` each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
     """
 
     def __init__(
@@ -108,10 +107,11 @@ class Cloud:
         self._size = len(surfaces.points)
 
     def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Return clouds of n environments, world frame, metres: (n, *shape), float32; zeros if nothing is visible.
+        """Return the clouds of n environments in the world frame, in metres: (n, *shape), float32.
 
-        Fewer visible candidates than points are repeated, of more an even share is taken. Hidden ones change no bit.
-        Positions (n, nbody, 3), metres, and rotation matrices (n, nbody, 3, 3) are of the model's bodies.
+        If there are fewer visible candidates than points, candidates are repeated; if there are more, an evenly spread
+        subset is taken. Hidden candidates do not affect the result. If nothing is visible, the cloud is all zeros.
+        ``position`` (n, nbody, 3), in metres, and ``rotation`` (n, nbody, 3, 3) are those of the model's bodies.
         """
         if position.device.type == "cpu" and len(position) > _CHUNK:
             pairs = zip(position.split(_CHUNK), rotation.split(_CHUNK), strict=True)

@@ -2,7 +2,7 @@
 
 ``tests/test_contract.py`` checks every world against it. A world has N environments, each of one slot (a task class of
 the suite; MT1: a task of its class). All tensors are on ``device``. A reset or step returns tensors that the caller
-owns: no later step changes them, and changing them, or the action that was given, changes nothing in the world.
+owns: no later step changes them. Changes to them or to the given action do not affect the world.
 
 Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) an environment that ends starts its next episode within
 the step; the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In
@@ -66,7 +66,7 @@ Step = tuple[Tensor, Tensor, Tensor, Tensor, Info]
 
 @dataclass(frozen=True)
 class ObservationGroup:
-    """Entries of an observation that are of one kind in every environment of a world."""
+    """Entries of an observation that have the same kind in every environment of a world."""
 
     name: str
     """``right_hand``, ``left_hand``, ``object`` (the rest), ``goal`` (zeros where a suite hides it), ``padding``,
@@ -90,7 +90,7 @@ def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]
 
 @runtime_checkable
 class VectorWorld(Protocol):
-    """N environments stepped together, each of one of ``num_tasks`` slots."""
+    """N environments that are stepped together; each belongs to one of ``num_tasks`` slots."""
 
     single_observation_space: Box
     """Shape (d,), float32; ``observation_space`` (N, d)."""
@@ -127,18 +127,18 @@ class VectorWorld(Protocol):
         ...
 
     def step(self, action: Tensor, /) -> Step:
-        """Take actions (N, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
+        """Take actions (N, a), clipped to [-1, 1]; an environment with a non-finite action ends as unstable.
 
         Returns observations (N, d), rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
         """
         ...
 
     def state_dict(self) -> State:
-        """Return tensors and plain values from which the world continues bit for bit, copied."""
+        """Return copies of the tensors and plain values from which the world continues bit for bit."""
         ...
 
     def load_state_dict(self, state: State, /) -> None:
-        """Restore a ``state_dict`` of a world that was made alike; it may be stepped without a reset."""
+        """Restore a ``state_dict`` of a world made in the same way; the world may then be stepped without a reset."""
         ...
 
     def close(self) -> None:
@@ -173,7 +173,7 @@ class PooledWorld(TaskWorld, Protocol):
         ...
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Give slots, by name, other pools, from the next reset on, which must be of all environments.
+        """Replace the task pools of the named slots. The next reset must include all environments.
 
         Environment j of a slot plays task j mod n if tasks are fixed. Raises BidexError for an unknown slot, a wrong
         shape, or non-finite numbers.
@@ -185,16 +185,16 @@ class EndlessWorld(Protocol):
     """A world whose suite has no fixed number of train tasks (``tasks_per_class = 0``).
 
     In SAME_STEP and NEXT_STEP mode every episode draws a new task, until ``set_tasks`` gives others. In DISABLED mode
-    the pools stay, and a learner that plays trials gives each the tasks of another ``fresh_tasks``.
+    the pools stay, and a learner that plays trials calls ``fresh_tasks`` and ``set_tasks`` before each trial.
     """
 
     endless: bool
     """True if training draws tasks without number. Worlds with a fixed number have False, or no such attribute."""
 
     def fresh_tasks(self, number: int, count: int, /) -> dict[str, np.ndarray]:
-        """Return set ``number``, from 0 on, of ``count`` new tasks of each slot, for ``set_tasks``.
+        """Return ``count`` new tasks of each slot, for ``set_tasks``; each ``number`` (0, 1, ...) gives other tasks.
 
-        Numbers and the world's own seed decide the tasks. No pool of the suite has one of them.
+        ``number`` and the world's own seed determine the tasks. None of them is in a pool of the suite.
         """
         ...
 
@@ -203,12 +203,12 @@ class PrivilegedWorld(Protocol):
     """A world that can show what its observations hide: for teachers, and for learners that are taught in training.
 
     Hidden values are the numbers of a task that its class hides (such as the goal's position), scaled from their range
-    to [-1, 1]. Classes that hide fewer than ``hidden_size`` numbers have zeros behind theirs.
+    to [-1, 1]. If a class hides fewer than ``hidden_size`` numbers, zeros follow.
     """
 
     @property
     def hidden_size(self) -> int:
-        """The most numbers that tasks of a class hide; 0 if observations show the goals."""
+        """Maximum number of values that the tasks of a class hide; 0 if observations show the goals."""
         ...
 
     @property
@@ -228,5 +228,5 @@ class PrivilegedWorld(Protocol):
         ...
 
     def with_goals(self, obs: Tensor, /) -> Tensor:
-        """Return present observations (N, d) with the goals that they hide, in new memory."""
+        """Return a copy of the present observations (N, d) in which the hidden goals are visible."""
         ...

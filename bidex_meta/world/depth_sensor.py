@@ -46,7 +46,7 @@ class PointsRule:
 
 
 class DepthSensor:
-    """Puts clouds into the observations of a scene's class, from index ``first`` on.
+    """Puts clouds into the observations of a scene's class, beginning at entry ``first``.
 
     ``hidden``: entries of the class's observation that depend on objects' states, ascending.
     """

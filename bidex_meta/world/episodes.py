@@ -46,7 +46,7 @@ class Episodes:
 
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
-        """Return counters of n environments none of which has begun."""
+        """Return counters of n environments in which no episode has begun."""
         kinds = [torch.int64] * 2 + [torch.bool] * 5 + [torch.int64] + [torch.float32] * 2 + [torch.int64]
         number, *rest = (torch.zeros(num, dtype=kind, device=device) for kind in kinds)
         return cls(number - 1, *rest)
@@ -94,7 +94,7 @@ class Episodes:
 
 
 def ended_info(info: Info) -> Info:
-    """Return Gymnasium's keys for what ended in a step, from the contract's keys; zero outside each mask.
+    """Return Gymnasium's keys for the episodes that ended in a step, from the contract's keys; zero outside each mask.
 
     ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last
     step's values, ``episode`` once more and a mask each; ``_final_info``: ended.
@@ -108,7 +108,7 @@ def ended_info(info: Info) -> Info:
 
 
 class Clock:
-    """Seconds that the episodes of ``num`` environments have taken: ``t`` of ``episode``; no part of the state."""
+    """Seconds that the episodes of ``num`` environments have taken: ``t`` of ``episode``, not part of the state."""
 
     def __init__(self, num: int, device: torch.device) -> None:
         self._began = torch.full((num,), time.perf_counter(), dtype=torch.float64, device=device)
@@ -126,7 +126,7 @@ class Clock:
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """Return the autoreset mode as a member, from any spelling; None: SAME_STEP.
+    """Return the autoreset mode as a member, from any spelling; None stands for SAME_STEP.
 
     Raises BidexError for other modes, and if torch's default precision is not single.
     """
@@ -146,8 +146,8 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
 def set_stagger(world: VectorWorld, stagger: bool) -> None:
     """Set whether first episodes begin at random elapsed steps, from the world's next first reset on.
 
-    Other libraries sum rewards from the first step to the first end, so what is made for them begins at 0 by default.
-    The world may be wrapped; one without ``stagger`` is left as it is.
+    Other libraries sum rewards from the first step to the first end, so worlds that are made for them begin at 0 by
+    default. The world may be wrapped. A world without ``stagger`` is not changed.
     """
     stagger = true_or_false("stagger", stagger)
     inner: Any = getattr(world, "unwrapped", world)
@@ -156,7 +156,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
 
 
 def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
-    """Return the environments that ``reset`` starts, bool (num_envs,): those of ``reset_mask``, else all.
+    """Return the environments that ``reset`` starts, bool (num_envs,): those of ``reset_mask``, or all without a mask.
 
     Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and if
     torch's default precision is not single.
@@ -185,7 +185,7 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
 
 
 def checked_seed(seed: object, mask: Tensor) -> int:
-    """Return the seed of a reset; raise BidexError unless it is a whole number from 0 on and the reset is full."""
+    """Return the seed of a reset; raise BidexError unless it is a non-negative integer and the reset is full."""
     number = whole_number("seed", seed, 0)
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")
@@ -193,7 +193,7 @@ def checked_seed(seed: object, mask: Tensor) -> int:
 
 
 def check_single_reset(seed: object, options: object) -> None:
-    """Raise BidexError unless the seed is None or a whole number from 0 on, and there are no options."""
+    """Raise BidexError unless the seed is None or a non-negative integer, and there are no options."""
     if seed is not None:
         whole_number("seed", seed, 0)
     if options is not None and not isinstance(options, Mapping):

@@ -23,7 +23,7 @@ OWN_DRAWS = 2
 
 
 class Sizes(NamedTuple):
-    """Of each environment: entries of its state as observed (no one-hot) and of its action; its time limit in steps."""
+    """Sizes of each environment: observation entries (without one-hot), action entries, and the time limit in steps."""
 
     state: int
     action: int
@@ -31,11 +31,11 @@ class Sizes(NamedTuple):
 
 
 class ForeignWorld(BatchedWorld):
-    """Environments of foreign classes, the slots; ``sizes`` holds for all of them.
+    """Environments of another library's classes; each class is a slot, and ``sizes`` applies to all of them.
 
-    Observations are the class's own numbers, with its one-hot behind them where there are several. In SAME_STEP mode
-    each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j modulo their
-    number.
+    Observations are the class's own numbers, followed by the class's one-hot if there are several classes. In SAME_STEP
+    mode each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j modulo the
+    number of tasks.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class ForeignWorld(BatchedWorld):
         self._success = torch.zeros(self.num_envs, dtype=torch.bool)
 
     def _draws(self, num: int) -> Tensor:
-        """Return uniform numbers of the running episodes, (n, num), a function of seed, environment and episode."""
+        """Return uniform numbers (n, num) of the running episodes, from seed, environment and episode."""
         return uniform(self._keys, self.episodes.number, num)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
@@ -77,7 +77,7 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _place(self, mask: Tensor) -> None:
-        """Start ``task_index`` in the environments of a mask and write their states into ``_obs``."""
+        """Start the tasks ``task_index`` in the environments of a mask, and write their states into ``_obs``."""
 
     def _move(self, active: Tensor, broken: Tensor) -> Outcome:
         reward, terminated, truncated, info = self._finish(active, broken, self._advance(active, broken))
@@ -86,9 +86,9 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        """Step the ``active`` environments under ``_action``; of others only success is read.
+        """Step the ``active`` environments under ``_action``; for the others, only read success.
 
-        ``broken``: the active environments whose action was not finite; nothing is read of them.
+        ``broken``: the active environments whose action was not finite; nothing is read from them.
         """
 
     def state_dict(self) -> State:

@@ -1,7 +1,8 @@
 """Ways to keep an accelerator busy during a step: engines side by side on streams, torch's work as CUDA graphs.
 
 If torch's kernels were launched one by one, they would take longer than the physics. The state that a stretch of work
-reads and leaves behind lives in tensors at fixed addresses; so does its result, which its next replay overwrites.
+reads and writes is in tensors at fixed addresses. The result is at a fixed address too, and the next replay overwrites
+it.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -39,7 +40,7 @@ def cuda_graph(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
 
 
 class GraphCache:
-    """Recorded stretches of work by key, over one state.
+    """Recorded stretches of work, by key; all of them read and write the same state.
 
     A stretch is recorded with the tensors that its closures hold at that time. Call ``forget`` after replacing any of
     these tensors other than the state and the inputs.
@@ -120,7 +121,7 @@ class Stepper(Protocol):
         ...
 
     def forget(self) -> None:
-        """Drop the records of earlier runs, after something that the methods read was replaced."""
+        """Drop the records of earlier runs. Call this after replacing something that the methods read."""
         ...
 
 

@@ -27,7 +27,7 @@ _LARGEST = 1e6
 @checked_arguments
 @dataclass(frozen=True)
 class Slot:
-    """A task class with its pool of tasks and its share of a world."""
+    """A task class with a pool of tasks and a share of a world's environments."""
 
     name: Text
     """E.g. ``CatchUnderarm`` or ``CatchUnderarm/left``."""
@@ -68,7 +68,7 @@ class Group:
 
 
 def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
-    """Return the slots with other pools of tasks for those named; see :func:`with_pool`.
+    """Return the slots, with the task pools of the named slots replaced; see :func:`with_pool`.
 
     Raises BidexError for an unknown slot.
     """
@@ -85,7 +85,7 @@ def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
 
 
 def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
-    """Return the slot with a copy of another pool of tasks, shape (n, variation_space.size).
+    """Return the slot with its task pool replaced by a copy of the given one, shape (n, variation_space.size).
 
     Raises BidexError for a wrong shape, or numbers that are not finite.
     """
@@ -111,9 +111,9 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
 
 
 def build_groups(slots: list[Slot], env_ids: list[slice], make_engine: EngineMaker) -> list[Group]:
-    """Compile the slots' scenes and put those of equal structure together, in the slots' order.
+    """Compile the slots' scenes and group the slots with models of equal structure, in the slots' order.
 
-    ``env_ids``: contiguous environments of each slot.
+    ``env_ids`` holds the contiguous environments of each slot.
     """
     scenes: dict[Hashable, Scene] = {}
     pools: list[list[int]] = []

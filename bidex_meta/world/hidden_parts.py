@@ -1,4 +1,4 @@
-"""Hidden parts of tasks: how a world of hands answers as a ``contract.PrivilegedWorld``."""
+"""Hidden parts of tasks: the methods by which a world of hands is a ``contract.PrivilegedWorld``."""
 
 from collections.abc import Sequence
 

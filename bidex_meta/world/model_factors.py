@@ -19,7 +19,7 @@ Exponents = dict[str, dict[str, Tensor]]
 
 
 def object_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies belong to objects, (nbody,), bool: those behind the hands'."""
+    """Return which bodies belong to objects, (nbody,), bool: the bodies that follow those of the hands."""
     names = [model.body(i).name for i in range(model.nbody)]
     return np.array([i > 0 and name.partition("/")[0] not in SIDES for i, name in enumerate(names)])
 
@@ -74,7 +74,7 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yield factor, field and exponents (n, 1) or (n, k).
 
-    Sizes leave masses as they are; inverse inertias follow both.
+    Factors of size do not change masses; inverse inertias follow both.
     """
     objects = object_bodies(model)
     free = _free(model)

@@ -22,12 +22,12 @@ _HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both
 class Observer:
     """Builds the observations of rows of one layout: a gather of sensors, last actions and base rotations.
 
-    Blocks that only a task can compute (goal pose and the like) are left at zero, as a masked goal and padding are;
-    ``Part`` fills in the former.
+    Blocks that only a task can compute (such as the goal's pose) are left at zero, and ``Part`` fills them in. A masked
+    goal and padding stay at zero.
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Look up source, factor and offset of every entry; ``scene`` is any whose task has the layout.
+        """Look up source, factor and offset of every entry; ``scene`` is any scene whose task has the layout.
 
         ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
         the observation with padding and task id.
@@ -71,9 +71,10 @@ class Observer:
         self._scale[where] = 1.0
 
     def _of_quaternions(self, scene: Scene) -> list[int]:
-        """First entries of the quaternions whose sign the scene's rules choose; of a pose the last four are one.
+        """Return the first entries of the quaternions whose sign the scene's rules choose; a pose ends with one.
 
-        None of the hands': joints turn them from one start, so that each has one sign, also where its w is near 0.
+        Quaternions of hands are not among them: joints turn the hands from one start, so that each sign is unique even
+        if w is near 0.
         """
         if not scene.task.rules.wide:
             return []
@@ -101,10 +102,10 @@ class Observer:
         return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
 
     def __call__(self, sensors: Tensor, action: Tensor, rotation: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Return observations of some rows (n, width), float32, without the tasks' own blocks, not yet clipped.
+        """Return unclipped observations of some rows (n, width), float32, without the tasks' own blocks.
 
-        From sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3; None for fixed bases); written
-        into ``out`` where it is given.
+        The observations are computed from sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3;
+        None for fixed bases). If ``out`` is given, the result is written into it.
         """
         values = self._values[: len(sensors)]
         sensed, acted, turned = self._columns
@@ -135,7 +136,7 @@ def observation_groups(
     hidden: Sequence[Sequence[int]] | None = None,
     points: tuple[str, int] | None = None,
 ) -> tuple[ObservationGroup, ...]:
-    """Return groups that hold for all of a world's classes; entries of different kinds are in ``task``.
+    """Return groups that are valid for all classes of a world; entries whose kind differs by class are in ``task``.
 
     ``width``: entries before the task id, at least those of each layout; ``hidden``: entries of each layout that are
     zero, as padding is; ``points``: name and entries of the cloud between the padded observation and the task id.

@@ -72,9 +72,10 @@ class Part:
         num_envs: int,
         sights: list[DepthSensor] | None = None,
     ) -> None:
-        """``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are the world's.
+        """Allocate the tensors of the part.
 
-        ``sights``: depth sensor of each of its slots; None: observations show objects' states.
+        ``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are those of the world. ``sights``
+        holds the depth sensor of each slot, or is None if observations show the objects' states.
         """
         self.group = group
         self._engine = group.engine
@@ -135,7 +136,7 @@ class Part:
                 pool[name].copy_(values)
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Return frozen numbers of a member's environments, by their tasks' indices in the pool."""
+        """Return the frozen numbers of a member's environments, given the pool indices of their tasks."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
@@ -176,7 +177,7 @@ class Part:
                 yield i, member, slice(first, last), rows[first:last]
 
     def rows_in(self, mask: Tensor) -> Tensor | None:
-        """Return the engine rows of the environments of a mask (num_envs,), ascending; None, all, if masked.
+        """Return the engine rows of the environments of a mask (num_envs,), ascending; None (all rows) if masked.
 
         Counting the entries of a mask would make the host wait for an accelerator.
         """
@@ -185,7 +186,7 @@ class Part:
         return self.group.take(mask).nonzero().squeeze(1)
 
     def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
-        """See ``Observer.mounts``; of engine rows, None: all. Returns None if the bases are fixed."""
+        """Return ``Observer.mounts`` of engine rows (all if None); return None if the bases are fixed."""
         chosen = slice(None) if rows is None else rows
         if self._observer.moving:
             return self._observer.mounts(self._engine.sensordata[chosen], chosen)
@@ -199,10 +200,11 @@ class Part:
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Return observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
+        """Return the observations of engine rows without the task id, shape (n, width), float32.
 
-        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a), ``rotation`` what
-        ``base_rotations`` did; ``out`` (n, width) is written into where it is given.
+        ``rows`` are ascending; None stands for all rows. ``states`` and ``rotation`` are the results of ``states()``
+        and ``base_rotations`` for these rows, and ``action`` (n, a) holds their last actions. If ``out`` (n, width) is
+        given, the result is written into it.
         """
         sensors = self._engine.sensordata
         values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)
@@ -244,7 +246,7 @@ class Part:
         return values.clamp_(-CLIP, CLIP)
 
     def check_formulas(self, task_index: Tensor) -> None:
-        """Raise BidexError if a class of the user's own gives numbers that are not finite in the present state."""
+        """Raise BidexError if a user's own class returns numbers that are not finite in the present state."""
         for member, _, state in self.states(task_index):
             task = member.scene.task
             checked.own_numbers(task, "reward_terms", task.rewards(state), self.unstable, member.engine_rows)
@@ -281,7 +283,7 @@ class Part:
 
 
 class PartedWorld(Protocol):
-    """A world of hands as pictures and hidden goals read it (``World``)."""
+    """The attributes of a world of hands (``World``) that pictures and hidden goals need."""
 
     num_envs: int
     device: torch.device
@@ -301,9 +303,10 @@ class PartedWorld(Protocol):
 
 
 def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None = None) -> Sequence[Tensor | None]:
-    """Return roll, pitch and yaw (n, 2, 3) of both bases since the start, of engine rows (None: all) of each part.
+    """Return, for each part, roll, pitch and yaw (n, 2, 3) of both bases relative to the start.
 
-    All parts at once: a dozen operations on a few rows take as long as on all.
+    Engine rows None stand for all rows. All parts are computed at once, because a dozen operations take as long on a
+    few rows as on all.
     """
     mounts = [part.mounts(r) for part, r in zip(parts, rows or [None] * len(parts), strict=True)]
     moving = [each for each in mounts if each is not None]
@@ -315,7 +318,7 @@ def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None =
 
 
 class Judgement(NamedTuple):
-    """A step of environments of one class by its formulas; see ``Transition``."""
+    """The results of one class's formulas for a step; see ``Transition``."""
 
     terms: dict[str, Tensor]
     reward: Tensor
@@ -335,10 +338,10 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
 
 
 def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together) -> Transition:
-    """Judge and observe all environments after a step, part by part at the same time.
+    """Judge and observe all environments after a step; parts are processed at the same time.
 
-    ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations, whose task ids are not
-    written.
+    ``task_index`` (n,) and ``action`` (n, a) are those of the step. ``width`` is the size of observations; their task
+    ids are not written.
     """
     n = len(action)
     device = action.device

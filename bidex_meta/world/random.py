@@ -30,7 +30,7 @@ def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tupl
 
 
 def env_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
-    """Return one key (two words) per environment of a class, only from seed, class and index, int64 (count, 2)."""
+    """Return one key (two words) per environment of a class, int64 (count, 2); keys depend on seed, class and index."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     words = [torch.tensor(int.from_bytes(digest[i : i + 4], "little"), device=device) for i in (0, 4)]
     index = torch.arange(count, device=device)
@@ -54,7 +54,7 @@ def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
     """Return uniform numbers in [0, 1), float64 (n, draws), that only depend on key (n, 2), episode (n,) and draw.
 
-    They are multiples of 2^-24, so exact in single precision.
+    The numbers are multiples of 2^-24 and therefore exact in single precision.
     """
     pairs = torch.arange((draws + 1) // 2, device=keys.device)
     words = threefry((keys[:, :1], keys[:, 1:]), (episode[:, None], pairs[None]))

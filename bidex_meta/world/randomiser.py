@@ -26,7 +26,7 @@ class Randomiser:
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
         """``deviation`` holds the standard deviations of the observations' noise, (n, width), or no columns.
 
-        Raises BidexError if the size of an object that is a mesh shall vary.
+        Raises BidexError if the size of a mesh object is to vary.
         """
         self._rule = rule
         self._parts = parts

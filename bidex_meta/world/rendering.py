@@ -126,7 +126,7 @@ def _camera(world: "PartedWorld", env_id: int, name: str) -> mujoco.MjvCamera:
 
 
 def simulation(world: "PartedWorld", env_id: int) -> "tuple[Engine, int, Scene]":
-    """Return the engine that carries an environment, its row there, and its scene."""
+    """Return the engine that simulates an environment, the environment's row in the engine, and its scene."""
     part, at = _part(world, env_id)
     scene = next(m.scene for m in part.group.members if m.engine_rows.start <= at < m.engine_rows.stop)
     return part.group.engine, at, scene
@@ -150,9 +150,9 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
 
 
 def ghosts(world: "PartedWorld", env_id: int) -> list[DrawnGhost]:
-    """Return the goals of an environment's task in its present state; none in a world that hides them.
+    """Return the goals of an environment's task in its present state, or nothing if the world hides them.
 
-    Every picture, film and view asks here, so that none tells what observations hide.
+    Every picture, film and view calls this function, so that none shows what observations hide.
     """
     if world.hides_goals:
         return []

@@ -1,6 +1,6 @@
 """One environment of a task class as a suite has it: `env = cls()`, `env.set_task(task)`, as with Meta-World's classes.
 
-For code that is written so; all environments of a suite at once are `Benchmark.make_world`.
+This is for code written in that way; `Benchmark.make_world` makes all environments of a suite at once.
 """
 
 import copyreg
@@ -36,18 +36,18 @@ class AnyTask(Protocol):
 
     @property
     def env_name(self) -> str:
-        """Name of its class."""
+        """Name of the task's class."""
         ...
 
     @property
     def variation(self) -> np.ndarray:
-        """Its variation, shape (size,)."""
+        """Variation of the task, shape (size,)."""
         ...
 
 
 @dataclass(frozen=True)
 class EnvRecipe:
-    """A task class as a suite has it: what decides observations and rewards."""
+    """A task class in a suite: the settings that determine observations and rewards."""
 
     name: str
     moving_base: bool | None
@@ -74,12 +74,12 @@ class EnvRecipe:
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
-        """Return the environment's class: the same object for equal recipes."""
+        """Return the environment class; equal recipes give the same class object."""
         return _make_class(self)
 
 
 class _Remade(type):
-    """Of classes that no module holds: they are pickled as their recipes."""
+    """Metaclass of classes that no module holds; they are pickled as their ``EnvRecipe``."""
 
 
 def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
@@ -93,15 +93,16 @@ copyreg.pickle(_Remade, _reduced)
 
 
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
-    """A task class as an environment that plays the task it is given; its subclasses stand in `train_classes`.
+    """A task class as an environment that plays the task it is given; its subclasses are listed in `train_classes`.
 
     Classes and environments pickle and copy: a copy has the same task and continues bit for bit.
 
-    Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
-    where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
-    has `success` (1.0 or 0.0), `unscaled_reward` and `unstable` (physics broke: the episode is truncated). In version 1
-    `success` says whether the goal is met in this state. In version 2 success counts at the end of an episode, so that
-    `success` is 0.0 before the last step. An episode is a success if any of its steps has `success` 1.0.
+    Observations are those of the suite's worlds without the one-hot: they are padded to the suite's widest class, and
+    goal entries are zero if the suite hides goals. If the suite shows point clouds, a cloud follows and replaces the
+    objects' states. `info` has `success` (1.0 or 0.0), `unscaled_reward` and `unstable` (physics broke: the episode is
+    truncated). In version 1 `success` says whether the goal is met in this state. In version 2 success counts at the
+    end of an episode, so that `success` is 0.0 before the last step. An episode is a success if any of its steps has
+    `success` 1.0.
 
     `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
     `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the suite's:
@@ -174,7 +175,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @checked_arguments
     def set_task(self, task: AnyTask) -> None:
-        """Play one of the benchmark's tasks of this class from the next reset on.
+        """Set one of the benchmark's tasks of this class; the next reset begins to play it.
 
         Raises BidexError for a task of another class or version, or with a variation of another size or range.
         """
@@ -196,7 +197,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self._given = task
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Start an episode, with a seed the same one every time; return observation (d,), float32, and an empty info.
+        """Start an episode; return observation (d,), float32, and an empty info. A seed always gives the same episode.
 
         Raises BidexError if no task was set, and for any options.
         """

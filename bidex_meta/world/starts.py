@@ -37,7 +37,7 @@ class Starts:
         task_keys: Tensor | None = None,
         episodes_per_task: int = 1,
     ) -> None:
-        """Make room for the draws.
+        """Allocate memory for the draws.
 
         Args:
             parts: The world's parts.
@@ -70,7 +70,7 @@ class Starts:
         self._takes = 0
 
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Draw ahead if the next ``take`` needs it, which gets the same mask, number and task_index."""
+        """Draw ahead if the next ``take``, which gets the same mask, number and task_index, needs new draws."""
         if self._masked:
             # An environment begins at most one episode per take, so counting them replaces a look at any number.
             if self._takes % _AHEAD == 0:
@@ -104,7 +104,7 @@ class Starts:
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
     def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Fill the bank of some environments, from the given episode numbers on."""
+        """Fill the bank of some environments, beginning with the given episode numbers."""
         self._first[env_ids] = number[env_ids]
         many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -120,7 +120,7 @@ class Starts:
                 qpos[engine_row[own], ahead[own]] = start.to(qpos.dtype)
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
-        """Fill the bank of every environment in place, with shapes that depend on no number."""
+        """Fill the bank of every environment in place, with shapes that do not depend on values."""
         self._first.copy_(number)
         many, ahead = _repeated(torch.arange(len(number), device=number.device))
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -149,7 +149,7 @@ class Starts:
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
-        """Return where in their spaces the new tasks of episodes (k,) lie, in [0, 1), (k, size); None: none are new."""
+        """Return shares (k, size), in [0, 1), that place the new tasks of episodes (k,) in their spaces, or None."""
         if self._task_keys is None:
             return None
         return uniform(self._task_keys[env_ids], episode // self._episodes_per_task, self._task_size)

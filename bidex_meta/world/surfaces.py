@@ -33,7 +33,7 @@ def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
 
 
 def area(model: mujoco.MjModel, geom: int) -> float:
-    """Return the area of a geom's surface, m²; for an ellipsoid to 1.1 % (Thomsen's formula)."""
+    """Return the area of a geom's surface, m²; for an ellipsoid the error is up to 1.1 % (Thomsen's formula)."""
     a, b, c = (float(x) for x in model.geom_size[geom])
     p = 1.6075
     kind = int(model.geom_type[geom])
@@ -237,9 +237,10 @@ def body_kinds(model: mujoco.MjModel) -> list[float]:
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spread ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
+    """Spread ``count`` points over a model's visible surfaces.
 
-    Raises BidexError for fewer points than visible geoms, or none visible.
+    Hands, objects and fixtures have fixed shares of the points; within each of these groups, points are in proportion
+    to area. Raises BidexError if no geom is visible, or if there are fewer points than visible geoms.
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:

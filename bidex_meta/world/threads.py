@@ -25,7 +25,7 @@ def one_torch_thread() -> Iterator[None]:
 def set_up_torch(threads: int, deterministic: bool = False) -> None:
     """Give torch this many threads, and the process the memory settings of training.
 
-    With ``deterministic`` torch only takes algorithms that repeat bit for bit on a GPU, from now on.
+    With ``deterministic`` torch only uses algorithms that repeat bit for bit on a GPU.
     """
     torch.set_num_threads(threads)
     if deterministic:
@@ -37,10 +37,10 @@ def set_up_torch(threads: int, deterministic: bool = False) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep up to 64 MB that were freed, for the next tensors; without effect where there is no glibc.
+    """Let glibc keep up to 64 MB that were freed, for the next tensors; without effect if there is no glibc.
 
-    It returns what is free beyond twice the largest block it has freed, blocks above 32 MB apart. With small tensors
-    every step then waits for pages: an inner step of the meta-learners took up to twice as long, an MT-PPO update 3 %
-    longer.
+    By default glibc returns free memory beyond twice the size of the largest block that it has freed (blocks above 32
+    MB do not count). With small tensors every step then waits for pages: an inner step of the meta-learners took up to
+    twice as long, an MT-PPO update 3 % longer.
     """
     torch.empty(8_000_000)

@@ -1,6 +1,6 @@
 """The batched world of hands: all environments of a suite, stepped together.
 
-The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
+An observation is made in these steps: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
 ``TaskClass.observe`` (goal blocks) -> ``World._write_ids`` (task id) -> the learner's network.
 """
 
@@ -112,7 +112,8 @@ class World(BatchedWorld):
     def __init__(self, slots: Sequence[Slot], config: WorldConfig | None = None) -> None:
         """Build the world of some task classes with their pools of tasks; no episode is started before ``reset``.
 
-        Raises BidexError for fewer environments than slots, an unknown device, engine or mode, or too narrow a padding.
+        Raises BidexError for fewer environments than slots, an unknown device, engine or mode, or padding that is too
+        narrow.
         """
         check_argument("slots", slots, Annotated[Sequence[Slot], Meta(min_length=1)])
         check_argument("config", config, WorldConfig | None)
@@ -235,9 +236,10 @@ class World(BatchedWorld):
         self._stepper.forget()  # recordings hold the old starts and pools
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        """Replace the pools of tasks of some slots, from the next full reset on; see ``PooledWorld``.
+        """Replace the task pools of some slots; see ``PooledWorld``.
 
-        Episodes draw no new tasks from then on.
+        The change takes effect at the next full reset. In a suite with ``tasks_per_class = 0``, episodes then play the
+        tasks of the pools instead of new tasks.
         """
         current = [replace(slot, tasks=tasks) for slot, tasks in zip(self.slots, self.pools, strict=True)]
         self._set_pools(with_pools(current, pools))
@@ -376,7 +378,7 @@ class World(BatchedWorld):
             obs[:, -self.num_id_columns :] = self._one_hot
 
     def check_formulas(self) -> None:
-        """Raise BidexError if a class of the user's own gives numbers that are not finite in the present state.
+        """Raise BidexError if a user's own class returns numbers that are not finite in the present state.
 
         On the CPU every step and reset checks this. On a GPU the check would stall each step; a learner calls it when
         its loss is no longer finite.
@@ -432,7 +434,7 @@ class World(BatchedWorld):
 
     @property
     def randomised(self) -> dict[str, Tensor]:
-        """Factors, and the delay in control steps, drawn for the running episodes, each (num_envs,)."""
+        """Factors and the delay in control steps that were drawn for the running episodes, each (num_envs,)."""
         if self._randomiser is None:
             return {}
         return {name: value.clone() for name, value in self._randomiser.drawn.items()}
@@ -454,7 +456,7 @@ class World(BatchedWorld):
         return [pools[slot] for slot in range(self.num_tasks)]
 
     def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
-        """Return in a sentence what a task of a slot asks for, without what the world hides; None: the class."""
+        """Return in a sentence what a task of a slot (None: the class) asks for, without what the world hides."""
         return self.slots[slot].task_class.instruction(variation, self.hides_goals)
 
     def instructions(self) -> list[str]:
@@ -497,12 +499,12 @@ class World(BatchedWorld):
 
 
 def _with_entries(slot: Slot, env_ids: slice) -> Slot:
-    """Return the slot with as many tasks in its pool as it has environments."""
+    """Return the slot with a pool that has one task per environment."""
     return replace(slot, tasks=slot.tasks[np.arange(env_ids.stop - env_ids.start) % len(slot.tasks)])
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text; of an object's file only the name, because a run may move."""
+    """Return an option of a class as text. For an object's file this is only its name, because folders may move."""
     if isinstance(value, str):
         return Path(value).stem
     return str(value)

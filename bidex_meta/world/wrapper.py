@@ -1,7 +1,7 @@
 """Wrappers of a world, the base of recorders and statistics, and the NumPy form that Gymnasium expects.
 
 Extend the wrapper of the wrapped world's class, so that evaluation and learners still see its abilities, and override
-the methods that shall do more::
+the methods that are to do more::
 
     class Count(WorldWrapper):
         steps = 0
@@ -100,12 +100,12 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
 class NumpyWorld(VectorEnv):
     """The result of ``world.to_numpy()``: NumPy arrays, for Gymnasium's vector wrappers.
 
-    ``info`` has ``success``, ``unstable``, ... of every environment, and where one ended ``final_obs`` (an array of
-    objects: observations, None in the others) and ``final_info``, whose ``episode`` has r, l, t, success, unscaled.
-    ``episode`` itself is left to ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be stepped, as
-    in the world, but its end is reported once, in the step that ended it: later steps would count as episodes. With
-    ``stagger`` a training world's first episodes begin at random elapsed steps, and wrappers that count for themselves
-    count them too short.
+    ``info`` has ``success``, ``unstable``, ... of every environment, and if one ended ``final_obs`` (an array of
+    objects: observations, None for the other environments) and ``final_info``, whose ``episode`` has r, l, t, success,
+    unscaled. ``episode`` itself is left to ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be
+    stepped, as in the world, but its end is reported once, in the step that ended it: later steps would count as
+    episodes. With ``stagger`` a training world's first episodes begin at random elapsed steps, and wrappers that count
+    for themselves count them too short.
     """
 
     @checked_arguments

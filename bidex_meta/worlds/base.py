@@ -58,7 +58,7 @@ Identity = dict[str, str | int | None]
 
 
 class Worlds(ABC):
-    """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
+    """The worlds that a config names, with their common properties; ``name`` is as the user wrote it."""
 
     hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
@@ -100,7 +100,7 @@ class Worlds(ABC):
 
     @abstractmethod
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """Return the names of the tasks in the pool of each slot of a split's worlds, by slot; empty without any."""
+        """Return the names of the tasks in each slot's pool in a split's worlds, by slot; the dict may be empty."""
 
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
@@ -108,7 +108,7 @@ class Worlds(ABC):
 
     @property
     def short_name(self) -> str:
-        """Return the name; of a suite file of the user's own, the file's name without folder and suffix."""
+        """Return the name. For a user's own suite file, this is the file's name without folder and suffix."""
         return PurePath(self.name).stem if self.name.endswith(".toml") else self.name
 
     @property
@@ -143,10 +143,10 @@ class Worlds(ABC):
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
     def identity(self) -> Identity:
-        """Return what distinguishes these worlds from others of the same name, ready for JSON.
+        """Return entries, ready for JSON, that distinguish these worlds from others of the same name.
 
-        ``physics`` are twelve letters of the classes' physics (``bidex_meta.engine.models``), None for classes of
-        another library. ``suite_version`` and ``suite_digest`` come from the suite's file; they are None without one.
+        ``physics`` is a digest of the classes' physics (``bidex_meta.engine.models``), or None for classes of another
+        library. ``suite_version`` and ``suite_digest`` come from the suite's file; they are None without one.
         """
         return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
 

@@ -56,7 +56,7 @@ class Foreign(Worlds):
         raise BidexError(f"Pictures and references are made of classes of our own, got {self.name}. Name another.")
 
     def identity(self) -> Identity:
-        """Return an identity without entries: the physics is the library's, known by its package's version."""
+        """Return an identity without entries: the version of the library's package identifies the physics."""
         return {"physics": None, "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
@@ -65,7 +65,7 @@ class Foreign(Worlds):
 
 
 class MetaWorldSuite(Foreign):
-    """A suite of Meta-World's."""
+    """One of Meta-World's suites."""
 
     preset = ("metaworld", "the suite is Meta-World's")
     default_episodes = 1  # its tasks fix their start, so that a policy would only repeat itself

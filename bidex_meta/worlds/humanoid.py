@@ -36,11 +36,11 @@ _START_NOISE = 1e-2
 class HumanoidWorld(ForeignWorld):
     """``num_envs`` humanoids that learn to walk, on the CPU: a ``contract.PooledWorld`` of one slot.
 
-    Observations are Humanoid-v5's 348 numbers: positions without x and y, velocities, and of its 13 bodies inertias,
-    velocities, actuators' forces and contact forces. An action of [-1, 1] is its motors' range, [-0.4, 0.4]. The reward
-    is 1.25 times the speed of the centre of mass along x (m/s), and 5 while it is up, less the price of control and
-    contact; it falls (terminated) when the torso leaves 1 to 2 m, and an episode lasts 1,000 steps of 15 ms. There is
-    no success. Keywords as of ``bidex_meta.World``.
+    Observations are Humanoid-v5's 348 numbers: positions without x and y, velocities, and the inertias, velocities,
+    actuator forces and contact forces of the 13 bodies. Actions in [-1, 1] are scaled to the motors' range, [-0.4,
+    0.4]. The reward is 1.25 times the speed of the centre of mass along x (m/s), plus 5 while the humanoid is upright,
+    minus costs of control and contact. An episode terminates when the torso's height leaves 1 to 2 m, and is cut after
+    1,000 steps of 15 ms. There is no success. Keywords are those of ``bidex_meta.World``.
     """
 
     def __init__(
@@ -126,9 +126,9 @@ class HumanoidWorld(ForeignWorld):
         return (height > _LOWEST) & (height < _HIGHEST)
 
     def _feel(self, moved: Tensor) -> None:
-        """Compute the external forces on the bodies of the rows of a mask.
+        """Compute the external forces on all bodies, for the environments in a mask.
 
-        MuJoCo's step leaves them out, and Gymnasium reads them after it.
+        MuJoCo's step does not compute these forces, but Gymnasium reads them after a step.
         """
         for row in moved.nonzero()[:, 0].tolist():
             self._engine.batch.get_data(row, self._data)

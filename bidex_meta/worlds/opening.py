@@ -17,7 +17,7 @@ from bidex_meta.worlds.own import OwnSuite, SingleClass
 def open_worlds(config: Mapping[str, Json] | WorldsConfig) -> Worlds:
     """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
 
-    Raises BidexError for unknown or faulty ones.
+    Raises BidexError if they are unknown or faulty.
     """
     config = WorldsConfig.of(config)
     if config.suite is None:

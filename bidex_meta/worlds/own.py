@@ -52,7 +52,7 @@ class OwnSuite(Worlds):
         return self.benchmark.make_world(*given, randomisation=randomisation, deterministic=self.deterministic)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """Return the names that the file lists, else numbers; see ``Worlds``."""
+        """Return the task names that the file lists, or numbers if it lists none; see ``Worlds``."""
         return self.suite.task_names(cast(Split, split))
 
     def task_classes(self) -> "dict[str, TaskClass]":

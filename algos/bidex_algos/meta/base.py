@@ -56,7 +56,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; those of one task adapt together. None: each adapts by itself."""
+        """Set the task (N,) of each environment; environments of a task adapt together (None: each one separately)."""
         if task_of_row is None:
             self.rows = None
         else:
@@ -146,7 +146,7 @@ def make_meta_policy(
 
 
 class MetaLearner(Learner):
-    """Learns parameters from which one gradient step on a task's own data improves much; runs in one process."""
+    """Learns parameters that one gradient step on a task's own data improves strongly; runs in one process."""
 
     world: PooledWorld
     config: OuterConfig

@@ -73,7 +73,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348), taught by those who know it."""
+    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); its teachers know the task."""
 
     name = "icl"
     remedy = "lower learning_rate"
@@ -117,7 +117,7 @@ class ICL(TrialLearner):
     def load_policy(cls, state: State, device: str | torch.device = "cpu", belief: Belief | None = None) -> MemoryAgent:
         """Return the agent of a checkpoint; see ``Learner.load_policy``.
 
-        With ``belief``, its actor acts on that belief instead of the learned one.
+        With ``belief``, the agent's actor acts on this belief instead of the learned belief.
         """
         agent = super().load_policy(state, device)
         if belief is None:
@@ -250,11 +250,14 @@ class ICL(TrialLearner):
         return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
+        """Return the state as in the base class, with the data set.
+
+        The data set makes its own copy, because a second copy at the same time may not fit in memory.
+        """
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the data set had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the data set had another size."""
         super().load_state_dict(state)
         if self.data is not None:
             self.data.load_state_dict(state["data"])
@@ -285,7 +288,7 @@ class _Pupil:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def _draw_goals(self, privileged: PrivilegedWorld) -> None:
-        """Store the tasks' own goals (N, k) and draw other goals of their range.
+        """Store the tasks' own goals (N, k) and draw other goals from the same range.
 
         Entries that a class does not use are drawn too.
         """

@@ -23,7 +23,7 @@ class MemoryAgent:
         self.init()
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Do nothing: each environment learns from its own episodes, and rows of one task do not share a memory."""
+        """Do nothing: each environment learns from its own episodes; environments of one task share no memory."""
 
     def init(self) -> None:
         """Reset every memory to its state at the start of a trial."""

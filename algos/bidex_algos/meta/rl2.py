@@ -59,7 +59,10 @@ class RL2Config(PPOConfig):
 
     @property
     def trial_steps(self) -> int:
-        """Return the maximum steps of a trial; for whole episodes an estimate, until a learner knows its world."""
+        """Return the maximum number of steps of a trial.
+
+        If trials play whole episodes, this is an estimate until the learner has its world.
+        """
         return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
     def __post_init__(self) -> None:

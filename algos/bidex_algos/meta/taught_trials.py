@@ -34,7 +34,7 @@ class TaughtTrials:
 
     ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,) are filled while ``trials`` is
     played; then ``keep`` stores everything. The first of ``g`` goals is the task's own; the same steps are rewarded in
-    hindsight for the others.
+    hindsight for the other goals.
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int, size: int):

@@ -1,7 +1,7 @@
 """Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-A row whose episode is over waits, and its memory does not change. Waiting is not recorded: slot t holds the memory's
-t-th step.
+An environment whose episode is over waits, and its memory does not change. Steps spent waiting are not recorded, so
+index t holds the t-th step that the memory has seen.
 """
 
 from dataclasses import dataclass
@@ -88,7 +88,7 @@ class Player(Protocol):
     """Chooses the actions in a trial."""
 
     def begin(self, shown: Tensor) -> None:
-        """Begin an episode in all environments; ``shown`` (N,) tells in which ones the policy sees rewards."""
+        """Begin an episode in all environments; ``shown`` (N,) marks those in which the policy sees rewards."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return unclamped actions (N, a) for raw observations (N, d), and the memory's next state (N, memory).

@@ -148,7 +148,11 @@ class TeamActor(Team):
         return joint.index_select(-1, self._taken).split(self._sizes, dim=-1)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return the rows of ``log_std`` (default: own) for observations (B, d): (a,) with one head, else (B, a)."""
+        """Return the logarithms of standard deviations for observations (B, d).
+
+        The shape is (a,) with one head, otherwise (B, a). The values are rows of ``log_std``; None stands for the
+        network's own ``log_std``.
+        """
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:

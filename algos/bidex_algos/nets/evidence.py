@@ -126,9 +126,9 @@ class ModelBelief:
         return self._policy.actor.candidates
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return log-likelihoods as described in :class:`Belief`.
+        """Return the log-likelihoods that :class:`Belief` describes.
 
-        The evidence takes most of a step's time, so on the CPU, where a host sync is free, unknown rewards are skipped.
+        The evidence takes most of a step's time, so unknown rewards are skipped on the CPU, where a host sync is free.
         """
         if maths.may_look(known.device):
             found = torch.zeros(len(obs), len(self.candidates))

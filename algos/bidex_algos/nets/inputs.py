@@ -14,7 +14,7 @@ from bidex_meta.world.contract import ObservationGroup, plain_groups
 
 
 class Columns(nn.Module):
-    """Reads and writes some columns, in ascending order, of tensors (..., d); a checkpoint contains no part of it."""
+    """Reads and writes some columns, in ascending order, of tensors (..., d); checkpoints do not contain it."""
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
@@ -107,7 +107,7 @@ class Inputs:
 class GroupEncoder(nn.Module):
     """Encodes observations (..., d) as the input (..., size) of a network's layers.
 
-    Groups without an encoder come first, in the order of their columns, followed by groups with one. Without any
+    Groups without an encoder come first, in the order of their columns, followed by groups with an encoder. Without any
     encoder the module is the identity and has no weights.
     """
 

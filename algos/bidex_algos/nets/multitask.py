@@ -16,7 +16,7 @@ from bidex_meta.utils import maths
 
 
 class StackedLinear(nn.Module):
-    """``count`` (K) parallel linear layers of one form, with orthogonal weights of a ``gain`` and zero biases."""
+    """``count`` (K) parallel linear layers of the same size, with orthogonal weights of a ``gain``, zero biases."""
 
     def __init__(
         self, count: int, inputs: int, outputs: int, gain: float, generator: torch.Generator, bias: bool = True
@@ -278,8 +278,8 @@ class Towers(Headed):
 class Transformer(Headed):
     """One token per group of the observation; every token attends to all (Vaswani et al. 2017, arXiv 1706.03762).
 
-    Each entry of ``hidden`` adds a block with ``modules`` attention heads; all entries are one width. Tokens are
-    normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745), independent of ``layer_norm``. The
+    Each entry of ``hidden`` adds a block with ``modules`` attention heads; all entries must be the same width. Tokens
+    are normalised before each half of a block (Xiong et al. 2020, arXiv 2002.04745), independent of ``layer_norm``. The
     output layer reads the mean of the tokens.
     """
 

@@ -140,8 +140,8 @@ def deterministic_policy(
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Return the log-density of the action tanh(raw), with raw drawn from N(mean, exp(log_std)^2).
 
-    The argument is the value before squashing, (..., a) to (...), because in float32 tanh rounds to 1 from 9 on and has
-    no finite inverse.
+    The argument is the value before squashing, (..., a) to (...), because in float32 tanh rounds to 1 at 9 and above,
+    and then has no finite inverse.
     """
     # log(1 - tanh(u)^2), written without a difference of almost equal numbers.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))

@@ -109,14 +109,14 @@ class RecurrentPolicy(nn.Module):
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return unclamped mean actions (N, a) and the memory's next state (N, memory) for raw observations (N, d).
 
-        ``drawn`` is the result of :meth:`drawn` for an exploring episode; None: the policy tries nothing.
+        ``drawn`` is the result of :meth:`drawn` for an exploring episode; with None the policy does not explore.
         """
         x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
         mean, state = self.actor(x[None], memory.state)
         return mean[0], state
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor | None:
-        """Draw what each of ``rows`` exploring environments tries next, given the ``last`` draw; None: nothing."""
+        """Draw what each of ``rows`` exploring environments tries next, given the ``last`` draw; None if nothing."""
         return None
 
     def fresh_memory(self, rows: int) -> Memory:

@@ -73,7 +73,7 @@ class OffPolicyConfig(NetworkConfig):
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Returns of a task fade after ``horizon`` newer ones. ``gamma`` is a number, or one per environment (N,).
+    Returns of a task are forgotten after ``horizon`` newer returns. ``gamma`` is a number, or one per environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -254,7 +254,7 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """Take one step of the named optimisers down ``loss`` summed over processes; also sum ``numbers`` (n,)."""
+        """Take one step of the named optimisers on ``loss``, summed over processes; also sum ``numbers`` (n,)."""
         weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
             self.adams[name].zero_grad()

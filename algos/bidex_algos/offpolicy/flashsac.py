@@ -103,7 +103,7 @@ def _of(module: nn.Module) -> list[UnitMLP]:
 
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
-    """Let batch norms within the context use their input's statistics and merge these into the running ones."""
+    """Let batch norms within the context use their input's statistics and merge these into the running statistics."""
     network.train()
     yield
     network.eval()

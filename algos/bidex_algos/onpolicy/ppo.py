@@ -29,7 +29,7 @@ class PPOConfig(LearnerConfig):
 
     @property
     def followed_kl(self) -> float | None:
-        """Return the KL that the step size follows; None: it stays the same."""
+        """Return the KL that the step size follows, or None if the step size stays the same."""
         return self.desired_kl if self.adaptive_learning_rate else None
 
     def __post_init__(self) -> None:
@@ -90,7 +90,7 @@ def policy_loss(
 
 
 def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
-    """Return the factor of a step size: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
+    """Return the factor of a step size: 1 / 1.5 above twice the desired KL, 1.5 below half of it, and 1 in between."""
     return torch.where(kl < 0.5 * desired_kl, 1.5, torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0))
 
 
@@ -131,7 +131,7 @@ class AdaptiveAdam:
         self.actor.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
-        """Take one step along gradients clipped to this norm; its size follows the last step's KL (None: none yet)."""
+        """Take one step along clipped gradients; the step size follows the KL of the last step (None at first)."""
         self.follow(kl)
         nn.utils.clip_grad_norm_(self.weights, max_grad_norm)
         self.actor.step()

@@ -70,7 +70,7 @@ class HeldObject:
         SceneObject(name, self.name, position, colour=colour).attach(scene, part)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
-        """Return the contact room of a class with ``count`` such objects, from the class's need with eggs."""
+        """Return the contact buffer sizes of a class with ``count`` such objects, given the sizes that eggs need."""
         # A flat face meets its support in four points, and each geom may meet palm and fingers at once.
         more = count * (8 + 4 * self.geoms)
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)

@@ -168,7 +168,7 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]
 
 
 def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres (k, 3) and radii (k,) of balls whose convex hull holds a body's colliding geoms; body frame, m.
+    """Return centres (k, 3) and radii (k,), m, body frame, of balls whose convex hull holds all colliding geoms.
 
     Ellipsoids and meshes may stand out by 1 % of their size. Without colliding geoms both arrays are empty.
     """
@@ -182,7 +182,7 @@ def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper corner of the box around a body's colliding geoms, body frame, metres, each (3,).
+    """Return the lower and upper corner, each (3,), of the box around a body's colliding geoms, body frame, metres.
 
     The result is the intersection of the outline's box and the box of the geoms' own boxes, which both hold the geoms.
     """

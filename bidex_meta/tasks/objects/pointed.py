@@ -42,7 +42,7 @@ class PointedObject(SceneObject):
 class OwnObjectClass(ReachTask):
     """A class whose object may be the user's, with the sensors and joints of the class's own object.
 
-    ``usual_stands``: whether the class's own object stands on its foot at the start.
+    ``usual_stands`` says whether the class's own object stands on its foot at the start.
     """
 
     usual_stands: ClassVar[bool] = True
@@ -50,7 +50,7 @@ class OwnObjectClass(ReachTask):
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
         """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
 
-        Raises BidexError if the file holds no such object, or one that starts inside hands or table.
+        Raises BidexError if the file holds no such object, or the object starts inside hands or table.
         """
         super().__init__(moving_base)
         (usual,) = self.objects

@@ -115,7 +115,10 @@ def _beside(way: Tensor, sign: float) -> float:
 
 
 def _next(way: Tensor, sign: float, half: float) -> Tensor:
-    """Return the next point of a hand that goes over the bucket to its side and down; from the bucket, metres (3,)."""
+    """Return the hand's next waypoint on its way over the bucket, to the bucket's side and down.
+
+    The waypoint (3,) and ``way`` are offsets from the bucket, in metres.
+    """
     x, y, z = way.tolist()
     over = z - _UP
     at_side = _beside(way, sign)

@@ -16,9 +16,10 @@ _TO_PALM = 0.02
 
 @dataclass(frozen=True)
 class _Leaf:
-    """A leaf from above, as on the right hand's side, where y grows outwards; metres (assets/objects/door.xml).
+    """Geometry of a door leaf seen from above, for the leaf on the right hand's side, where y points outwards.
 
-    ``hinge``: its x, and its y from the door's middle; ``along`` and ``over``: from it to the bar that faces the hands.
+    ``hinge`` is the hinge's x and y; y is measured from the middle of the door. ``along`` and ``over`` are the offsets
+    from the hinge to the bar that faces the hands. Lengths are in metres and come from assets/objects/door.xml.
     """
 
     hinge: tuple[float, float]
