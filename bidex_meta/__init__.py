@@ -21,7 +21,7 @@ from bidex_meta.suite import Suite, load_suite, suite_names
 from bidex_meta.utils.gl_backend import set_aside_what_is_missing
 
 if TYPE_CHECKING:
-    from bidex_meta.benchmark import Benchmark, Task, make_task_world
+    from bidex_meta.benchmark import Benchmark, make_task_world
     from bidex_meta.config import RunConfig
     from bidex_meta.experiments.evaluating import evaluate, meta_test
     from bidex_meta.experiments.learners import learner_class
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from bidex_meta.experiments.transferring import transfer
     from bidex_meta.experiments.verifying import verify
     from bidex_meta.runs import RunFolder
+    from bidex_meta.tasks.task import Task
     from bidex_meta.world import World
 
 __all__ = [
@@ -48,7 +49,7 @@ _LAZY = {
     "RunConfig": "bidex_meta.config",
     "RunFolder": "bidex_meta.runs",
     "SweepPlan": "bidex_meta.experiments.sweep_plan",
-    "Task": "bidex_meta.benchmark",
+    "Task": "bidex_meta.tasks.task",
     "World": "bidex_meta.world",
     "evaluate": "bidex_meta.experiments.evaluating",
     "learner_class": "bidex_meta.experiments.learners",

@@ -12,16 +12,29 @@ from collections.abc import Iterable
 from itertools import product
 from typing import Literal, NamedTuple
 
-_OPENING = ("right_angle", "left_angle", 0.5, 1.2, (0.3, 1.4))
-_CLOSING = ("right_angle", "left_angle", 0.18, 0.82, (0.0, 1.0))
-CHOICES: dict[str, tuple[str, str, float, float, tuple[float, float]]] = {
+
+class Choice(NamedTuple):
+    """The two hidden components of a class with choice and shared suites, and their values, rad."""
+
+    first: str
+    second: str
+    small: float
+    large: float
+    lowest: float
+    """Lower end of the class's range; ``highest`` is the upper end."""
+    highest: float
+
+
+_OPENING = Choice("right_angle", "left_angle", small=0.5, large=1.2, lowest=0.3, highest=1.4)
+_CLOSING = Choice("right_angle", "left_angle", small=0.18, large=0.82, lowest=0.0, highest=1.0)
+CHOICES = {
     "DoorOpenOutward": _OPENING,
     "DoorOpenInward": _OPENING,
     "DoorCloseOutward": _CLOSING,
     "DoorCloseInward": _CLOSING,
-    "Switch": ("switch1_angle", "switch2_angle", 0.18, 0.48, (0.1, 0.5585)),
+    "Switch": Choice("switch1_angle", "switch2_angle", small=0.18, large=0.48, lowest=0.1, highest=0.5585),
 }
-"""Classes with choice and shared suites: the two hidden components, their small and large value, and range, rad."""
+"""Classes with choice and shared suites."""
 ANY_CLASS = "CLASS"
 """The name of any class in messages."""
 _VARIANTS = ("choice2", "choice4", "shared")
@@ -92,27 +105,27 @@ class OfOneClass(NamedTuple):
         """Return name, split and fixed components of each listed task; none if tasks are drawn."""
         if self.variant == "v2":
             return []
-        first, second, small, large, _ = CHOICES[self.class_name]
+        choice = CHOICES[self.class_name]
         if self.variant == "shared":
             return self._shared_tasks()
-        values = {"small": small, "large": large}
+        values = {"small": choice.small, "large": choice.large}
         tasks = []
         for of_first, of_second in product(values, values):
             if of_first == of_second or self.variant == "choice4":
-                fixed = {first: values[of_first], second: values[of_second]}
+                fixed = {choice.first: values[of_first], choice.second: values[of_second]}
                 tasks.append((f"{of_first}-{of_second}", "both", fixed))
         return tasks
 
     def _shared_tasks(self) -> list[_Task]:
         """Return tasks evenly spaced over the class's range, alternately for training and testing."""
-        first, second, _, _, (lowest, highest) = CHOICES[self.class_name]
+        choice = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
         for number in range(_SHARED_TASKS):
             for split in splits:
                 share = (number + 0.25 + 0.5 * (split == "test")) / _SHARED_TASKS
-                angle = lowest + share * (highest - lowest)
-                tasks.append((f"{split}-{number:02}", split, {first: angle, second: angle}))
+                angle = choice.lowest + share * (choice.highest - choice.lowest)
+                tasks.append((f"{split}-{number:02}", split, {choice.first: angle, choice.second: angle}))
         return tasks
 
 

@@ -13,12 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bidex_meta.benchmark
-from bidex_meta.benchmark import Benchmark, Task, make_task_world
+from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.ladder import parts_of
 from bidex_meta.metaworld import CustomML
 from bidex_meta.suite import V1, V2, suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.task import Task
 
 MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
 

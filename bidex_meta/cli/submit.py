@@ -18,7 +18,7 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry of runs, which play their own tasks and as many new tasks, or of a meta-test.
+    """Write a leaderboard entry of runs, which play their own tasks and equally many new tasks, or of a meta-test.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 

@@ -14,11 +14,12 @@ from gymnasium.spaces import Box, Space
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from bidex_meta.benchmark import Benchmark, Task
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.clients.gymnasium_ids import both_seeds, make_suite_world
 from bidex_meta.clients.needs import check_training
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.suite import SPLITS, Suite
+from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import World, checked

@@ -47,7 +47,7 @@ def agreements(recorded: Mapping[str, ClassSummary], again: Mapping[str, ClassSu
     """
     if set(recorded) != set(again):
         raise BidexError(
-            f"Expected the recorded evaluation to be of {', '.join(again)}, got {', '.join(recorded)}. Evaluate anew."
+            f"Expected the recorded evaluation to be of {', '.join(again)}, got {', '.join(recorded)}. Evaluate again."
         )
     normal = NormalDist().inv_cdf
     wider = normal(1 - 0.025 / (_MEASURES * len(recorded))) / normal(0.975)

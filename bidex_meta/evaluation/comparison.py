@@ -202,7 +202,7 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         if evaluated is not None and evaluated < goal:
             raise BidexError(
                 f"The evaluation of {run.path} is of {evaluated:,} steps, but the run goes on to {goal:,}. Let it end, "
-                f"or write it anew: {run.again}"
+                f"or write it again: {run.again}"
             )
         if twice := by_seed[seed].keys() & own.keys():
             raise BidexError(f"{run.path} is the second run of {label} with seed {seed} on {min(twice)}.")

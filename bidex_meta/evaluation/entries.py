@@ -1,6 +1,7 @@
 """Entries of the leaderboard: their schema, and the contradictions that an entry must not have."""
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -107,11 +108,11 @@ class Stated:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Listed:
+class _Listed(ABC):
     """The fields of every entry."""
 
     verified: ClassVar[bool]
-    """Whether ``submit`` has played the episodes."""
+    """True if ``submit`` has played the episodes."""
     format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
     name: _Name
     suite: _Name
@@ -194,7 +195,7 @@ class _Listed:
                 yield f"shots[{shot}]: expected the classes {', '.join(pools)}, got {', '.join(classes)}"
                 return
             for name, row in classes.items():
-                faults = _faults_of(row, self.runs, self._tasks(pools[name]), episodes)
+                faults = _faults_of_row(row, self.runs, self._tasks(pools[name]), episodes)
                 yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
 
     def _pools(self, where: str) -> dict[str, int]:
@@ -214,9 +215,9 @@ class _Listed:
         """Return the number of train tasks per class, if it differs from that of the suite."""
         return None
 
+    @abstractmethod
     def _tasks(self, pool: int) -> range:
         """Return the numbers of tasks that may be played of a pool."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +226,7 @@ class Entry(_Listed):
 
     verified = True
     algorithm: _Name
-    train_tasks: Whole | None  # per class; 0: new ones in each episode or trial; None: as many as the suite has
+    train_tasks: Whole | None  # per class; 0: a new task in each episode or trial; None: the suite's number
     steps: list[Count]  # of the checkpoints
     own: Part
     """Results on the tasks of the suite's train split, as the runs' seeds draw them."""
@@ -329,7 +330,7 @@ def _suite(name: str) -> Suite | None:
     return load_suite(name)
 
 
-def _faults_of(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
+def _faults_of_row(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
     """Yield the contradictions within a class of ``runs`` runs, ``tasks`` tasks and ``episodes`` of each."""
     counts = {len(of_run) for of_run in row.solved}
     if len(row.solved) != runs or len(counts) != 1 or min(counts) not in tasks:

@@ -53,11 +53,11 @@ def read_entry(path: Path) -> AnyEntry:
     _check(entry, str(path))
     name = entry_name(entry.suite, entry.name)
     if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it anew.")
+        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
     if path.name != name:
-        raise BidexError(f"{path}: expected a file named {name}. Submit it anew.")
+        raise BidexError(f"{path}: expected a file named {name}. Submit it again.")
     if entry.receipt.evaluation != _digest_of(entry):
-        raise BidexError(f"{path}: receipt.evaluation: expected the digest of the content. Submit it anew.")
+        raise BidexError(f"{path}: receipt.evaluation: expected the digest of the content. Submit it again.")
     return entry
 
 
@@ -68,7 +68,7 @@ def _check(entry: AnyEntry, where: str) -> None:
     except BidexError as error:  # of a suite that is not here, or not so
         raise BidexError(f"{where}: {error}") from None
     if fault is not None:
-        raise BidexError(f"{where}: {fault}. Submit it anew.")
+        raise BidexError(f"{where}: {fault}. Submit it again.")
 
 
 def read_entries(folder: Path) -> dict[Path, AnyEntry]:

@@ -320,7 +320,7 @@ def _judged(run: _Run, worlds: Worlds, episodes: int, seed: int) -> _Played:
 
 def _adapted(run: _Run, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int) -> _Played:
     """Play a meta-test."""
-    # An agent that adapts by its own episodes explores in as many environments as it is judged in.
+    # An agent that adapts by its own episodes is judged in the environments in which it explores.
     rollouts = episodes if adaptation.is_per_environment else None
     options = Options(shots=SHOTS, tasks=TASKS, episodes=episodes, rollouts=rollouts, seed=seed)
     load = partial(policy_of, run.folder, run.state, worlds.device)

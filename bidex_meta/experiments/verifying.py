@@ -156,7 +156,7 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
             return found
     raise BidexError(
         f"The evaluation is of {steps:,} steps, and {folder.path} has no checkpoint of these: its newest is at "
-        f"{folder.checkpoints.newest_step() or 0:,}. Evaluate anew: bidex-meta evaluate {folder.path} --json"
+        f"{folder.checkpoints.newest_step() or 0:,}. Evaluate again: bidex-meta evaluate {folder.path} --json"
     )
 
 
@@ -187,7 +187,7 @@ def _again(
         if not part.rewards_shown:
             raise BidexError(
                 f"{folder.path}: the evaluation hid the rewards of its episodes, as before version 0.3.0. Evaluate "
-                f"anew: bidex-meta evaluate {folder.path} --json"
+                f"again: bidex-meta evaluate {folder.path} --json"
             )
         options = Options(
             shots=part.shots, rollouts=part.rollouts, trials=part.trials, episodes=part.before.episodes_per_task,

@@ -6,10 +6,11 @@ environments in this process, which MuJoCo 4 breaks (``library.mended``), and ma
 
 from contextlib import suppress
 
-from bidex_meta.benchmark import Benchmark, Task
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.metaworld.benchmarks import ML1, ML4, ML20, MT1, MT4, MT20, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
 from bidex_meta.metaworld.vector_envs import make_ml_envs, make_ml_envs_test, make_ml_envs_train, make_mt_envs
+from bidex_meta.tasks.task import Task
 
 with suppress(ModuleNotFoundError):
     mended().Benchmark.register(Benchmark)

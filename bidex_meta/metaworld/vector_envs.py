@@ -12,12 +12,13 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
-from bidex_meta.benchmark import Benchmark, Task
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
 from bidex_meta.suite import V1, known_suite, load_suite, plain_name, versioned_name
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Few, true_or_false
 from bidex_meta.world.episodes import checked_mode

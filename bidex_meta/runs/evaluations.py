@@ -217,7 +217,7 @@ def read_evaluation(path: Path, again: str) -> Evaluated:
     try:
         return parse_evaluation(read_json(path, "an evaluation"), str(path))
     except BidexError as error:
-        raise BidexError(f"{error} Write it anew: {again}") from None
+        raise BidexError(f"{error} Write it again: {again}") from None
 
 
 def parse_evaluation(content: object, where: str) -> Evaluated:

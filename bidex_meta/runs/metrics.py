@@ -95,7 +95,7 @@ def mend(path: Path, step: Whole) -> list[Json]:
     try:
         lines = _lines(path)
     except BidexError as error:
-        print(f"{error} It is kept as {path.name}.damaged, and metrics begin anew.", file=sys.stderr)
+        print(f"{error} It is kept as {path.name}.damaged, and new metrics begin.", file=sys.stderr)
         path.rename(path.with_name(f"{path.name}.damaged"))
         return []
     bad = sum(row is None for _, row in lines[:-1])

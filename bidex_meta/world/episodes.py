@@ -188,7 +188,7 @@ def checked_seed(seed: object, mask: Tensor) -> int:
     """Return the seed of a reset; raise BidexError unless it is a non-negative integer and the reset is full."""
     number = whole_number("seed", seed, 0)
     if not mask.all():
-        raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")
+        raise BidexError("Expected a seed with a full reset, got a reset_mask too; a seed restarts all environments.")
     return number
 
 

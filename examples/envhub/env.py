@@ -4,6 +4,7 @@ hf upload ME/bidex-meta examples/envhub, then: lerobot.envs.factory.make_env("ME
 trust_remote_code=True). docs/hub.md lists what LeRobot gets.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from bidex_meta import Benchmark, make_task_world
+from bidex_meta import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.world import World
 
@@ -23,28 +24,33 @@ _HANDS = ("right_hand", "left_hand")
 def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> dict[str, dict[int, "LeRobotEnv"]]:
     """Return the vector environments of a suite's classes, each with `n_envs` environments: `{suite: {number: env}}`.
 
-    `use_async_envs` has no effect, because a world steps its environments in threads. All classes have observations and
-    actions of one size. Raises BidexError for an unknown suite, and for a suite that hides its goals.
+    Tasks, rules and rewards are those of the suite. `use_async_envs` has no effect, because a world steps its
+    environments in threads. All classes have observations and actions of one size. Raises BidexError for an unknown
+    suite, and for a suite that hides its goals.
     """
     benchmark = Benchmark(getattr(cfg, "task", None) or SUITE)
-    if benchmark.suite.kind != "multi-task":
-        raise BidexError(f'Expected a suite that shows its goals, such as "MT4-v2", got {benchmark.name}.')
+    suite = benchmark.suite
+    if suite.kind != "multi-task":
+        raise BidexError(f'Expected a suite that shows its goals, such as "MT4-v2", got {suite.name}.')
     worlds = []
-    for name in benchmark.train_classes:
-        worlds.append(make_task_world(name, num_envs=n_envs, moving_base=True, stagger=False))
+    for entry in suite.classes:
+        alone = replace(suite, classes=(entry,), observation="plain", task_id="class")
+        worlds.append(Benchmark(alone).make_world(num_envs=n_envs, stagger=False))
     width = max(world.observation_size for world in worlds)
-    return {benchmark.name: {number: LeRobotEnv(world, width) for number, world in enumerate(worlds)}}
+    envs = [LeRobotEnv(world, width, name) for world, name in zip(worlds, benchmark.train_classes, strict=True)]
+    return {suite.name: dict(enumerate(envs))}
 
 
 class LeRobotEnv(VectorWrapper):
-    """The world of a class as LeRobot's evaluation uses it; its observation is padded with zeros to a width.
+    """The world of the class `name` as LeRobot's evaluation uses it; observations are padded with zeros to a width.
 
     `agent_pos` holds the hands, `environment_state` objects and goal. `info["final_info"]` has `is_success`.
     """
 
-    def __init__(self, world: World, width: int) -> None:
+    def __init__(self, world: World, width: int, name: str) -> None:
         super().__init__(world.to_numpy())
         self.world = world
+        self._name = name
         is_hand = np.zeros(width, dtype=bool)
         for group in world.observation_groups:
             if group.name in _HANDS:
@@ -76,7 +82,7 @@ class LeRobotEnv(VectorWrapper):
         if name == "_max_episode_steps":
             return (int(self.world.max_episode_steps[0]),) * self.num_envs
         if name == "task":
-            return tuple(self.world.task_name)
+            return (self._name,) * self.num_envs
         if name == "task_description":
             return tuple(self.world.instructions())
         if name == "render":

@@ -189,6 +189,13 @@ def test_envhub_offers_what_lerobot_calls(tmp_path: Path) -> None:
         each.close()
 
 
+def test_envhub_plays_the_tasks_of_the_suite() -> None:
+    benchmark = Benchmark("MT1-Switch-choice2")
+    (env,) = example("envhub/env").make_env(n_envs=2, cfg=SimpleNamespace(task=benchmark.name))[benchmark.name].values()
+    (pool,) = env.world.pools
+    assert np.array_equal(pool, np.stack([task.variation for task in benchmark.train_tasks]))
+
+
 def test_envhub_refuses_a_suite_that_hides_its_goals() -> None:
     with pytest.raises(BidexError, match=r"shows its goals.*got ML4-v2"):
         example("envhub/env").make_env(cfg=SimpleNamespace(task="ML4-v2"))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bidex_meta import Benchmark, make_task_world
-from bidex_meta.benchmark import Task
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.task import Task
 from tests.world.play import suite_world
 
 VERSIONS = ("", "-v2")

@@ -22,7 +22,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive, check_risi
 class ProMPConfig(OuterConfig):
     """All options of ProMP; the defaults are the preset ``laptop``."""
 
-    outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts anew.
+    outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts again.
     outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the start.
     desired_kl: Positive | None = None
     """Divide the step size by 1.5 when the KL of the adapted policies from those that sampled exceeds twice this,
