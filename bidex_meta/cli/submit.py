@@ -12,6 +12,7 @@ from bidex_meta.evaluation.agreement import DIFFERS, EQUAL
 from bidex_meta.evaluation.entries import AdaptationTrack
 from bidex_meta.evaluation.leaderboard import read_entry, success_iqm
 from bidex_meta.experiments.submitting import check, submit, submit_agent
+from bidex_meta.experiments.submitting_transfer import check_transfer, submit_transfer
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.validation import Few
 
@@ -29,6 +30,8 @@ class SubmitFlags:
     runs: RunPaths  # Run folders, a seed each.
     tuning: str | None = None  # Settings that you tried before you chose these, times seeds of each; 1x1: no others.
     check: Path | None = None  # Play the runs of this entry again and compare; writes nothing.
+    transfer: Path | None = None
+    """Folder of `bidex-meta transfer` for the run, to rank how much its policy helps on held-out classes."""
     evaluation: Path | None = None  # Instead of runs: the file of a meta-test, from meta_test(agent, suite).save(FILE).
     track: AdaptationTrack | None = None
     """Training of the agent of --evaluation: reward-only (rewards of its own episodes) or privileged (also teachers,
@@ -48,12 +51,19 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError("Expected run folders to submit, got none. Name them: bidex-meta submit runs/MT20/mtppo/*")
     if flags.track is not None and flags.evaluation is None:
         raise BidexError("--track is for --evaluation: a run's track comes from its learner. Leave it out.")
+    if flags.transfer is not None and len(flags.runs) != 1:
+        raise BidexError(f"--transfer: expected one run, whose policy was transferred, got {len(flags.runs)}.")
     if flags.check is not None:
         _check(flags, flags.check)
         return
     tuning = _tuning(flags.tuning)
     if flags.evaluation is not None:
         path = submit_agent(flags.evaluation, flags.out, name=flags.name, track=flags.track, tuning=tuning)
+    elif flags.transfer is not None:
+        path = submit_transfer(
+            _folders(flags)[0], flags.transfer, flags.out, name=flags.name, tuning=tuning,
+            episodes=flags.episodes or 1, device=flags.device,
+        )  # fmt: skip
     else:
         path = submit(
             _folders(flags), flags.out, name=flags.name, tuning=tuning, episodes=flags.episodes,
@@ -83,7 +93,10 @@ def _check(flags: SubmitFlags, path: Path) -> None:
     """Repeat an entry, and print differences and the verdict; return exit code 1 if something differs."""
     if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
         raise BidexError("--check takes an entry, its runs and --device, and all else from the entry. Leave it out.")
-    found = check(path, _folders(flags), flags.device)
+    if flags.transfer is not None:
+        found = check_transfer(path, _folders(flags)[0], flags.transfer, flags.device)
+    else:
+        found = check(path, _folders(flags), flags.device)
     table = Sheet(["task", "outcome", "success", "again"], "Results that are not equal")
     for each in found.classes:
         if each.outcome != EQUAL:

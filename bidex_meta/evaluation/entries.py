@@ -2,31 +2,30 @@
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import MANY_TASKS
-from bidex_meta.evaluation.statistics import Estimate, bootstrap, estimate_from
-from bidex_meta.runs.atomic import Json
+from bidex_meta.evaluation.entry_rows import ClassRow, class_row, faults_of_row, row_table
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
-from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole
+from bidex_meta.utils.validation import Count, Few, NonNegative, Seed, Whole
 
 FORMAT = 3
 SHOTS = 2  # of a meta-test: a trial has three episodes
 TASKS = 20  # of a class in a meta-test, the first of its pool
 MULTI_TASK = "multi-task"
+TRANSFER = "transfer"
+TRANSFER_STEPS = 1_000_000  # of training on each held-out class
 _FIRST_SEED = 2**30
 """The least evaluation seed: seeds of training are small, so that no run trains on the tasks of an evaluation."""
 _TASKS_OF_METAWORLD = 50
 _MOST_EPISODES = 1000  # of a task after a shot, over all trials
-ROUNDING = 1e-6  # of stored rates
-_Interval = tuple[Fraction, Fraction]
+_ITEMS = {MULTI_TASK: 1, TRANSFER: 2}  # of ``shots`` by track; other tracks have one before and one after each shot
 _Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
 _Commit = Annotated[str, Meta(pattern=r"^[0-9a-f]{7,40}\+?$")]
@@ -36,17 +35,8 @@ _Version = Annotated[str, Meta(max_length=100, pattern=r"^[0-9][\w.+]*$")]
 AdaptationTrack = Literal["reward-only", "privileged"]
 """The training of an agent that adapts: rewards of its own episodes alone; or also teachers, hidden parts of tasks, or
 rewards of other goals."""
-Track = Literal["multi-task", "reward-only", "privileged"]
-
-
-@dataclass(frozen=True)
-class ClassRow:
-    """The results of a class."""
-
-    success: Fraction
-    interval: _Interval | None  # 95 %, of the mean over runs and tasks; None with a single episode
-    solved: Annotated[list[Annotated[list[Whole], Meta(min_length=1)]], Meta(min_length=1)]
-    """Successful episodes of each task, one list per run."""
+Track = Literal["multi-task", "reward-only", "privileged", "transfer"]
+ADAPTATION: tuple[str, ...] = get_args(AdaptationTrack)
 
 
 Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
@@ -58,11 +48,12 @@ class Part:
 
     trials: Few  # adaptations to each task, each with ``episodes`` of the entry
     rollouts: Whole  # exploration episodes of each task in a shot; 0 for a policy that does not adapt
-    shots: Annotated[list[Classes], Meta(min_length=1)]  # after 0, 1, ... shots
+    shots: Annotated[list[Classes], Meta(min_length=1)]
+    """Results after 0, 1, ... shots; of a transfer, from scratch and from the run."""
 
     def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
         """Return success (runs, units) in each class after a shot; ``episodes`` are those of an adaptation."""
-        return [_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
+        return [row_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
 
 
 @dataclass(frozen=True)
@@ -127,8 +118,8 @@ class _Listed(ABC):
 
     @property
     def runs(self) -> int:
-        """Return the number of runs; an agent that is no run counts as one."""
-        return max(1, len(self.receipt.weights))
+        """Return the number of runs, which is that of the lists of successes in every class."""
+        return len(self.receipt.weights)
 
     @property
     def result(self) -> list[np.ndarray]:
@@ -171,15 +162,17 @@ class _Listed(ABC):
             identity = (trained_on.version, trained_on.digest)
         if (conditions.suite_version, conditions.suite_digest) != identity:
             yield f"conditions: expected {self.suite} as it is here, version {identity[0]}, digest {identity[1]}"
-        if self.track != MULTI_TASK and (suite is None or "test" not in suite.splits):
+        if self.track in ADAPTATION and (suite is None or "test" not in suite.splits):
             yield f"track: {self.suite} has no test tasks to adapt to"
+        if self.track == TRANSFER and not held_out(suite):
+            yield f"track: {self.suite} has no class that is only tested"
         for where, part in self.parts.items():
             yield from (f"{where}.{fault}" for fault in self._faults_of(part, self._pools(where)))
 
     def _faults_of(self, part: Part, pools: Mapping[str, int]) -> Iterator[str]:
         """Yield the contradictions within a part whose classes have ``pools`` tasks."""
-        adapts = self.track != MULTI_TASK
-        shots = SHOTS + 1 if adapts else 1
+        adapts = self.track in ADAPTATION
+        shots = _ITEMS.get(self.track, SHOTS + 1)
         if len(part.shots) != shots:
             yield f"shots: expected {shots} of the track {self.track}, got {len(part.shots)}"
         if adapts != (part.rollouts > 0):
@@ -195,12 +188,14 @@ class _Listed(ABC):
                 yield f"shots[{shot}]: expected the classes {', '.join(pools)}, got {', '.join(classes)}"
                 return
             for name, row in classes.items():
-                faults = _faults_of_row(row, self.runs, self._tasks(pools[name]), episodes)
+                faults = faults_of_row(row, self.runs, self._tasks(pools[name]), episodes)
                 yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
 
     def _pools(self, where: str) -> dict[str, int]:
         """Return the number of tasks per class in a part."""
         suite = _suite(self.suite)
+        if self.track == TRANSFER:
+            return held_out(suite)
         if suite is None:
             return dict.fromkeys(METAWORLD_SUITES[self.suite], _TASKS_OF_METAWORLD)
         if where == "own":
@@ -221,24 +216,40 @@ class _Listed(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry(_Listed):
-    """Runs that differ only in the seed, and their verified results; lists have one item per run."""
+class _OfRuns(_Listed):
+    """An entry of runs, which `submit` has played."""
 
     verified = True
     algorithm: _Name
     train_tasks: Whole | None  # per class; 0: a new task in each episode or trial; None: the suite's number
     steps: list[Count]  # of the checkpoints
+    stated: Stated
+
+    def _train_tasks(self) -> int | None:
+        return self.train_tasks
+
+    def faults(self) -> Iterator[str]:
+        """Yield the contradictions within an entry and to its suite."""
+        weights = self.receipt.weights
+        if len({*weights}) < len(weights):
+            yield "receipt.weights: expected another policy of each run, got one twice"
+        seed = evaluation_seed(weights)
+        if self.seed != seed:
+            yield f"seed: expected {seed}, which comes from the weights, got {self.seed}"
+        yield from super().faults()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry(_OfRuns):
+    """Runs that differ only in the seed, and their verified results; lists have one item per run."""
+
     own: Part
     """Results on the tasks of the suite's train split, as the runs' seeds draw them."""
-    stated: Stated
 
     @property
     def parts(self) -> dict[str, Part]:
         """Return the parts by name."""
         return {"new": self.new, "own": self.own}
-
-    def _train_tasks(self) -> int | None:
-        return self.train_tasks
 
     def _tasks(self, pool: int) -> range:
         tasks = pool if self.track == MULTI_TASK else min(pool, TASKS)
@@ -249,16 +260,52 @@ class Entry(_Listed):
         receipt = self.receipt
         named = {"steps": self.steps, "receipt.weights": receipt.weights, "receipt.config": receipt.config}
         named |= {f"stated.{name}": value for name, value in vars(self.stated).items() if isinstance(value, list)}
-        for name, values in named.items():
-            if len(values) != self.runs:
-                yield f"{name}: expected {self.runs} values, one per run, got {len(values)}"
-        if len({*receipt.weights}) < len(receipt.weights):
-            yield "receipt.weights: expected another policy of each run, got one twice"
+        yield from _faults_of_lengths(named, self.runs)
         if len({*self.stated.seeds}) < len(self.stated.seeds):
             yield "stated.seeds: expected each seed once"
-        seed = evaluation_seed(receipt.weights)
-        if self.seed != seed:
-            yield f"seed: expected {seed}, which comes from the weights, got {self.seed}"
+        if self.track == TRANSFER:
+            yield "track: expected policies that learned the held-out classes, got none"
+        yield from super().faults()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferEntry(_OfRuns):
+    """A run whose policy learned each held-out class, compared with policies that learned it from scratch.
+
+    The lists of ``steps`` and ``stated`` have one item, for the run. The first item of ``new.shots`` holds the results
+    of training from scratch, the second those of training that began with the run's policy.
+    """
+
+    start: _Digest
+    """The weights of the run's policy; those in the receipt are of the policies that it became, class by class."""
+    scratch: list[_Digest]  # of the policies from scratch, in the same order
+    seeds: Annotated[list[Seed], Meta(min_length=1)]  # of the training on each class
+    budget: Count  # environment steps of the training on each class
+
+    @property
+    def runs(self) -> int:
+        """Return the number of policies that learned each class from the run's policy."""
+        return len(self.seeds)
+
+    def _tasks(self, pool: int) -> range:
+        return range(pool, pool + 1)
+
+    def faults(self) -> Iterator[str]:
+        """Yield the contradictions within an entry and to its suite."""
+        if self.track != TRANSFER:
+            yield f"track: expected {TRANSFER}, got {self.track}"
+        if self.budget != TRANSFER_STEPS:
+            yield f"budget: expected {TRANSFER_STEPS:,} steps, got {self.budget:,}"
+        receipt = self.receipt
+        policies = self.runs * len(held_out(_suite(self.suite)))
+        named = {"receipt.weights": receipt.weights, "receipt.config": receipt.config, "scratch": self.scratch}
+        yield from _faults_of_lengths(named, policies)
+        stated = {f"stated.{name}": value for name, value in vars(self.stated).items() if isinstance(value, list)}
+        yield from _faults_of_lengths({"steps": self.steps, **stated}, 1)
+        if len({*self.seeds}) < len(self.seeds):
+            yield "seeds: expected each seed once"
+        if len({self.start, *receipt.weights, *self.scratch}) < 1 + 2 * policies:
+            yield "start, receipt.weights, scratch: expected each policy once"
         yield from super().faults()
 
 
@@ -271,6 +318,11 @@ class AgentEntry(_Listed):
     agent: _Name  # its class
     task_seed: Seed
 
+    @property
+    def runs(self) -> int:
+        """Return one, because an agent that is no run counts as one."""
+        return 1
+
     def _tasks(self, pool: int) -> range:
         return range(1, pool + 1)
 
@@ -282,43 +334,13 @@ class AgentEntry(_Listed):
         yield from super().faults()
 
 
-AnyEntry = Entry | AgentEntry
+AnyEntry = Entry | TransferEntry | AgentEntry
 
 
 def evaluation_seed(weights: Iterable[str]) -> int:
     """Return the seed of an evaluation, from the digests of the policies that it plays."""
     digest = hashlib.sha256("/".join(("bidex-meta evaluation", *sorted(weights))).encode()).digest()
     return _FIRST_SEED + int.from_bytes(digest[:8], "little") % _FIRST_SEED
-
-
-def class_row(solved: list[list[int]], episodes: int) -> Json:
-    """Return the results of a class, ready for JSON, from the number of successes per run and task, of ``episodes``."""
-    mean = _mean(_table(solved, episodes))
-    return {"success": mean.value, "interval": mean.interval, "solved": solved}
-
-
-def _table(solved: list[list[int]], episodes: int) -> np.ndarray:
-    """Return success (runs, units): the units are tasks, or episodes if there are few tasks (``MANY_TASKS``)."""
-    counts = np.array(solved)
-    if counts.shape[1] >= MANY_TASKS:
-        return counts / episodes
-    table = []
-    for run, of_run in enumerate(counts):
-        outcomes = (np.arange(episodes) < of_run[:, None]).ravel()
-        # Runs are resampled together, so that successes of two runs must not stand side by side.
-        table.append(np.random.default_rng(run).permutation(outcomes))
-    return np.array(table, dtype=float)
-
-
-def _mean(table: np.ndarray) -> Estimate:
-    """Return the mean of a table (runs, units), with an interval over both."""
-    if table.size < 2:
-        return Estimate(float(table.mean()), None)
-
-    def means(runs: np.ndarray, units: np.ndarray) -> np.ndarray:
-        return table[runs[:, :, None], units[:, None]].mean(axis=(1, 2))
-
-    return estimate_from(float(table.mean()), bootstrap(means, [(len(table),), (table.shape[1],)]))
 
 
 def _suite(name: str) -> Suite | None:
@@ -330,23 +352,16 @@ def _suite(name: str) -> Suite | None:
     return load_suite(name)
 
 
-def _faults_of_row(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
-    """Yield the contradictions within a class of ``runs`` runs, ``tasks`` tasks and ``episodes`` of each."""
-    counts = {len(of_run) for of_run in row.solved}
-    if len(row.solved) != runs or len(counts) != 1 or min(counts) not in tasks:
-        yield f"solved: expected {tasks[-1]} values of each of {runs} runs, got {[*map(len, row.solved)]}"
-        return
-    if max(map(max, row.solved)) > episodes:
-        yield f"solved: expected at most {episodes} episodes of a task"
-        return
-    expected = class_row(row.solved, episodes)
-    if abs(expected["success"] - row.success) > ROUNDING:
-        yield f"success: expected the mean of its tasks, {expected['success']:.4f}, got {row.success:.4f}"
-    given = row.interval
-    wanted = expected["interval"]
-    if given is None or wanted is None:
-        apart = given is not wanted
-    else:
-        apart = max(abs(given[0] - wanted[0]), abs(given[1] - wanted[1])) > ROUNDING
-    if apart:
-        yield f"interval: expected that of its tasks, {wanted}, got {given}"
+def held_out(suite: Suite | None) -> dict[str, int]:
+    """Return the number of test tasks of each class of a suite that is tested but not trained on."""
+    if suite is None:
+        return {}
+    pools = suite.task_names("test") if "test" in suite.splits else {}
+    names = [entry.name for entry in suite.classes if entry.splits == ("test",)]
+    return {name: len(pools[name]) for name in names}
+
+
+def _faults_of_lengths(lists: Mapping[str, Sequence[object]], expected: int) -> Iterator[str]:
+    for name, values in lists.items():
+        if len(values) != expected:
+            yield f"{name}: expected {expected} values, got {len(values)}"

@@ -14,7 +14,8 @@ import numpy as np
 from msgspec import to_builtins
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.entries import ROUNDING, SHOTS, AgentEntry, AnyEntry, ClassRow, Entry, Part, class_row
+from bidex_meta.evaluation.entries import SHOTS, TRANSFER, AgentEntry, AnyEntry, Entry, Part, TransferEntry
+from bidex_meta.evaluation.entry_rows import ROUNDING, ClassRow, class_row
 from bidex_meta.evaluation.statistics import (
     Estimate,
     crossed_estimate,
@@ -35,7 +36,7 @@ def entry_name(suite: str, name: str) -> str:
     return f"{suite}-{name}.json".replace(" ", "-").replace("/", "-")
 
 
-def sealed(content: Json, kind: type[Entry] | type[AgentEntry], where: str) -> Json:
+def sealed(content: Json, kind: type[AnyEntry], where: str) -> Json:
     """Return the content of a new entry with the digest of its evaluation.
 
     Raises BidexError, which begins with ``where``, if the leaderboard does not take the entry.
@@ -49,7 +50,12 @@ def sealed(content: Json, kind: type[Entry] | type[AgentEntry], where: str) -> J
 def read_entry(path: Path) -> AnyEntry:
     """Read an entry; raise BidexError if the file cannot be read, does not fit the schema, or contradicts itself."""
     content = read_json(path, "an entry of the leaderboard")
-    entry = parse(content, AgentEntry if path.parent.name == "trials" else Entry, str(path), exact=True)
+    kind: type[AnyEntry] = Entry
+    if path.parent.name == "trials":
+        kind = AgentEntry
+    elif content.get("track") == TRANSFER:
+        kind = TransferEntry
+    entry = parse(content, kind, str(path), exact=True)
     _check(entry, str(path))
     name = entry_name(entry.suite, entry.name)
     if portable(content) != content:
@@ -79,10 +85,13 @@ def read_entries(folder: Path) -> dict[Path, AnyEntry]:
 
 
 def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
-    """Raise BidexError if one policy is in two entries, of any suites."""
+    """Raise BidexError if one policy is in two entries, of any suites, or transferred in two."""
     known: dict[str, Path] = {}
     for path, entry in entries.items():
-        for digest in entry.receipt.weights:
+        weights = [*entry.receipt.weights]
+        if isinstance(entry, TransferEntry):
+            weights.append(f"{TRANSFER} of {entry.start}")  # the run may also have an entry of its own
+        for digest in weights:
             if digest in known:
                 raise BidexError(f"{path} has a run of {known[digest]}: their weights are equal. Keep one of them.")
             known[digest] = path

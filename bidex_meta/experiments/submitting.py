@@ -18,9 +18,10 @@ from bidex_meta.evaluation.entries import (
     AgentEntry,
     Entry,
     Track,
-    class_row,
+    TransferEntry,
     evaluation_seed,
 )
+from bidex_meta.evaluation.entry_rows import class_row
 from bidex_meta.evaluation.leaderboard import (
     agent_part,
     content_digest,
@@ -54,7 +55,7 @@ _FACTS = ("suite", "track", "algorithm", "train_tasks", "steps")
 
 
 @dataclass(frozen=True)
-class _Run:
+class SubmittedRun:
     """A run that is submitted."""
 
     folder: RunFolder
@@ -101,10 +102,10 @@ def submit(
 
     Raises BidexError for runs that cannot form one entry, and if there is an entry of this name or of equal weights.
     """
-    runs = _read(folders)
+    runs = read_runs(folders)
     config = runs[0].config
     name = name or short_name(config.algo)
-    path = _new(out / entry_name(open_worlds(config.to_json()).short_name, name))
+    path = new_path(out / entry_name(open_worlds(config.to_json()).short_name, name))
     for known, entry in read_entries(out).items():
         for run in runs:
             if run.weights in entry.receipt.weights:
@@ -119,7 +120,7 @@ def submit(
         )
     content = _played(runs, track, episodes, device)
     content |= {"name": name, "tuning": {"trials": tuning[0], "seeds": tuning[1]}}
-    _write(path, sealed(content, Entry, str(path)))
+    write_entry(path, sealed(content, Entry, str(path)))
     return path
 
 
@@ -129,10 +130,12 @@ def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
     Raises BidexError if the runs are not those of the entry.
     """
     entry = read_entry(path)
+    if isinstance(entry, TransferEntry):
+        raise BidexError(f"{path} is of a transfer. Name the run, and the folder of its transfer by --transfer.")
     if not isinstance(entry, Entry):
         raise BidexError(f"{path} is of an agent that is no run: nobody can play it. Name an entry of runs.")
     weights = entry.receipt.weights
-    runs = _read(folders)
+    runs = read_runs(folders)
     found = [run.weights for run in runs]
     if sorted(found) != sorted(weights):
         raise BidexError(f"{path} is of other runs: expected weights {', '.join(weights)}, got {', '.join(found)}.")
@@ -174,18 +177,18 @@ def submit_agent(
             "parts of tasks or rewards of other goals too), got none."
         )
     name = name or found.agent or ""
-    path = _new(out / "trials" / entry_name(found.suite or "", name))
+    path = new_path(out / "trials" / entry_name(found.suite or "", name))
     content = {
         "format": FORMAT, "name": name, "suite": found.suite, "track": track, "agent": found.agent,
         "tuning": {"trials": tuning[0], "seeds": tuning[1]}, "seed": found.seed, "task_seed": found.task_seed,
         "episodes": episodes, "new": asdict(part), "conditions": asdict(found.conditions),
         "receipt": {"weights": [], "config": [], "code": None},
     }  # fmt: skip
-    _write(path, sealed(content, AgentEntry, str(file)))
+    write_entry(path, sealed(content, AgentEntry, str(file)))
     return path
 
 
-def _track_of(runs: Sequence[_Run]) -> Track | None:
+def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
     """Return the track of runs, from their learner's class and what they learned from; None if nobody can tell."""
     if Capability.ADAPTS not in learner_class(runs[0].config.algo).capabilities:
         return MULTI_TASK
@@ -220,13 +223,16 @@ def _was_privileged(config: RunConfig) -> bool | None:
             return None
 
 
-def _read(folders: Sequence[RunFolder]) -> list[_Run]:
-    """Return runs with their policies; raise BidexError if the runs cannot form one entry."""
+def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[SubmittedRun]:
+    """Return runs with their policies; raise BidexError if the runs cannot form one entry.
+
+    ``shipped``: the runs must have trained on a suite that everybody has, not on a suite file.
+    """
     configs = [folder.config() for folder in folders]
     for folder, config in zip(folders, configs, strict=True):
         if config.suite is None:
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
-        if config.suite.endswith(".toml"):
+        if shipped and config.suite.endswith(".toml"):
             raise BidexError(
                 f"{folder.path} trained on {portable(config.suite)}. The leaderboard is of shipped suites."
             )
@@ -242,7 +248,7 @@ def _read(folders: Sequence[RunFolder]) -> list[_Run]:
     check_alike(folders)
     for folder in folders:
         check_worlds_of(folder, worlds, "An entry is of the present ones: submit with the versions in versions.json.")
-    runs: dict[str, _Run] = {}
+    runs: dict[str, SubmittedRun] = {}
     for folder, config in zip(folders, configs, strict=True):
         state, steps = checkpoint(folder, noted=True)
         with fitting(folder.path):
@@ -252,11 +258,11 @@ def _read(folders: Sequence[RunFolder]) -> list[_Run]:
             raise BidexError(
                 f"{folder.path} and {runs[digest].folder.path} have equal weights: they are one run. Name it once."
             )
-        runs[digest] = _Run(folder, config, {"learner": {"policy": policy}}, steps, digest)
+        runs[digest] = SubmittedRun(folder, config, {"learner": {"policy": policy}}, steps, digest)
     return list(runs.values())
 
 
-def _played(runs: Sequence[_Run], track: Track, episodes: int | None, device: str) -> Json:
+def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, device: str) -> Json:
     """Play runs and return the content of their entry, without its name, tuning and seal."""
     first = runs[0].config
     if episodes is None:
@@ -270,25 +276,16 @@ def _played(runs: Sequence[_Run], track: Track, episodes: int | None, device: st
             say(f"{run.folder.path}: playing {'its own' if name == 'own' else 'new'} tasks.")
             set_up_torch(run.config.threads, run.config.deterministic)
             if track == MULTI_TASK:
-                played.append(_judged(run, of_run[place], episodes, seed))
+                played.append(judged(run, of_run[place], episodes, seed))
             else:
                 adaptation = Adaptation.of(of_run[0], run.config)
                 played.append(_adapted(run, of_run[place], adaptation, ("train", "test")[place], episodes, seed))
         parts[name] = _part(played, episodes)
-    stated = [_facts(run) for run in runs]
     return {
         "format": FORMAT, "suite": worlds[0][0].short_name, "track": track, "algorithm": first.algo,
         "train_tasks": first.tasks_per_class, "steps": [run.steps for run in runs], "seed": seed,
         "episodes": episodes, **parts, "conditions": asdict(conditions(worlds[0][0])),
-        "stated": {
-            "seeds": [run.config.seed for run in runs], "hours": [row[0] for row in stated],
-            "device": stated[0][1], "commit": [row[2] for row in stated],
-        },
-        "receipt": {
-            "weights": [run.weights for run in runs],
-            "config": [content_digest(portable(run.config.to_json())) for run in runs],
-            "code": _commit(git_state(Path(__file__).parent)),
-        },
+        "stated": stated(runs), "receipt": receipt(runs),
     }  # fmt: skip
 
 
@@ -308,7 +305,7 @@ class _Played:
     rollouts: int = 0
 
 
-def _judged(run: _Run, worlds: Worlds, episodes: int, seed: int) -> _Played:
+def judged(run: SubmittedRun, worlds: Worlds, episodes: int, seed: int) -> _Played:
     """Play the episodes of a policy that does not adapt."""
     world = worlds.world("train")
     found = worlds.judge(
@@ -318,7 +315,9 @@ def _judged(run: _Run, worlds: Worlds, episodes: int, seed: int) -> _Played:
     return _Played([found])
 
 
-def _adapted(run: _Run, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int) -> _Played:
+def _adapted(
+    run: SubmittedRun, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int
+) -> _Played:
     """Play a meta-test."""
     # An agent that adapts by its own episodes is judged in the environments in which it explores.
     rollouts = episodes if adaptation.is_per_environment else None
@@ -341,7 +340,25 @@ def _part(played: Sequence[_Played], episodes: int) -> Json:
     return {"trials": first.trials, "rollouts": first.rollouts, "shots": shots}
 
 
-def _facts(run: _Run) -> tuple[float, str, str | None]:
+def stated(runs: Sequence[SubmittedRun]) -> Json:
+    """Return what the folders of runs state, and nobody can verify."""
+    rows = [_facts(run) for run in runs]
+    return {
+        "seeds": [run.config.seed for run in runs], "hours": [row[0] for row in rows],
+        "device": rows[0][1], "commit": [row[2] for row in rows],
+    }  # fmt: skip
+
+
+def receipt(runs: Sequence[SubmittedRun]) -> Json:
+    """Return the digests of the runs that are played, and the commit of the code that plays."""
+    return {
+        "weights": [run.weights for run in runs],
+        "config": [content_digest(portable(run.config.to_json())) for run in runs],
+        "code": commit_of(git_state(Path(__file__).parent)),
+    }
+
+
+def _facts(run: SubmittedRun) -> tuple[float, str, str | None]:
     """Return the hours of training, the device, and the commit that trained."""
     versions = run.folder.versions()
     config = run.config
@@ -350,17 +367,17 @@ def _facts(run: _Run) -> tuple[float, str, str | None]:
     else:
         gpus = set()
     device = ", ".join(gpus) or f"{config.device}, {config.threads} thread{'s' * (config.threads != 1)}"
-    return round(training_seconds(run.folder.metrics()) / 3600.0, 3), device, _commit(versions.get("git"))
+    return round(training_seconds(run.folder.metrics()) / 3600.0, 3), device, commit_of(versions.get("git"))
 
 
-def _commit(git: Json | None) -> str | None:
+def commit_of(git: Json | None) -> str | None:
     """Return a commit in short, with + if files differed from it; None without one."""
     if not git or not git.get("commit"):
         return None
     return git["commit"][:10] + "+" * bool(git.get("dirty"))
 
 
-def _new(path: Path) -> Path:
+def new_path(path: Path) -> Path:
     """Return the path of an entry; raise BidexError if there is one, or if it cannot be written."""
     if exists(path):
         raise BidexError(f"There is {path} already. Give another --name, or delete it.")
@@ -368,6 +385,7 @@ def _new(path: Path) -> Path:
     return path
 
 
-def _write(path: Path, content: Json) -> None:
+def write_entry(path: Path, content: Json) -> None:
+    """Write the file of an entry, and its folder if there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)

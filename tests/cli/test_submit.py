@@ -14,7 +14,8 @@ import pytest
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import leaderboard, statistics
-from bidex_meta.evaluation.entries import FORMAT, AgentEntry, Entry, class_row, evaluation_seed
+from bidex_meta.evaluation.entries import FORMAT, TRANSFER_STEPS, AgentEntry, Entry, TransferEntry, evaluation_seed
+from bidex_meta.evaluation.entry_rows import class_row
 from bidex_meta.evaluation.leaderboard import (
     improvement,
     profile,
@@ -94,7 +95,8 @@ def test_the_seed_comes_from_the_weights_alone() -> None:
     assert len(seeds) == 100 and min(seeds) >= 2**30 and max(seeds) < 2**31
 
 
-KINDS = {"multi-task": "MT5-v2", "reward-only": "ML5-v2", "agent": "ML1-Switch-choice2"}
+KINDS = {"multi-task": "MT5-v2", "reward-only": "ML5-v2", "agent": "ML1-Switch-choice2", "transfer": "ML4-v2"}
+SCHEMAS = {"agent": AgentEntry, "transfer": TransferEntry}
 
 
 @pytest.fixture
@@ -115,10 +117,25 @@ def _part(suite: Suite, split: str, adapts: bool, runs: int, rate: float, genera
     return {"trials": trials, "rollouts": 4 if adapts else 0, "shots": shots}
 
 
+def _transfer(suite: Suite, runs: int, rate: float, first: int, generator: np.random.Generator) -> dict:
+    """The fields of a transfer to the suite's only held-out class, with ``runs`` seeds."""
+    held_out = "TwoCatchUnderarm"
+    shots = []
+    for success in (rate / 2, rate):
+        solved = generator.binomial(3, success, (runs, 50)).tolist()
+        shots.append({held_out: class_row(solved, 3)})
+    return {
+        "new": {"trials": 1, "rollouts": 0, "shots": shots}, "seeds": list(range(runs)), "budget": TRANSFER_STEPS,
+        "start": f"{first + 100:032x}", "scratch": [f"{first + 200 + number:032x}" for number in range(runs)],
+        "algorithm": "mtppo", "train_tasks": None, "steps": [1000],
+        "stated": {"seeds": [0], "hours": [0.5], "device": "H100", "commit": [None]},
+    }  # fmt: skip
+
+
 def made(kind: str, name: str = "mine", rate: float = 0.5, runs: int = 2, first: int = 0) -> dict[str, Any]:
     """The content of a valid entry; runs of other ``first`` have other weights."""
     suite = load_suite(KINDS[kind])
-    adapts = kind != "multi-task"
+    adapts = kind in ("reward-only", "agent")
     generator = np.random.default_rng(first)
     weights = [f"{first + number:032x}" for number in range(runs)]
     content: dict[str, Any] = {
@@ -134,11 +151,15 @@ def made(kind: str, name: str = "mine", rate: float = 0.5, runs: int = 2, first:
     if kind == "agent":
         receipt = {"weights": [], "config": [], "code": None}
         return sealed({**content, "agent": "Scout", "task_seed": 3, "receipt": receipt}, AgentEntry, "made")
+    receipt = {"weights": weights, "config": weights, "code": "0123456789+"}
+    if kind == "transfer":
+        content |= _transfer(suite, runs, rate, first, generator) | {"receipt": receipt}
+        return sealed(content, TransferEntry, "made")
     content |= {
         "algorithm": "rl2" if adapts else "mtppo", "train_tasks": None, "steps": [1000] * runs,
         "own": _part(suite, "train", adapts, runs, rate, generator),
         "stated": {"seeds": list(range(runs)), "hours": [0.5] * runs, "device": "H100", "commit": [None] * runs},
-        "receipt": {"weights": weights, "config": weights, "code": "0123456789+"},
+        "receipt": receipt,
     }  # fmt: skip
     return sealed(content, Entry, "made")
 
@@ -187,13 +208,13 @@ def _edited(value: Any, rng: random.Random) -> Any:
     return rng.choice([value + 1, value - 1, value / 2, value * 2 + 0.01, -value, 0, 1, 1e12, float("nan"), None, "1"])
 
 
-PROVEN = ("suite", "episodes", "format", "own", "new", "seed")
+PROVEN = ("suite", "episodes", "format", "own", "new", "seed", "budget")
 """Fields that follow from the weights, the suite or other fields. A forger gives the rest a fitting digest too."""
 
 
 def _resealed(content: dict[str, Any]) -> None:
     with suppress(BidexError, LookupError, TypeError, AttributeError):
-        entry = parse(content, Entry, "edited", exact=True)
+        entry = parse(content, TransferEntry if "budget" in content else Entry, "edited", exact=True)
         content["receipt"]["evaluation"] = leaderboard._digest_of(entry)
 
 
@@ -242,17 +263,24 @@ def test_contradictions_are_refused_whatever_the_digest(kind: str, tmp_path: Pat
         "version": lambda entry: entry["conditions"].update(suite_version=9),
         "digest": lambda entry: entry["conditions"].update(suite_digest="0" * 12),
         "mujoco": lambda entry: entry["conditions"]["packages"].pop("mujoco"),
-        "rollouts": lambda entry: entry["new"].update(rollouts=4 if kind == "multi-task" else 0),
+        "rollouts": lambda entry: entry["new"].update(rollouts=4 if kind in ("multi-task", "transfer") else 0),
         "shipped suite": lambda entry: entry.update(suite="mine"),
-        "receipt|one per run": lambda entry: entry["receipt"]["config"].append("0" * 32),
+        r"receipt|expected \d values": lambda entry: entry["receipt"]["config"].append("0" * 32),
     }
     if kind != "agent":
         edits |= {
             "seed: expected": lambda entry: entry.update(seed=entry["seed"] + 1),
             "which comes from the weights": lambda entry: entry["receipt"]["weights"].__setitem__(0, "f" * 32),
             "got one twice": lambda entry: entry["receipt"].update(weights=["0" * 32] * 2),
-            "each seed once": lambda entry: entry["stated"].update(seeds=[0, 0]),
+            "each seed once|expected 1 values": lambda entry: entry["stated"].update(seeds=[0, 0]),
             "train_tasks|digest": lambda entry: entry.update(train_tasks=7),
+        }
+    if kind == "transfer":
+        edits |= {
+            "budget: expected 1,000,000 steps": lambda entry: entry.update(budget=10),
+            "seeds: expected each seed once": lambda entry: entry.update(seeds=[3, 3]),
+            "each policy once": lambda entry: entry.update(start=entry["scratch"][0]),
+            "track": lambda entry: entry.update(track="multi-task"),
         }
 
     def solved_by(entry: dict[str, Any], count: int) -> dict[str, Any]:
@@ -263,7 +291,7 @@ def test_contradictions_are_refused_whatever_the_digest(kind: str, tmp_path: Pat
         content = made(kind)
         edit(content)
         with pytest.raises(BidexError, match=expected):
-            sealed(content, AgentEntry if kind == "agent" else Entry, "edited")
+            sealed(content, SCHEMAS.get(kind, Entry), "edited")
 
 
 def test_a_policy_stands_in_one_entry_alone_of_all_suites(tmp_path: Path, few_resamples) -> None:
@@ -275,19 +303,33 @@ def test_a_policy_stands_in_one_entry_alone_of_all_suites(tmp_path: Path, few_re
         list(leaderboard_table("", tmp_path / "data"))
 
 
+def test_a_run_is_transferred_in_one_entry_alone(tmp_path: Path, few_resamples) -> None:
+    board = tmp_path / "leaderboard"
+    place_of(board, "multi-task", made("multi-task", first=100))  # the policy itself may also have its own entry
+    place_of(board, "transfer", made("transfer"))
+    assert list(leaderboard_table("", tmp_path / "data"))
+    again = made("transfer", "again", first=10)
+    again["start"] = f"{100:032x}"
+    place_of(board, "transfer", sealed(again, TransferEntry, "again"))
+    with pytest.raises(BidexError, match="their weights are equal"):
+        list(leaderboard_table("", tmp_path / "data"))
+
+
 def test_the_table_is_by_track_and_suite_and_claims_only_what_is_separated(tmp_path: Path, few_resamples) -> None:
     board = tmp_path / "leaderboard"
     place_of(board, "multi-task", made("multi-task", "strong", 0.9, first=0))
     place_of(board, "multi-task", made("multi-task", "like", 0.9, first=2))
     place_of(board, "multi-task", made("multi-task", "weak", 0.1, runs=1, first=4))
     place_of(board, "reward-only", made("reward-only", first=6))
+    place_of(board, "transfer", made("transfer", first=8))
     scout = place_of(board, "agent", made("agent", "scout"))
     with pytest.raises(BidexError, match="nobody can play it"):
         submitting.check(scout, [], "cpu")
     lines = list(leaderboard_table("", tmp_path / "data"))
     heads = [line for line in lines if line.startswith("**")]
     of = "adaptation, reward only"
-    assert heads == ["**MT5-v2, multi-task**", f"**ML1-Switch-choice2, {of}**", f"**ML5-v2, {of}**"]
+    adaptation = [f"**ML1-Switch-choice2, {of}**", f"**ML5-v2, {of}**"]
+    assert heads == ["**MT5-v2, multi-task**", *adaptation, "**ML4-v2, transfer to held-out classes**"]
     assert sum("better than weak (policies of single runs)" in line for line in lines) == 2
     assert sum("| not separated |" in line for line in lines) == 1
     assert any("scout (not verified)" in line and "| 12 × 1 |" in line for line in lines)

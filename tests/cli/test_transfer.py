@@ -15,12 +15,15 @@ from gymnasium.spaces import Box
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.cli import main
+from bidex_meta.cli import submit as submit_command
 from bidex_meta.data import Episode, open_dataset, part_files
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation import statistics
+from bidex_meta.evaluation import entries, statistics
+from bidex_meta.evaluation.entry_rows import class_row
+from bidex_meta.evaluation.leaderboard import read_entry, sealed
 from bidex_meta.evaluation.transfer_measures import at_the_end
-from bidex_meta.experiments import transferring
+from bidex_meta.experiments import submitting_transfer, transferring
 from bidex_meta.experiments.evaluating import FinalEvaluation
 from bidex_meta.experiments.run_config import resolve
 from bidex_meta.experiments.sweeping import state_of
@@ -35,6 +38,7 @@ from bidex_meta.experiments.transfer_plan import (
     suite_file,
 )
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.suite import V2, Rules, load_suite, plain_name
 from bidex_meta.worlds import WorldsConfig, open_worlds
 from bidex_meta.worlds.own import OwnSuite
@@ -253,6 +257,37 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
     assert "area over nothing" in tables and "steps to 50 %" in tables and "demonstrations" in tables
 
 
+def test_a_transfer_is_submitted_and_repeated(trained: Path, shown, refused, monkeypatch) -> None:
+    for module in (entries, submitting_transfer):
+        monkeypatch.setattr(module, "TRANSFER_STEPS", 96)
+    words = [*FLAGS[:2], "--demonstrations", *FLAGS[4:], "--out", "t"]
+    ours = ["submit", trained, "--transfer", "t", "--device", "cpu", "--out", "board"]
+    shown("transfer", trained, *words, "--seeds", "1", *MORE)
+    shutil.move("t/runs/TwoCatchUnderarm-nothing-ppo-seed0", "aside")
+    assert "from scratch has the seeds []" in refused(*ours, "--tuning", "1x1")
+    shutil.move("aside", "t/runs/TwoCatchUnderarm-nothing-ppo-seed0")
+    shown("transfer", trained, *words, *MORE)
+    shown(*ours, "--tuning", "1x1")
+    path = Path("board/ML4-v2-mtppo-transfer.json")
+    entry = read_entry(path)
+    assert isinstance(entry, entries.TransferEntry) and (entry.seeds, entry.steps) == ([0, 1], [480])
+    run = RunFolder.open("t/runs/TwoCatchUnderarm-start-ppo-seed1")
+    loaded = run.checkpoints.load()
+    assert loaded and entry.receipt.weights[1] == weights_digest(loaded[0]["learner"]["policy"])
+    assert len(entry.new.shots) == 2 and [*entry.new.shots[0]] == ["TwoCatchUnderarm"]
+    check = ["submit", "--check", path, trained, "--transfer", "t", "--device", "cpu"]
+    assert shown(*check).splitlines()[-1] == f"{path}: equal"
+    assert "by --transfer" in refused(*check[:4])
+    assert "stands in" in refused(*ours, "--tuning", "1x1", "--name", "other")
+    content = json.loads(path.read_text())
+    row = content["new"]["shots"][0]["TwoCatchUnderarm"]
+    content["new"]["shots"][0]["TwoCatchUnderarm"] = class_row([[0] * 50, [1] * 50], 1)
+    assert content["new"]["shots"][0]["TwoCatchUnderarm"] != row
+    path.write_text(json.dumps(sealed(content, entries.TransferEntry, "forged")))
+    with pytest.raises(SystemExit, match="1"):
+        submit_command.main([str(word) for word in check[1:]])
+
+
 def test_what_no_demonstration_shows_plays_the_policy_itself(trained: Path, shown) -> None:
     shown("transfer", trained, *FLAGS, "--steps", "0", "--seeds", "1", "--out", "t", *MORE[:-2])
     before = weights(trained)
@@ -275,8 +310,8 @@ def test_a_failed_run_is_left_out_and_tried_again(trained: Path, monkeypatch, sh
 
 
 def test_bad_input_is_one_line_and_writes_nothing(trained: Path, tmp_path: Path, refused) -> None:
-    for name, entries in (("shown", {"suite": "MT4"}), ("both", {"suite": "ML1"}), ("alone", {"task": "HandOver"})):
-        RunFolder.create(run_config(**{"suite": None, **entries}), tmp_path / name)
+    for name, fields in (("shown", {"suite": "MT4"}), ("both", {"suite": "ML1"}), ("alone", {"task": "HandOver"})):
+        RunFolder.create(run_config(**{"suite": None, **fields}), tmp_path / name)
     RunFolder.create(run_config(suite="ML4-v2"), tmp_path / "nothing")
     RunFolder.create(run_config(suite="ML4-v2"), tmp_path / "others" / "start")
     for words, message in (

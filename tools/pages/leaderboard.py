@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from bidex_meta.evaluation import leaderboard as board
-from bidex_meta.evaluation.entries import MULTI_TASK, SHOTS, AnyEntry, Entry, Track
+from bidex_meta.evaluation.entries import MULTI_TASK, SHOTS, TRANSFER, AgentEntry, AnyEntry, Entry, Track
 from bidex_meta.evaluation.statistics import NONE, iqm
 from tools.pages.tables import table
 
@@ -14,6 +14,7 @@ _TITLES = {
     MULTI_TASK: "multi-task",
     "reward-only": "adaptation, reward only",
     "privileged": "adaptation, privileged training",
+    TRANSFER: "transfer to held-out classes",
 }
 _LAST = ["runs", "steps", "tuning", "hours", "trained on", "commit"]
 
@@ -26,7 +27,7 @@ def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
         for name in sorted({entry.suite for entry in of_track}):
             ranked = sorted((entry for entry in of_track if entry.suite == name), key=_rank, reverse=True)
             yield from (f"**{name}, {_TITLES[track]}**", "")
-            head = _multi_task_head() if track == MULTI_TASK else _adaptation_head()
+            head = _HEADS.get(track, _adaptation_head)()
             yield from table(["", "entry", *head, *_LAST], [_row(*numbered) for numbered in enumerate(ranked, 1)])
             yield ""
             if len(ranked) > 1:
@@ -44,6 +45,13 @@ def _adaptation_head() -> list[str]:
     return ["before", *after, f"own tasks, after {SHOTS}", "exploration episodes"]
 
 
+def _transfer_head() -> list[str]:
+    return ["from the run", "from scratch"]
+
+
+_HEADS = {MULTI_TASK: _multi_task_head, TRANSFER: _transfer_head}
+
+
 def _rank(entry: AnyEntry) -> float:
     return float(iqm(board.success_rates(entry.result).ravel()))
 
@@ -55,6 +63,8 @@ def _row(place: int, entry: AnyEntry) -> list[str]:
     shots = [_percent(entry.new.tables(entry.episodes, shot)) for shot in range(len(entry.new.shots))]
     if entry.track == MULTI_TASK:
         measures = [*shots, own, *(f"{100 * board.profile(entry.result, rate):.0f} %" for rate in board.PROFILE)]
+    elif entry.track == TRANSFER:
+        measures = shots[::-1]
     else:
         measures = [*shots, own, str(entry.new.rollouts)]
     tuning = f"{entry.tuning.trials} × {entry.tuning.seeds}"
@@ -62,7 +72,7 @@ def _row(place: int, entry: AnyEntry) -> list[str]:
 
 
 def _label(entry: AnyEntry) -> str:
-    if not isinstance(entry, Entry):
+    if isinstance(entry, AgentEntry):
         return f"{entry.name} (not verified)"
     if entry.name == entry.algorithm:
         return entry.name
@@ -71,7 +81,7 @@ def _label(entry: AnyEntry) -> str:
 
 def _trained(entry: AnyEntry, tuning: str) -> list[str]:
     """Return the cells of steps, tuning, hours, device and commit."""
-    if not isinstance(entry, Entry):
+    if isinstance(entry, AgentEntry):
         return [NONE, tuning, NONE, NONE, NONE]
     stated = entry.stated
     steps = " / ".join(f"{steps:,}" for steps in sorted(set(entry.steps)))
