@@ -158,8 +158,7 @@ def _played(found: _Transfer, episodes: int, device: str) -> Json:
             for name, runs in runs_of.items():
                 say(f"{name}: playing the policies from {start}.")
                 evaluations = [_on_new_tasks(run, files[name], config, episodes, seed) for run in runs]
-                [solved] = ([each.classes[slot].solved for each in evaluations] for slot in evaluations[0].classes)
-                classes[name] = class_row(solved, episodes)
+                classes[name] = class_row([_solved(evaluation) for evaluation in evaluations], episodes)
             shots.append(classes)
     return {
         "format": FORMAT, "suite": new.short_name, "track": TRANSFER, "algorithm": stored.algo,
@@ -176,3 +175,11 @@ def _on_new_tasks(run: SubmittedRun, file: Path, config: Json, episodes: int, se
     own = run.config.to_json() | {"suite": str(file), "device": config["device"], "engine": config["engine"]}
     [evaluation] = judged(run, open_worlds(own), episodes, seed).by_shot
     return evaluation
+
+
+def _solved(evaluation: Evaluation) -> list[int]:
+    """Return the successes of each task of the only class; several objects of a class are several rows."""
+    solved = []
+    for row in evaluation.classes.values():
+        solved += row.solved
+    return solved

@@ -271,7 +271,7 @@ def test_contradictions_are_refused_whatever_the_digest(kind: str, tmp_path: Pat
         edits |= {
             "seed: expected": lambda entry: entry.update(seed=entry["seed"] + 1),
             "which comes from the weights": lambda entry: entry["receipt"]["weights"].__setitem__(0, "f" * 32),
-            "got one twice": lambda entry: entry["receipt"].update(weights=["0" * 32] * 2),
+            "got one twice|each policy once": lambda entry: entry["receipt"].update(weights=["0" * 32] * 2),
             "each seed once|expected 1 values": lambda entry: entry["stated"].update(seeds=[0, 0]),
             "train_tasks|digest": lambda entry: entry.update(train_tasks=7),
         }
@@ -279,7 +279,7 @@ def test_contradictions_are_refused_whatever_the_digest(kind: str, tmp_path: Pat
         edits |= {
             "budget: expected 1,000,000 steps": lambda entry: entry.update(budget=10),
             "seeds: expected each seed once": lambda entry: entry.update(seeds=[3, 3]),
-            "each policy once": lambda entry: entry.update(start=entry["scratch"][0]),
+            "scratch: expected each policy once": lambda entry: entry.update(start=entry["scratch"][0]),
             "track": lambda entry: entry.update(track="multi-task"),
         }
 

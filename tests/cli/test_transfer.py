@@ -44,7 +44,7 @@ from bidex_meta.worlds import WorldsConfig, open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import toy
 from tests.data.worlds import ABOUT
-from tests.fakes import run_config
+from tests.fakes import SLOT_TASKS, run_config
 
 SUITE = """
 name = "pair"
@@ -260,6 +260,7 @@ def test_all_starts_are_run_once_and_become_tables(trained: Path, tmp_path: Path
 def test_a_transfer_is_submitted_and_repeated(trained: Path, shown, refused, monkeypatch) -> None:
     for module in (entries, submitting_transfer):
         monkeypatch.setattr(module, "TRANSFER_STEPS", 96)
+        monkeypatch.setattr(module, "held_out", lambda suite: {"TwoCatchUnderarm": sum(SLOT_TASKS)})
     words = [*FLAGS[:2], "--demonstrations", *FLAGS[4:], "--out", "t"]
     ours = ["submit", trained, "--transfer", "t", "--device", "cpu", "--out", "board"]
     shown("transfer", trained, *words, "--seeds", "1", *MORE)
@@ -281,7 +282,7 @@ def test_a_transfer_is_submitted_and_repeated(trained: Path, shown, refused, mon
     assert "stands in" in refused(*ours, "--tuning", "1x1", "--name", "other")
     content = json.loads(path.read_text())
     row = content["new"]["shots"][0]["TwoCatchUnderarm"]
-    content["new"]["shots"][0]["TwoCatchUnderarm"] = class_row([[0] * 50, [1] * 50], 1)
+    content["new"]["shots"][0]["TwoCatchUnderarm"] = class_row([[0] * 5, [1] * 5], 1)
     assert content["new"]["shots"][0]["TwoCatchUnderarm"] != row
     path.write_text(json.dumps(sealed(content, entries.TransferEntry, "forged")))
     with pytest.raises(SystemExit, match="1"):
