@@ -65,10 +65,10 @@ class Rung(NamedTuple):
 
 
 RUNGS = (
-    Rung("one of two or four goals", "15 minutes of a core"),
-    Rung("one number", "45 minutes of a core"),
-    Rung("two numbers", "2 hours of a core"),
-    Rung("two numbers, several classes", "2 hours of a core"),
+    Rung("one of two or four goals", "15 minutes on one core"),
+    Rung("one number", "45 minutes on one core"),
+    Rung("two numbers", "2 hours on one core"),
+    Rung("two numbers, several classes", "2 hours on one core"),
     Rung("three numbers and more", "10 minutes of a GPU"),
     Rung("all that version 2 hides", "hours of a GPU"),
 )

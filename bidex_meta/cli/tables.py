@@ -146,10 +146,16 @@ def print_rows(rows: Sequence[Json], as_json: bool, otherwise: str = "Nothing.",
     if as_json:
         print(json.dumps(rows, indent=2))
     elif rows:
-        cells = [[", ".join(cell) if isinstance(cell, list) else cell for cell in row.values()] for row in rows]
+        cells = [[_cell(value) for value in row.values()] for row in rows]
         print_table(plain_table([name.replace("_", " ") for name in rows[0]], cells, spare))
     else:
         print(otherwise)
+
+
+def _cell(value: object) -> object:
+    if value is None:
+        return NONE
+    return ", ".join(value) if isinstance(value, list) else value
 
 
 def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None = None) -> Sheet:

@@ -23,6 +23,7 @@ def test_help_and_lists_need_no_torch():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     named = [*COMMANDS, "MT10", "MT20-v2", *registry.names(), *ALGOS]
     assert all(name in done.stdout for name in named) and done.stdout.rstrip().endswith("set()")
+    assert "None" not in done.stdout
 
 
 def test_the_help_of_run_fits_three_screens_and_that_of_all_flags_names_them_all(monkeypatch, capsys):
