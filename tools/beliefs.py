@@ -1,4 +1,4 @@
-"""``python -m tools.beliefs RUN``: measure the bounds of a learner that infers hidden goals."""
+"""``python -m tools.beliefs RUN``: measure upper bounds for a learner that infers hidden goals."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,8 @@ from bidex_meta.suite import OTHERS
 from bidex_meta.world.contract import PrivilegedWorld
 from bidex_meta.worlds import open_worlds
 
-# Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
+# For beliefs by known reward formulas: the number of candidate goals, whose rewards are computed in each step, and the
+# standard deviation of a reward, because the true goal lies between candidates.
 _CANDIDATES = 128
 _EXACT = 0.02
 
@@ -30,16 +31,18 @@ _EXACT = 0.02
 def beliefs(
     run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
 ) -> None:
-    """Measure success per class on unseen tasks, of a run of icl and of its actor with other knowledge of the goal.
+    """Measure success per class of the actor of an icl run when it knows more about the goal, and of its teachers.
+
+    The actor acts with a belief that knows the reward formulas, and with a belief that knows the goal.
 
     Example: python -m tools.beliefs runs/ML20-v2/icl/RUN
 
     Args:
         run: Folder of a run of icl.
-        shots: Exploring episodes.
-        tasks: Tasks of each class.
-        split: Test tasks, or others of the train classes.
-        out: File that takes the numbers too.
+        shots: Number of exploring episodes.
+        tasks: Number of tasks of each class.
+        split: Tasks to play: test, train, or others (unseen tasks of the train classes).
+        out: JSON file for the results. Default: results are only printed.
     """
     folder = RunFolder.open(run)
     if folder.config().algo != ICL.name:
@@ -83,7 +86,7 @@ class _KnownRewards:
         self.candidates = spread(_CANDIDATES, world.hidden_size)
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return log-likelihoods of the rewards of the step that the world has just made."""
+        """Return log-likelihoods (N, candidates) of the rewards of the world's last step."""
         paid = self._world.rewards_if(self.candidates[:, None].expand(-1, len(obs), -1))
         off = (reward[:, None] - paid.T) / _EXACT
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
@@ -105,7 +108,7 @@ class _ShownGoal:
         return torch.zeros(len(obs), 1)
 
     def believed(self, state: Tensor) -> Tensor:
-        """Return the goals of the tasks that the environments play now."""
+        """Return the goals of the environments' current tasks."""
         return self._world.hidden_values()
 
 

@@ -29,7 +29,7 @@ from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
 
 POINTS = 60
-"""Points of a curve at most."""
+"""Largest number of points of a curve."""
 _TAG = re.compile(
     r"(Train|Eval)/((return|success|score)(/.*)?|mean_return|success_rate|success_before_adapt|mean_episode_length)"
     r"|Perf/steps_per_second"
@@ -38,7 +38,7 @@ _TRAINED = "Train/return/"
 _OF_A_RUN = ("task", "algo", "seed", "learner")
 """Entries of a config in which a run of the same name must not differ."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
-"""What is kept of a class after each shot; the evaluation after the last one has counts and lengths too."""
+"""Measures of a class that are stored for each shot; the evaluation after the last shot also has counts and lengths."""
 
 
 def collect(
@@ -47,10 +47,10 @@ def collect(
     """Add all runs, or none, to the file of a study, and print the runs' names.
 
     Args:
-        runs: Run folders, or the files of sweeps, of which the runs that have ended are taken.
-        into: The study's file of JSON, in which a run has the name of its folder.
-        out: Where a sweep's folder lies (`--out` of `bidex-meta sweep`).
-        arm: What tables call these runs; None: of a sweep its arms, else the folder's name without suite and seed.
+        runs: Run folders or sweep files. From a sweep, all runs that have ended are added.
+        into: The study's JSON file. A run's entry has the name of the run's folder.
+        out: Folder that contains the folder of the sweep (`--out` of `bidex-meta sweep`).
+        arm: Name of these runs in tables. Default: the sweep's arm, or the folder's name without suite and seed.
 
     Raises:
         BidexError: A run cannot be condensed, or it would replace another run.
@@ -78,9 +78,9 @@ def collect(
 def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> Json:
     """Return the entry of an evaluated run in the file of a study.
 
-    ``arm`` is the run's name in its study, without the seed (None: see :func:`arm_of`); ``parameters`` is the number of
-    the policy's parameters, if known. Raises BidexError if the run is not evaluated, its evaluation is of another run
-    or of fewer steps, or its commit is not known.
+    ``arm`` is the run's name in its study, without the seed; with None it is the result of :func:`arm_of`.
+    ``parameters`` is the number of the policy's parameters, if known. Raises BidexError if the run is not evaluated,
+    its evaluation is of another run or of fewer steps, or its commit is not known.
     """
     config = folder.config().to_json()
     evaluation = folder.evaluation()
@@ -112,7 +112,7 @@ def arm_of(path: Path, config: Json) -> str:
 
 
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
-    """Return run folders; for a sweep, the folders of the ended runs, with the names of their arms."""
+    """Return a run folder without an arm; for a sweep file, return folder and arm of each run that has ended."""
     if path.suffix != ".toml":
         return [(path, None)]
     runs = SweepPlan.read(path, out).runs
@@ -132,7 +132,7 @@ def _parameters(folder: RunFolder) -> int | None:
 
 
 def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> None:
-    """Raise BidexError for a run whose table nobody could trust or repeat."""
+    """Raise BidexError for a run whose results nobody could trust or reproduce."""
     if not rows:
         raise BidexError(f"{folder.metrics_path} holds nothing: not a run that has trained. Name another.")
     steps = rows[-1]["step"]
@@ -190,7 +190,7 @@ def _engine(config: Json) -> str:
 
 
 def _evaluation(evaluation: Evaluated) -> Json:
-    """Return the content of an evaluation with less about random actions, and about each shot."""
+    """Return the content of an evaluation, with only some measures of random actions and of each shot."""
     content = evaluation_json(replace(evaluation, run=None))
     if "random" in content:
         content["random"] = _only(content["random"], ("success", "return"))
@@ -208,7 +208,7 @@ def _only(summary: Json, measures: Sequence[str]) -> Json:
 
 
 def _curves(rows: Sequence[Json]) -> dict[str, list[float | None]]:
-    """Return columns by tag: means over intervals of about equal length, with step and training time at their ends."""
+    """Return columns by tag: means over intervals of about equal length, step and training time at interval ends."""
     count = min(POINTS, len(rows))
     edges = [len(rows) * i // count for i in range(count + 1)]
     parts = [rows[low:high] for low, high in pairwise(edges)]

@@ -39,12 +39,12 @@ class Finding:
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:
-    """Replace matches with empty lines, so that line numbers stay."""
+    """Replace matches with empty lines, so that line numbers do not change."""
     return pattern.sub(lambda match: "\n" * match[0].count("\n"), text)
 
 
 def prose(text: str) -> str:
-    """Return a page's text without code blocks, comments, tables and pictures; line numbers stay."""
+    """Return a page's text without code blocks, comments, tables and pictures; line numbers do not change."""
     lines = _blanked(_HIDDEN, text).split("\n")
     return "\n".join("" if line.lstrip().startswith(("|", "![")) else line for line in lines)
 
@@ -107,7 +107,7 @@ def _broken(sentence: str) -> Iterator[str]:
 
 
 def check(page: str, text: str) -> Iterator[Finding]:
-    """Yield what is wrong with a page."""
+    """Yield all findings on a page."""
     text = _blanked(_GENERATED, text)
     for line, sentence in sentences(text):
         for rule in _broken(sentence):
@@ -121,7 +121,7 @@ def check(page: str, text: str) -> Iterator[Finding]:
 
 
 def check_all(rules: dict[str, Any] = RULES, root: Path = ROOT) -> list[str]:
-    """Return what is wrong with the listed pages, without the exceptions, and which exceptions are not needed."""
+    """Return messages for findings on the listed pages that are no exception, and for exceptions without a finding."""
     pages = sorted({path.relative_to(root).as_posix() for glob in rules["pages"] for path in root.glob(glob)})
     pages = [page for page in pages if page not in rules.get("later", [])]
     findings = [finding for page in pages for finding in check(page, (root / page).read_text(encoding="utf-8"))]

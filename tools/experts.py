@@ -1,4 +1,4 @@
-"""``python -m tools.experts RUN...``: find the best policy that solves each class; its normalised score is 100."""
+"""``python -m tools.experts RUN...``: find the best policy that solves each class; its score is defined as 100."""
 
 from collections.abc import Collection, Sequence
 from itertools import chain
@@ -15,18 +15,19 @@ from bidex_meta.runs.versions import collect_versions
 from bidex_meta.worlds import open_worlds
 
 _SOLVES = 0.5
-"""Success over all tasks of a class that an expert must have."""
+"""Least success over all tasks of a class with which a policy counts as an expert."""
 
 
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:
-    """Print and store, for each class, the best of its witness, its script and the runs, if the best solves the class.
+    """Find the best policy of each class among witness, script and runs; print and store it if it solves the class.
 
     Example: python -m tools.experts results/data/experts.json --out assets/references/expert.json
 
     Args:
-        runs: Runs of single classes, folders or files of results/data: a suite's policy is judged by these scores.
+        runs: Runs on single classes, as folders or files of results/data. Leave out runs on suites, because scores
+            compare them with the policies found here.
         suite: Suite whose train classes are looked up.
-        out: File of references, written anew.
+        out: File of references, which is overwritten.
     """
     known = best_known(open_worlds({"suite": suite}).task_classes(), runs)
     for name, row in known.items():

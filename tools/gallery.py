@@ -46,7 +46,7 @@ of version 2, solved by a script or (eggs) at the start. `make gallery` generate
 
 
 def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 270) -> None:
-    """Write the page, and its pictures into ``images/tasks/`` beside it.
+    """Write the page of all task classes, and its pictures into ``images/tasks/`` next to the page.
 
     Args:
         out: The Markdown file.
@@ -100,7 +100,10 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
 
 
 def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
-    """Draw three tasks of version 2 side by side, (height, 3 * width, 3) uint8: after the script, else at the start."""
+    """Draw three tasks of version 2 side by side, (height, 3 * width, 3) uint8.
+
+    The pictures show the end of an episode of the script, or the start if there is no script.
+    """
     world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
     obs, _ = world.reset(seed=0)
     rows, solved = [0, 1, 2], torch.ones(50, dtype=torch.bool)
@@ -153,10 +156,11 @@ def _mask(task: TaskClass) -> str:
 
 
 def masked(task: TaskClass) -> tuple[list[str], list[str]]:
-    """Return the components of a variation that only goal entries show, by reward and by success only.
+    """Return the components of a variation that only goal entries of the observation show.
 
-    The parts of a task that a component changes are replaced by NaN: every value that becomes NaN depends on the
-    component. A fixture's place is not returned, because other entries show that place.
+    The first list has those that affect the reward, the second those that only affect success. For each component, the
+    parts of a task that it changes are replaced by NaN: every value that becomes NaN depends on the component. The
+    place of a fixture is not returned, because other entries show that place.
     """
     scene, space = compile_scene(task), task.variation_space
     data = mujoco.MjData(scene.model)

@@ -28,11 +28,11 @@ def gae(
     rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float | Tensor,
     lam: float, valid: Tensor | None = None
 ) -> Tensor:  # fmt: skip
-    """Compute advantages A_t = sum_k (gamma lam)^k delta_{t+k} in an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
+    """Compute advantages A_t = sum_k (gamma lam)^k delta_{t+k} within each episode.
 
-    All tensors are (T, N). ``next_values`` are the values of the true successors (:func:`successor_values`) and count
-    as 0 if ``terminated``; a time limit is not a termination. ``gamma`` is a number, (N,) or (T, N). Nothing propagates
-    through entries that are not ``valid``.
+    Here delta_t = r_t + gamma V(s'_t) - V(s_t). All tensors are (T, N). ``next_values`` are the values of the true
+    successors (:func:`successor_values`) and count as 0 if ``terminated``; a time limit is not a termination. ``gamma``
+    is a number or a tensor, (N,) or (T, N). Nothing propagates through entries that are not ``valid``.
     """
     delta = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
     keep = gamma * lam * (~ended).to(delta.dtype)
@@ -47,7 +47,10 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean, biased variance and count (num_tasks,) of valid x (T, N) over all processes; 0 for an empty task."""
+    """Return mean, biased variance and count (num_tasks,) of the valid entries of x (T, N), over all processes.
+
+    All three are 0 for a task without valid entries.
+    """
 
     def total(values: Tensor) -> Tensor:
         sums = torch.zeros(num_tasks, dtype=values.dtype, device=values.device)
@@ -66,7 +69,10 @@ def normalise_per_task(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor
 
 
 def explained_variance(values: Tensor, returns: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:
-    """Return 1 - Var(return - value) / Var(return) per task (num_tasks,): 1 is perfect, 0 no better than a constant."""
+    """Return 1 - Var(return - value) / Var(return) per task (num_tasks,).
+
+    Perfect values give 1. Values that predict no better than a constant give 0.
+    """
     _, rest, _ = task_moments(returns - values, task_id, num_tasks, valid)
     _, whole, _ = task_moments(returns, task_id, num_tasks, valid)
     return 1.0 - rest / whole.clamp_min(1e-12)

@@ -13,27 +13,30 @@ from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
-_CAGRAD_RADIUS = 0.4  # how far cagrad's direction may leave the mean gradient, in its lengths
-_FAMO_RATE = 0.025  # Adam's step size of famo's weights
-_FAMO_DECAY = 0.01  # how strongly these weights are drawn back to even ones
+_CAGRAD_RADIUS = 0.4  # largest distance of cagrad's direction from the mean gradient, in lengths of that gradient
+_FAMO_RATE = 0.025  # Adam's step size for famo's weights
+_FAMO_DECAY = 0.01  # Adam's weight decay, which draws famo's weights back to equal ones
 
 
 class Balance(ABC):
-    """Replaces the gradient of the sum of all tasks' losses by a balanced one."""
+    """Replaces the gradient of the sum of all tasks' losses by a balanced gradient."""
 
-    tag: ClassVar[str]  # of the number that it reports
+    tag: ClassVar[str]  # metric tag of the number that ``backward`` returns
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Write the gradient into the parameters, which have none yet, and keep the graph.
+        """Write the gradient into the parameters, which have no gradient yet, and keep the graph.
 
-        ``losses`` (num_tasks,) and the ``least`` values that they can reach are this process's part. Returns a number
-        to be logged, already divided by the number of processes, because the caller sums it over them like the
-        gradients.
+        ``losses`` (num_tasks,) is this process's part of each task's loss. ``least`` (num_tasks,) is this process's
+        part of the smallest value that each loss can reach. Returns a number to be logged. It is already divided by the
+        number of processes, because the caller sums it over the processes, as it sums the gradients.
         """
 
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
-        """Update the balance after a step; ``above`` returns this process's part of each loss minus its least value."""
+        """Update the balance after a step of the parameters.
+
+        ``above`` computes this process's part of each loss minus the smallest value of that loss, (num_tasks,).
+        """
 
     def parts(self) -> Parts:
         """Return the parts of the balance that a checkpoint holds, by name."""
@@ -48,11 +51,11 @@ def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Te
 
 
 def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Remove from each gradient the component that points against another task's (PCGrad, Yu et al. 2020, algorithm 1).
+    """Remove from each task's gradient the components that point against other tasks' gradients.
 
-    The other tasks are visited in cyclic instead of random order, so that all processes of a run compute the same
-    result.
-    Returns the sum (P,) of the projected ``gradients`` (num_tasks, P) and the share of conflicting pairs, a scalar.
+    This is PCGrad (Yu et al. 2020, algorithm 1), but the other tasks are visited in cyclic instead of random order, so
+    that all processes of a run compute the same result. Returns the sum (P,) of the projected ``gradients``
+    (num_tasks, P) and the share of pairs of tasks whose gradients conflict, a scalar.
     """
     count = len(gradients)
     gram = gradients @ gradients.T
@@ -69,17 +72,17 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Turn the sum of all gradients towards the tasks that it serves worst (CAGrad, Liu et al. 2021).
+    """Turn the sum of all gradients towards the tasks whose losses it would lower least (CAGrad, Liu et al. 2021).
 
-    Let g_0 be the mean of the gradients. The result is the number of tasks times the d that maximises min_i <g_i, d>
-    within a distance of ``radius`` |g_0| from g_0. The dual problem (equation 4 of the paper) is over weights w on the
-    simplex, with g_w = sum_i w_i g_i::
+    Let g_0 be the mean of the gradients. The result is the number of tasks times the vector d that maximises
+    min_i <g_i, d> within a distance of ``radius`` |g_0| from g_0. The dual problem (equation 4 of the paper) minimises
+    over weights w on the simplex, with g_w = sum_i w_i g_i::
 
         min_w  <g_w, g_0> + radius |g_0| |g_w|        d = g_0 + radius |g_0| g_w / |g_w|
 
     ``gradients`` (num_tasks, P) has one row per task. ``radius`` is the paper's c: 0 gives the mean; a value below 1
     ensures that the mean loss still falls. Returns the direction (P,) and the share of pairs of tasks whose gradients
-    point apart, a scalar.
+    conflict, a scalar.
     """
     count = len(gradients)
     gram = (gradients @ gradients.T).double()
@@ -93,12 +96,14 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
-    """Return the weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
+    """Return the weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w).
 
-    This is an interior-point method. Logarithms of the weights, scaled by a mu that is halved at each step, keep the
-    weights positive; a cone of the same mu smooths the tip at w'G w = 0. Each step is a Newton step whose length is the
-    best of several. No number is read on the host, so a GPU is never waited for. ``gram`` holds the inner products of
-    the gradients (n, n), float64; ``even`` holds the weights e of the mean (n,), from which the method starts.
+    The error of the minimum is at most 1e-4 of e'G e. ``gram`` holds the inner products G of the gradients (n, n),
+    float64. ``even`` holds the weights e of the mean (n,), from which the method starts.
+
+    This is an interior-point method. A logarithmic barrier with factor mu keeps the weights positive, and mu is halved
+    at each step. The same mu smooths the square root near w'G w = 0. Each step is a Newton step whose length is the
+    best of several. No number is read on the host, so the host never waits for a GPU.
     """
     weights = even
     mean = gram @ even
@@ -127,7 +132,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
 class GradientBalance(Balance):
     """Combines the tasks' gradients (num_tasks, P) into one gradient (P,), with one backward pass per task.
 
-    ``combine`` also returns the share of conflicting gradients, which is logged.
+    Besides the gradient, ``combine`` returns the share of conflicting pairs of gradients, which is logged.
     """
 
     tag = "Policy/conflicts"
@@ -150,9 +155,10 @@ _LEAST = 1e-8
 class Famo(Balance):
     """FAMO (Liu et al. 2023): task weights under which all losses fall at the same rate, without a gradient per task.
 
-    theta descends sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), with z = softmax(xi); xi descends J'(log l - log l after
-    the step), with J = dz / dxi. Losses have to be positive, so each loss counts by its distance above its least
-    possible value. Adam with step size ``rate`` moves xi (``logits``, float64) with a ``decay`` towards even weights.
+    The parameters descend along sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), with z = softmax(xi). The logits xi descend
+    along J'(log l - log l after the step), with J = dz / dxi. The l_i must be positive, so l_i is the loss of task i
+    minus the smallest value that it can reach. Adam moves xi (``logits``, float64) with step size ``rate``; its weight
+    decay ``decay`` draws the weights towards equal ones.
     """
 
     tag = "Policy/largest_weight"
@@ -163,7 +169,10 @@ class Famo(Balance):
         self.above = torch.zeros_like(self.logits)
 
     def weights(self, above: Tensor) -> Tensor:
-        """Return factors for losses (num_tasks,) ``above`` their least: 1 on average, 0 for a loss that cannot fall."""
+        """Return the factor of each loss (num_tasks,): 1 on average, 0 for a loss that cannot fall any further.
+
+        ``above`` (num_tasks,) is each loss minus the smallest value that it can reach.
+        """
         self.above = above.detach().double()
         shares = self.logits.detach().softmax(0) / self.above.clamp_min(_LEAST)
         shares = shares.masked_fill(self.above <= _LEAST, 0.0)
@@ -190,7 +199,7 @@ class Famo(Balance):
 
 
 def balance_of(name: Balancing, num_tasks: int, device: torch.device) -> Balance | None:
-    """Make a balance by its name; None for ``none``, which sums the losses."""
+    """Return the balance called ``name``, or None for ``none``, which means that the losses are summed."""
     if name == "pcgrad":
         return GradientBalance(project_conflicting)
     if name == "cagrad":

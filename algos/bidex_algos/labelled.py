@@ -1,7 +1,7 @@
 """The data set of a student: the newest observations of each environment, with the teachers' actions as labels.
 
-The data set is a ring buffer of vector steps on the device, in half precision: 1.5 M observations of MT20-v2 with their
-labels take 1.6 GB.
+The data set is a ring buffer of vector steps on the device, in half precision; a vector step is one step of all
+environments. 1.5 M observations of MT20-v2 with their labels take 1.6 GB.
 """
 
 import torch
@@ -12,9 +12,10 @@ from bidex_meta.training.learner import State
 
 
 class Labelled:
-    """The last ``steps`` vector steps of environments ``rows`` (L,), whose tasks are ``task_id`` (L,), ascending.
+    """The last ``steps`` vector steps of the environments ``rows`` (L,).
 
-    ``tasks`` (K,) are the tasks that have an environment in ``rows``.
+    ``task_id`` (L,) is the task of each of these environments, in ascending order. ``tasks`` (K,) are the tasks that
+    have an environment in ``rows``.
     """
 
     def __init__(self, steps: int, rows: Tensor, task_id: Tensor, observations: int, actions: int):
@@ -34,13 +35,13 @@ class Labelled:
         return min(self.added, self.steps)
 
     def add(self, obs: Tensor, labels: Tensor) -> None:
-        """Store raw observations (N, d) and labels (N, a); of all environments of the world, only ``rows`` are kept."""
+        """Store one vector step: the entries ``rows`` of the world's raw observations (N, d) and labels (N, a)."""
         self._obs[self.added % self.steps] = obs[self.rows]
         self._labels[self.added % self.steps] = labels[self.rows]
         self.added += 1
 
     def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
-        """Draw indices, uniform within each task: int64 (batches, K * per_task), task after task."""
+        """Draw indices uniformly within each task: int64 (batches, K * per_task), ordered by task."""
         shape = (batches, len(self.tasks), per_task)
         device = self.rows.device
         step = torch.randint(self.filled, shape, generator=generator, device=device)
@@ -53,7 +54,7 @@ class Labelled:
         return tuple(ring.flatten(0, 1).index_select(0, places).float() for ring in (self._obs, self._labels))  # type: ignore[return-value]
 
     def of_last(self, steps: int) -> list[Tensor]:
-        """Return the labels of the last stored vector steps, at most ``steps``, for each task: (n, a), float32."""
+        """Return the labels of the newest ``steps`` vector steps, one tensor per task: (n, a), float32."""
         last = (self.added - 1 - torch.arange(steps, device=self.rows.device)) % self.steps
         return [part.flatten(0, 1).float() for part in self._labels[last].split(self._count.tolist(), dim=1)]
 
@@ -63,7 +64,7 @@ class Labelled:
         return {"added": self.added, "steps": self.steps, "rows": self.rows.clone(), **kept}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if its environments or sizes differ."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if ``state`` has other environments or sizes."""
         here = (self.steps, self.rows.tolist())
         there = (state["steps"], state["rows"].tolist())
         if here != there:

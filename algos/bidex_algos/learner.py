@@ -1,4 +1,4 @@
-"""The base of all learners: seeds, shapes read from the world, timers, the finite check, checkpoints, processes."""
+"""The base of all learners: seeds, shapes read from the world, timers, check for non-finite losses, checkpoints."""
 
 import copy
 import math
@@ -40,12 +40,12 @@ _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_
 
 
 class Learner(Contract):
-    """Base of all learners of this package; ``policy`` acts, and ``agent`` is the part of it that an evaluation runs.
+    """Base of all learners of this package; ``policy`` acts in training, and ``agent`` acts in evaluations.
 
     With several processes each process has its own world, samples and ``generator``, and all have the same networks:
     statistics, gradients and ``env_steps`` cover all processes. Raises BidexError for a world in another autoreset
-    mode, for a world with discounts per class if the learner has a single one, or for a world without the one-hot that
-    an option needs.
+    mode, for a world with discounts per class if the learner has a single discount, or for a world without the task's
+    one-hot if an option needs it.
     """
 
     remedy: ClassVar[str]  # advice when a loss is no longer finite
@@ -54,7 +54,7 @@ class Learner(Contract):
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
     policy_of: ClassVar[Callable[..., nn.Module]]
-    """Makes the policy of config, inputs, shape, a CPU generator for the weights, and device."""
+    """Makes the policy; the arguments are config, inputs, shape, a CPU generator for the weights, and device."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
         check_autoreset(world, self.name, self.autoreset_mode(config))
@@ -81,7 +81,7 @@ class Learner(Contract):
 
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
-        """Return how the networks read an observation; encoders of observation groups are added here."""
+        """Return the networks' inputs; encoders of observation groups are added here."""
         if shape.num_id_columns:
             size = vars(config).get("task_embedding", 0)
         else:
@@ -158,7 +158,8 @@ class Learner(Contract):
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
         """Return the agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments.
 
-        Raises ValueError if the config describes other layers than the weights have, before the layers take memory.
+        Raises ValueError if the layers in the config do not match the weights. This is checked before the layers take
+        memory.
         """
         init = torch.Generator().manual_seed(0)
         weights = state["weights"]
@@ -181,7 +182,8 @@ class Learner(Contract):
     def start_from(self, policy: State) -> None:
         """Copy the network and the statistics of another learner's policy, and keep the statistics fixed.
 
-        Raises BidexError if the policy has another form.
+        Raises BidexError if the policies differ in their weights' shapes, in what they observe, or in an option that
+        determines the network's function.
         """
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
@@ -201,11 +203,14 @@ class Learner(Contract):
         self.policy.observations.keep()
 
     def state_dict(self) -> State:
-        """Return a copy of all state but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
+        """Return a copy of all state except the world's: tensors and plain values.
+
+        ``torch.load(weights_only=True)`` accepts these values.
+        """
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if it comes from a world of another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the state is of a world of another size."""
         self._check_size(state)
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)

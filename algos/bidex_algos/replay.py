@@ -1,7 +1,8 @@
 """A replay with a separate part for each task: the last vector steps of all environments, in a ring on the device.
 
-An observation is stored once, as the end of one transition and the start of the next; last observations before time
-limits are stored in a separate ring. No shape depends on data, and the host never waits for the device.
+A vector step is one step of all environments. An observation is stored once, as the end of one transition and the start
+of the next; last observations before time limits are stored in a separate ring. No shape depends on data, and the host
+never waits for the device.
 """
 
 import math
@@ -25,16 +26,17 @@ class Transitions:
     obs: Tensor  # observations before the step (B, d)
     actions: Tensor  # actions (B, a)
     rewards: Tensor  # rewards (B,)
-    next_obs: Tensor  # observations after the step, of the same episode (B, d); read only where not terminated
-    terminated: Tensor  # whether nothing follows, bool (B,). A time limit is not such an end
-    steps: Tensor | int = 1  # steps from obs to next_obs, one for all or (B,); rewards is then their discounted sum
+    next_obs: Tensor  # observations after the step, in the same episode (B, d); not used if terminated
+    terminated: Tensor  # whether the step ended the episode, bool (B,); a time limit does not count
+    steps: Tensor | int = 1  # number of steps from obs to next_obs, an int or (B,); rewards is their discounted sum
 
 
 class Replay:
     """The last ``steps`` vector steps of all environments, with a separate part per task (``task_id``, (N,)).
 
     ``cut_share`` is the space for last observations of episodes cut by a time limit, as a share of all transitions. If
-    the space is too small, the oldest lose their weight. ``added`` counts the vector steps added.
+    the space is too small, the transitions that lost their last observation get weight 0. ``added`` counts the vector
+    steps added.
     """
 
     def __init__(
@@ -105,7 +107,7 @@ class Replay:
         self.obs.copy_(obs)
 
     def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
-        """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        """Draw indices uniformly within each task: int64 (batches, num_tasks * per_task), ordered by task."""
         shape = (batches, self.num_tasks, per_task)
 
         def uniform(high: int) -> Tensor:
@@ -116,21 +118,30 @@ class Replay:
         return self.places(row, uniform(self.filled)).flatten(1)
 
     def places(self, rows: Tensor, ages: Tensor) -> Tensor:
-        """Return the indices of environments' transitions ``ages`` vector steps ago (0: the last); int64, broadcast."""
+        """Return the int64 indices of the transitions of environments ``rows``, ``ages`` vector steps ago.
+
+        The newest transition has age 0. ``rows`` and ``ages`` are broadcast against each other.
+        """
         return (self.added - 1 - ages) % self.slots * self.rows + rows
 
     def weights(self, places: Tensor) -> Tensor:
-        """Return 1, or 0 if physics broke or the last observation is no longer kept. Shape of ``places``, float32."""
+        """Return the weight of each transition, float32, in the shape of ``places``.
+
+        The weight is 0 if physics broke or if the episode's last observation is no longer kept, and 1 otherwise.
+        """
         cut = self.at("cut", places)
         kept = (cut == 0) | (cut > self._cuts - self.cuts_kept)
         return (self.at("valid", places) & kept).float()
 
     def after(self, places: Tensor) -> Tensor:
-        """Return indices of the environments' next transitions, in the shape of ``places``."""
+        """Return the index of the same environment's next transition for each of ``places``, in the same shape."""
         return (places + self.rows) % (self.slots * self.rows)
 
     def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
-        """Return the transitions at ``places`` (B,); with ``last`` they end like the transitions at ``last``."""
+        """Return the transitions at ``places`` (B,).
+
+        With ``last`` (B,), the next observations and ``terminated`` are those of the transitions at ``last``.
+        """
         if last is None:
             last = places
         everything = self._obs.flatten(0, 1)
@@ -157,7 +168,7 @@ class Replay:
         }  # fmt: skip
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raises BidexError if it comes from a replay of another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the state is of a replay of another size."""
         here = (self.steps, *self._obs.shape[1:])
         there = (state["steps"], *state["obs"].shape[1:])
         if here != there:
@@ -191,7 +202,11 @@ def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
 
 
 class Stretches:
-    """Up to ``n`` consecutive steps from each of ``places``, int64 (batches, B); ``last`` are the final indices."""
+    """Sequences of up to ``n`` consecutive transitions, which begin at the indices ``places``, int64 (batches, B).
+
+    A sequence is shorter if its episode or the stored data end earlier. ``last`` holds the index of each sequence's
+    last transition.
+    """
 
     def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
         self.replay = replay
@@ -217,7 +232,7 @@ class Stretches:
         return self.replay.at("terminated", places) | (self.replay.at("cut", places) > 0)
 
     def take(self, batch: int) -> Transitions:
-        """Return one batch of the stretches as transitions (B,)."""
+        """Return one batch of the sequences, each as a single transition over several steps, (B,)."""
         taken = self.replay.take(self.first[batch], self.last[batch])
         if self.rewards is None:
             return taken
@@ -227,9 +242,9 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """Make a replay of ``asked`` vector steps, or the number that fits into ``memory`` (10^9 bytes).
+    """Make a replay of ``asked`` vector steps, or of fewer steps if only those fit into ``memory`` (in 10^9 bytes).
 
-    Raises BidexError if not even one step fits.
+    Raises BidexError if not even one step fits, or if a task has no environment.
     """
     rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()

@@ -64,7 +64,7 @@ Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Maps raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
 
 FinalValue = Callable[[Tensor, Tensor], Tensor]
-"""Maps raw observations (n, d) and task ids (n,) to values (n,) in units of reward; several critics: (n, critics)."""
+"""Maps raw observations (n, d) and task ids (n,) to values in units of reward: (n,) or, if several, (n, critics)."""
 
 
 class Rollout:
@@ -79,8 +79,8 @@ class Rollout:
         self.steps = steps
         self.obs = zeros(steps, num_envs, observations)  # raw, before each step
         self.actions = zeros(steps, num_envs, actions)  # sampled, not clamped
-        self.means = zeros(steps, num_envs, actions)  # of the sampling policy
-        self.rewards = zeros(steps, num_envs)  # 0 where not valid
+        self.means = zeros(steps, num_envs, actions)  # mean actions of the sampling policy
+        self.rewards = zeros(steps, num_envs)  # 0 if not valid
         self.terminated = zeros(steps, num_envs, dtype=torch.bool)  # the episode came to a true end
         self.ended = zeros(steps, num_envs, dtype=torch.bool)  # terminated, truncated or not valid
         self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False if physics broke: the transition teaches nothing
@@ -121,7 +121,7 @@ def collect(
 
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
-    """Raise BidexError if the world's autoreset mode is not the learner's, or the default precision is not single."""
+    """Raise BidexError if the world's autoreset mode is not ``expected``, or the default precision is not single."""
     maths.check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:

@@ -26,8 +26,8 @@ def write(parameters: Sequence[nn.Parameter], vector: Tensor) -> None:
 def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: float = 1e-10) -> Tensor:
     """Solve ``product(x) = b`` for x (P,), starting at 0 (Hestenes and Stiefel 1952).
 
-    After P iterations the solution is exact except for rounding. Once the squared residual is below ``tolerance`` of
-    the first one, x no longer changes.
+    After P iterations the solution is exact except for rounding. Once the squared residual is below ``tolerance`` times
+    the initial squared residual, x no longer changes.
     """
     x = torch.zeros_like(b)
     residual = b.clone()
@@ -49,7 +49,8 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
 def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: float) -> Product:
     """Return Fisher-vector products F v + damping v, computed by differentiating the KL twice.
 
-    ``kl`` is this process's part of the policy's mean KL from itself, with its graph; its Hessian is the Fisher matrix.
+    ``kl`` is the mean KL between the policy and a constant copy of it (this process's part), with its graph. The
+    Hessian of ``kl`` is the Fisher matrix F.
     """
     slope = flatten(torch.autograd.grad(kl, parameters, create_graph=True))
 
@@ -66,8 +67,8 @@ def line_search(
 ) -> float:  # fmt: skip
     """Shorten ``step`` (P,) until the objective has risen and the KL is within its bound; otherwise change nothing.
 
-    ``measure`` returns objective and KL. The objective must rise by at least ``accept_ratio`` of the rise ``expected``
-    of the step. Returns the share of the step that was taken, or 0.
+    ``measure`` returns objective and KL. ``expected`` is the rise that the whole step should bring. A shortened step
+    must bring at least ``accept_ratio`` of its share of this rise. Returns the share of the step that was taken, or 0.
     """
     start = flatten(parameters).detach().clone()
     before, _ = measure()
@@ -87,9 +88,10 @@ def trust_region_step(
     parameters: Sequence[nn.Parameter], objective: Tensor, kl: Tensor, measure: Callable[[], tuple[float, float]],
     config: Any, max_kl: float, kl_tag: str, accept_ratio: float = 0.0
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Move along F^-1 g to the KL ``max_kl``, to second order, and shorten the step by :func:`line_search`.
+    """Take a step along F^-1 g, where F is the Fisher matrix and g the gradient of the objective.
 
-    Returns scalars to be logged. ``objective`` is this process's part of the value to raise, with its graph; ``kl`` is
+    The step is as long as the KL ``max_kl`` allows to second order; then :func:`line_search` shortens it. Returns
+    scalars to be logged. ``objective`` is this process's part of the value to raise, with its graph; ``kl`` is
     described in :func:`fisher_product`. The config has ``damping``, ``cg_iterations``, ``backtracks`` and
     ``backtrack_factor``.
     """

@@ -50,19 +50,19 @@ _FIGURES = {
     "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
 _JOINED = ("ladder", "ladder-suites", "ladder-curves")
-"""Tables and pictures of all suites of a study, which others show one by one."""
+"""Tables and pictures that show all suites of a study together. All others show one suite each."""
 _DIGEST = "Description"
-"""Entry of a picture's PNG metadata: the digest of its data."""
+"""Entry of a picture's PNG metadata that holds the digest of the picture's data."""
 
 
 @dataclass(frozen=True)
 class Block:
     """The options of a block."""
 
-    study: str = ""  # Its name; of several, with commas between, one table or picture (``best``, ``ladder``).
-    show: str = "table"
-    on: str | None = None  # Only this suite or class.
-    split: str | None = None  # Only this split of meta-tests.
+    study: str = ""  # Name of a study, or of several studies with commas between for a joint table or picture.
+    show: str = "table"  # Kind of the table or picture.
+    on: str | None = None  # Suite or class to show; None: all.
+    split: str | None = None  # Split of meta-tests to show; None: all.
 
 
 def filled_pages(root: Path) -> list[Path]:
@@ -134,7 +134,7 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
 
 
 def _stored_digest(picture: Path) -> str | None:
-    """Read the stored digest of a picture's data (the picture's own bytes depend on matplotlib's version)."""
+    """Read the stored digest of a picture's data; the bytes of the picture depend on the version of matplotlib."""
     if not picture.exists():
         return None
     with Image.open(picture) as opened:

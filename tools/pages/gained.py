@@ -12,7 +12,7 @@ from tools.pages.studies import Study
 from tools.pages.tables import table
 
 CONTROL = "control"
-"""The arm that others are compared with: same starting policy and adaptation, no meta-training."""
+"""Name of the arm with which others are compared. It has the same starting policy and adaptation, no meta-training."""
 _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "return", "gain [95 %]", "over control [95 %]")
 
 
@@ -20,9 +20,9 @@ def gains_table(study: Study) -> Iterator[str]:
     """Yield one row per run, class by class; a gain whose interval excludes zero is bold.
 
     A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
-    the difference to the gain of the control's run of the same seed; half widths add as independent errors (the root
-    of the sum of squares). The split is that of the study, by default ``test``. Raises BidexError if a run has no
-    meta-test of the split, or if an arm has several runs of one seed.
+    the difference from the gain of the control's run with the same seed. Its interval adds the half widths of both
+    gains as independent errors (the root of the sum of squares). The split is that of the study, by default ``test``.
+    Raises BidexError if a run has no meta-test of the split, or if an arm has several runs with the same seed.
     """
     split = study.split or "test"
     parts: dict[tuple[str, int], tuple[StoredRun, SplitSummary]] = {}
@@ -51,7 +51,7 @@ def gains_table(study: Study) -> Iterator[str]:
 
 
 def _splits(run: StoredRun) -> dict[str, SplitSummary]:
-    """Return the splits of a run's meta-test; empty without one."""
+    """Return the splits of a run's meta-test by name; without a meta-test return an empty dict."""
     evaluation = run.evaluation()
     if isinstance(evaluation, MetaTestEvaluation):
         return evaluation.splits
@@ -59,7 +59,7 @@ def _splits(run: StoredRun) -> dict[str, SplitSummary]:
 
 
 def _gain(part: SplitSummary, name: str) -> Estimate:
-    """Return the gain of the return."""
+    """Return the meta-test's gain in return in the class ``name``; raise BidexError if it was not measured."""
     gain = None if part.gain is None else part.gain.classes[name]["return"]
     if gain is None:
         raise BidexError(f"The meta-test of {part.split} tasks has no gain in {name}. Evaluate again.")

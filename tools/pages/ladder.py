@@ -1,4 +1,4 @@
-"""The ladder: meta-learners between a policy that sees neither goal nor rewards and one that sees the goal."""
+"""The ladder: meta-learners compared with a policy that sees no goal or rewards, and with one that sees the goal."""
 
 import json
 import re
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BLIND = "blind PPO"
-"""The line of MT-PPO on the suite itself, which hides goals and shows no rewards."""
+"""Name of MT-PPO on the suite itself, which hides goals and does not show rewards."""
 SHOWN = "goal-shown PPO"
-"""The line of MT-PPO on the multi-task twin of the suite, which shows goals."""
+"""Name of MT-PPO on the multi-task version of the suite, which shows goals."""
 _OWN = "own rewards"
 _HEAD = (
     "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
@@ -46,9 +46,9 @@ class Line:
 
     given: str
     shares: list[list[float]] = field(default_factory=list)
-    """Per seed the success after 0, 1, ... exploring episodes, mean over classes; of PPO one number."""
+    """Mean success over classes after 0, 1, ... exploring episodes, for each seed; for PPO a single number."""
     hidden: list[float] = field(default_factory=list)
-    """Per seed the success after all exploring episodes in an episode that hides its rewards, if that was played."""
+    """Success after all exploring episodes in an episode with hidden rewards, for each seed that has such episodes."""
     steps: list[int] = field(default_factory=list)
     minutes: list[float] = field(default_factory=list)
 
@@ -61,8 +61,8 @@ class Line:
 def ladder_table(*studies: Study) -> Iterator[str]:
     """Yield for each suite a table of learners, a sentence on whether it separates them, and a table of pairs.
 
-    The gap is the one between blind and goal-shown PPO; a learner closes it by its success after the last exploring
-    episode. Studies with a ``split`` other than the test tasks show that one.
+    "Gap closed" is a learner's success after the last exploring episode on a scale from blind PPO (0 %) to goal-shown
+    PPO (100 %). Results are on the test tasks, or on the ``split`` of a study if it has one.
     """
     for number, (suite, lines) in enumerate(_suites(studies).items()):
         if number:
@@ -78,9 +78,9 @@ def ladder_table(*studies: Study) -> Iterator[str]:
 
 
 def suites_table(*studies: Study) -> Iterator[str]:
-    """Yield a table of suites: what a policy can reach blind, what tells the task, and what both lines of PPO reach.
+    """Yield a table of suites: figures of ``bidex-meta validity``, and success of blind and goal-shown PPO.
 
-    All but PPO's lines are from ``validity/SUITE.json`` next to the folder of data; means over classes.
+    The figures are means over classes, from ``validity/SUITE.json`` next to the folder of data.
     """
     rows = []
     for suite, lines in _suites(studies).items():
@@ -107,7 +107,7 @@ def _classes(file: Path) -> list[Json]:
 
 
 def ladder_figure(*studies: Study) -> "Figure":
-    """Draw success against exploring episodes: a panel per suite, a line per learner, level lines for PPO."""
+    """Draw success against exploring episodes: a panel per suite, a line per learner, horizontal lines for PPO."""
     panels: dict[str, list[plots.Group]] = {}
     suites = _suites(studies)
     most = max(len(each) for lines in suites.values() for line in lines.values() for each in line.shares)
@@ -150,7 +150,7 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
 
 
 def _suite(run: StoredRun) -> str:
-    """Return the meta suite that a run belongs to: its own, or that whose goals its suite shows."""
+    """Return the meta suite to which a run belongs; for a multi-task suite, the meta suite with the same goals."""
     return "ML" + str(run.content["suite"]["name"]).removeprefix("ML").removeprefix("MT")
 
 
@@ -165,9 +165,10 @@ def _named(run: StoredRun) -> tuple[str, Line]:
 
 
 def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
-    """Return the results by class after 0, 1, ... exploring episodes; of PPO one entry, on unseen tasks if it has them.
+    """Return the results by class after 0, 1, ... exploring episodes.
 
-    PPO on a suite that lists its tasks is evaluated on the same goals with other starts.
+    PPO has a single entry: the results on unseen tasks, if there are any. If PPO's suite lists its tasks, the
+    evaluation is on the same goals with other starts.
     """
     if isinstance(evaluation, MetaTestEvaluation):
         return [shot.classes for shot in evaluation.splits[split].by_shot]

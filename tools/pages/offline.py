@@ -1,8 +1,8 @@
-"""Table of offline learners' scores: kinds of data by learners.
+"""Table of offline learners' scores: a row per kind of data, a column per learner.
 
 The score is the paper's (appendix A.3): 100 (R - R_random) / (R_expert - R_random), with returns from the study's own
-evaluations. The expert is the study's online run on the same class. Without one (a suite), scores are those of the
-evaluations.
+evaluations. The expert is the study's online run on the same class. If there is no such run, as for a suite, scores are
+taken from the evaluations.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,9 +23,10 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 
 
 def offline_table(study: Study) -> Iterator[str]:
-    """Yield a table of data sets by learners: score as mean over seeds (least to most), and mean success.
+    """Yield a table with a row per kind of data and a column per learner.
 
-    The study's online runs are the experts. Raises BidexError if seeds of one cell differ in more than the seed.
+    A cell shows the score, as mean over seeds (least to most), and the mean success. The study's online runs are the
+    experts. Raises BidexError if the runs of one cell differ in more than the seed.
     """
     cells: dict[str, dict[str, list[StoredRun]]] = {}
     experts = []
@@ -59,7 +60,7 @@ def _kind(names: Sequence[str]) -> str:
 
 
 def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[float, float] | None:
-    """Return the mean returns of uniform actions and of the experts; None without experts."""
+    """Return the mean returns of uniform actions and of the experts; None if either is missing."""
     random = [rows for rows in map(classes_of_random, runs) if rows]
     if not experts or not random:
         return None

@@ -9,14 +9,15 @@ from bidex_meta.runs.folder import RunFolder
 from tools.pages.tables import table
 
 _FOLDERS = {"policies": ("assets/policies/*", "results/*"), "teachers": ("results/teachers/*",)}
-"""Patterns of run folders in the repository, by what a block shows ``on``."""
+"""Patterns of run folders in the repository, by the value of a block's option ``on``."""
 _ALONE = "assets/policies/MT20"
-"""The policy that ``bidex-meta play`` shows if it is given no run; the package contains it."""
+"""The policy that ``bidex-meta play`` shows if no run is named; the package contains it."""
 
 
 def pretrained_table(on: str, data: Path) -> Iterator[str]:
-    """Yield a row per stored policy, ``on=policies`` (of suites) or ``on=teachers`` (of single classes).
+    """Yield a table with a row per stored policy.
 
+    ``on`` is ``policies`` (trained on suites) or ``teachers`` (trained on single classes); otherwise raises BidexError.
     Success is the mean over classes from the evaluation in the policy's folder.
     """
     if on not in _FOLDERS:

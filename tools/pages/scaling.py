@@ -1,4 +1,4 @@
-"""Numbers of parallel environments by learners, at equal environment steps (the paper's Figure 6)."""
+"""Results for each learner and number of parallel environments, at equal environment steps (the paper's Figure 6)."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 
 def rows_table(study: Study) -> Iterator[str]:
-    """Yield a table of environments by learners: the evaluation's return, as mean over seeds (least to most).
+    """Yield a table of evaluated returns with a row per number of environments and a column per learner.
 
-    Raises BidexError if seeds of one cell differ in more than the seed, or if the runs are on several classes.
+    A cell shows the mean over seeds (least to most). Raises BidexError if the runs of one cell differ in more than the
+    seed, or if the runs are on several classes.
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))

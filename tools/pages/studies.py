@@ -31,17 +31,17 @@ _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", 
 class Arm:
     """One setting of a study, on several seeds."""
 
-    group: Group  # Final evaluations of its runs, labelled with its name.
-    runs: list[StoredRun]  # Its runs.
+    group: Group  # Final evaluations of the arm's runs, labelled with the arm's name.
+    runs: list[StoredRun]  # Runs of the arm, one or more.
 
     @cached_property
     def success(self) -> Estimate:
-        """Interquartile mean over seeds and classes."""
+        """Interquartile mean of success over seeds and classes."""
         return iqm_over_seeds(self.group.success)
 
     @cached_property
     def others(self) -> np.ndarray | None:
-        """Success on other tasks of the classes (seeds, classes), as ``group.success``; None if a run lacks a value."""
+        """Success on tasks that were not trained on, (seeds, classes); None if a run has no value for a class."""
         by_seed = []
         for run in self.runs:
             classes = classes_of_others(run)
@@ -61,9 +61,9 @@ class Arm:
 class Study:
     """Arms on one suite or class."""
 
-    name: str  # Name of its file.
+    name: str  # Name of the study's file, without suffix.
     on: str  # The suite or class.
-    runs: list[StoredRun]  # Sorted by name.
+    runs: list[StoredRun]  # All runs, sorted by name.
     split: str | None = None  # Split of a meta-test to show; None: all.
 
     @cached_property
@@ -125,7 +125,7 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
 
 
 def digest_of(studies: Sequence[Study]) -> str:
-    """Return the digest of all data that the studies' pictures show."""
+    """Return a digest of all data that pictures of the studies show."""
     found = hashlib.sha256()
     for study in studies:
         found.update(json.dumps([run.content for run in study.runs]).encode())
@@ -162,13 +162,16 @@ def _subject(runs: Sequence[StoredRun]) -> str:
 
 
 def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
-    """Return the classes of all runs that share a run's arm and seed."""
+    """Return the classes of all ``runs`` that have the same arm and seed as ``run``."""
     same = [other for other in runs if (other.arm, other.config().seed) == (run.arm, run.config().seed)]
     return frozenset(str(other.config().task) for other in same)
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
-    """Raise BidexError if shared config entries of an arm's seeds differ (versions may have more or fewer entries)."""
+    """Raise BidexError if runs of an arm differ in a config entry that both have, except in those of ``_FREE``.
+
+    Configs of different versions may have more or fewer entries.
+    """
     for run in runs[1:]:
         same = next(known for known in runs if known.config().task == run.config().task)
         first, other = flat(same.content["config"]), flat(run.content["config"])

@@ -16,7 +16,7 @@ from tools.pages.studies import Study, classes_of_others, classes_of_random
 _FEW = 4
 """The table of arms shows returns per class for at most this many classes."""
 _MANY = 10
-"""More classes than these are rows of the table of classes."""
+"""If there are more classes than this, the table of classes has a row instead of a column per class."""
 _PLAYED: dict[Kind, str] = {
     "random": "uniform actions",
     "zero": "zero actions",
@@ -57,7 +57,10 @@ def random_rows(study: Study) -> dict[str, list[ClassSummary]]:
 
 
 def arms_table(study: Study) -> Iterator[str]:
-    """Yield one row per arm, then one for uniform actions; means over classes if arms have played other tasks too."""
+    """Yield a table with a row per arm, and one for uniform actions.
+
+    Success is the interquartile mean, but the mean over classes if arms were also evaluated on other tasks.
+    """
     classes = study.classes if len(study.classes) <= _FEW else []
     means_only = any(arm.others is not None for arm in study.arms)
     measures = ["success, mean", "other tasks, mean"] if means_only else ["success, IQM", "score, IQM"]
@@ -89,7 +92,10 @@ def _over_seeds(success: np.ndarray | None) -> str:
 
 
 def classes_table(study: Study) -> Iterator[str]:
-    """Yield success and return per class, as mean over seeds (least to most); many classes are rows, few columns."""
+    """Yield a table of success and return per class, as mean over seeds (least to most).
+
+    Few classes are columns, more than ``_MANY`` are rows.
+    """
     if len(study.classes) > _MANY:
         return _classes_as_rows(study)
 
@@ -105,7 +111,10 @@ def classes_table(study: Study) -> Iterator[str]:
 
 
 def _classes_as_rows(study: Study) -> Iterator[str]:
-    """Yield one row per class, then the mean: for each arm success on own and other tasks, return and score."""
+    """Yield a table with a row per class and one for the mean.
+
+    For each arm there are columns of success on own and other tasks, return and score.
+    """
     columns: dict[str, list[str]] = {"class": [*study.classes, "mean"]}
     for arm in study.arms:
         group = arm.group
@@ -123,9 +132,10 @@ def _classes_as_rows(study: Study) -> Iterator[str]:
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
-    """Yield one row per class, in MT20's order: the run with the highest success, ties broken by return.
+    """Yield a table with a row per class, in MT20's order, for the run with the highest success in the class.
 
-    If there is only one run, the rows do not name it. Columns without any number are left out.
+    Ties are broken by return. If there is only one run, the rows do not name it. Columns without any number are left
+    out.
     """
     found: dict[str, list[tuple[StoredRun, ClassSummary]]] = {}
     for run in chain.from_iterable(study.runs for study in studies):
@@ -162,7 +172,7 @@ def _success(row: ClassSummary) -> str:
 
 
 def references_table() -> Iterator[str]:
-    """Yield one row per class: return and success of untrained policies; the expert and its source."""
+    """Yield a table with a row per class: return and success of untrained policies, return and source of the expert."""
     played = [load(kind) for kind in _PLAYED]
     expert = load("expert")
     measures = [f"{who}: {what}" for who, what in product(_PLAYED.values(), ("return", "success"))]

@@ -39,7 +39,7 @@ def validity_table(suite: str, data: Path) -> list[str]:
 
 
 def share_cell(row: Json, figure: str) -> str:
-    """Return a figure of a class as a percentage, empty if it was not measured; next to ``named`` stands its chance."""
+    """Return a figure of a class as a percentage, "" if it was not measured; the chance level follows ``named``."""
     cell = _percent(row.get(figure))
     if figure == "named" and cell:
         cell += f" ({100 * row['chance']:.0f} %)"

@@ -24,22 +24,23 @@ class DAggerConfig(NetworkConfig):
     hidden: Layers = (512, 512)  # Widths of the hidden layers.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
     init_std: Positive = 0.2
-    """Standard deviation of the actions for learners that start from the policy; DAgger plays its mean."""
-    rollout_steps: Count = 8  # Steps taken in every environment between two lots of updates.
+    """Standard deviation of the actions for learners that start from this policy. DAgger itself acts with the mean."""
+    rollout_steps: Count = 8  # Steps in every environment before each series of updates.
     updates_per_iteration: Count = 50  # Updates after each rollout.
-    batch_size: Count = 1024  # Labelled observations of an update, split evenly over the classes with a teacher.
-    samples: Count = 1_500_000  # Labelled observations that each process keeps; the oldest go first.
+    batch_size: Count = 1024  # Labelled observations per update, split evenly over the classes with a teacher.
+    samples: Count = 1_500_000  # Labelled observations that each process keeps; the oldest are overwritten first.
     learning_rate: Positive = 5e-4  # Adam's step size.
-    decay_steps: Whole = 0  # Environment steps over which it falls in a line to a twentieth of that; 0: it stays.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
+    decay_steps: Whole = 0
+    """Environment steps over which the step size falls linearly to a twentieth of learning_rate; 0: it is constant."""
+    max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm.
     teacher_steps: Whole = 500_000
-    """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0. Drawn for each
-    episode; 0: the student plays all."""
-    noise_std: NonNegative = 0.0  # Standard deviation of noise on the actions that are played.
+    """Environment steps over which the share of episodes in which the teacher acts falls from 1 to 0. Teacher or
+    student is drawn for each episode. 0: the student acts in all episodes."""
+    noise_std: NonNegative = 0.0  # Standard deviation of the noise that is added to all actions.
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    normalise_per_task: bool = False  # By statistics of each task apart; the world must show the task's one-hot.
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot is not changed."""
+    normalise_per_task: bool = False  # Use separate statistics for each task; the world must show the task's one-hot.
+    autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""
@@ -54,10 +55,10 @@ PRESETS: dict[str, DAggerConfig] = {"laptop": DAggerConfig()}
 
 
 class DAgger(Learner):
-    """Data set aggregation (Ross et al. 2011, arXiv 1011.0686) from policies and scripts, on a batched world.
+    """Data set aggregation (Ross et al. 2011, arXiv 1011.0686) with policies and scripts as teachers.
 
-    If teachers follow an episode from its start (scripts), a resumed run begins new episodes and is no longer bitwise
-    equal to an uninterrupted run.
+    Scripted teachers follow an episode from its start. With such teachers a resumed run begins new episodes, so it is
+    not bitwise equal to an uninterrupted run.
     """
 
     name = "dagger"
@@ -99,7 +100,7 @@ class DAgger(Learner):
         return self.episodes.metrics() | as_numbers({"Train/unstable": all_sum(unstable), **losses}) | self._played()
 
     def _teachers_share(self) -> float:
-        """Return the share of the episodes beginning now that the teacher plays."""
+        """Return the probability that the teacher acts in an episode that begins now."""
         steps = self.config.teacher_steps
         if steps:
             return max(0.0, 1.0 - self.env_steps / steps)
@@ -118,7 +119,7 @@ class DAgger(Learner):
         self._begin(everyone, share)
 
     def _begin(self, ended: Tensor, share: float) -> None:
-        """Begin new episodes in the rows of a mask (N,): draw who acts in them and reset the teachers."""
+        """Begin new episodes in the rows of a mask (N,): draw whether the teacher acts, and reset the teachers."""
         drawn = torch.rand(ended.shape, generator=self.generator, device=self.device) < share
         self.teacher_plays = torch.where(ended, drawn & self.lessons.teachers.known, self.teacher_plays)
         self.lessons.teachers.reset(ended)
@@ -151,11 +152,14 @@ class DAgger(Learner):
             self._expect("(num_envs, observations) = ", *shapes)
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; the data set copies itself, because two copies at once may not fit."""
+        """Return the state as in the base class, with a copy of the data set.
+
+        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
+        """
         return super().state_dict() | {"data": self.lessons.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the data set had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the data set had another size."""
         super().load_state_dict(state)
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:

@@ -15,12 +15,12 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]  # parameters that an inner step moves: all, or only the mean's output layer
+Adapted = Literal["all", "head"]  # parameters that an inner step moves: all, or only the output layer of the mean
 StepSizeKind = Literal["fixed", "layer", "weight"]  # granularity of learned inner step sizes; fixed: not learned
 
 
 class StepSizes(nn.Module):
-    """Factors of the inner step: one for each tensor that it moves (``layer``) or for each entry (``weight``)."""
+    """Learned factors of the inner step size: one per moved tensor (``layer``), or one per entry (``weight``)."""
 
     def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
         super().__init__()
@@ -33,7 +33,7 @@ class StepSizes(nn.Module):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Raise negative factors to 0, because a step uphill would unlearn."""
+        """Raise negative factors to 0, because with a negative factor the inner step would go uphill."""
         for factor in self.parameters():
             factor.clamp_(min=0.0)
 
@@ -53,7 +53,7 @@ Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have 
 Objective = Literal["likelihood", "ratio"]
 """Objective of the inner step: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192  # for layers 64-64 they fit a CPU's caches; all tasks at once take 1.5 times as long
+_TRANSITIONS_AT_ONCE = 8_192  # fit a CPU's caches with two layers of 64; all tasks at once take 1.5 times as long
 
 
 @dataclass
@@ -62,10 +62,10 @@ class TaskBatch:
 
     obs: Tensor  # normalised observations (M, B, d)
     actions: Tensor  # sampled actions (M, B, a)
-    old_means: Tensor  # means of the policies that sampled (M, B, a)
-    old_log_stds: Tensor  # logarithms of their standard deviations (M, a)
-    advantages: Tensor  # normalised within each task (M, B)
-    weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
+    old_means: Tensor  # means of the sampling policies (M, B, a)
+    old_log_stds: Tensor  # logarithms of the sampling policies' standard deviations (M, a)
+    advantages: Tensor  # advantages, normalised within each task (M, B)
+    weights: Tensor  # 0 for steps after an episode's end and for steps in which physics broke, otherwise 1 (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the fields in order."""
@@ -73,7 +73,7 @@ class TaskBatch:
 
 
 class Adapter:
-    """Gradient steps on an actor's parameters, which are the meta-parameters; options as in ``MetaConfig``."""
+    """Takes gradient steps from an actor's parameters, the meta-parameters; ``MetaConfig`` describes the options."""
 
     def __init__(
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],
@@ -102,7 +102,7 @@ class Adapter:
             self.step_sizes.project()
 
     def meta(self, count: int) -> Params:
-        """Return the meta-parameters once per task, as views with their graph."""
+        """Return the meta-parameters repeated for ``count`` tasks, as views that keep their graph."""
         return {name: p.expand(count, *p.shape) for name, p in self.actor.named_parameters()}
 
     def distribution(self, params: Params, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,7 +162,7 @@ def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch
 
 
 def weighted_mean(x: Tensor, weights: Tensor) -> Tensor:
-    """Average over the last axis the entries that have weight; 0 if no entry has weight."""
+    """Average over the last axis the entries of ``x`` whose weight is 1; return 0 if all weights are 0."""
     return (weights * x).sum(-1) / weights.sum(-1).clamp_min(1.0)
 
 

@@ -31,8 +31,8 @@ from bidex_meta.world.contract import PooledWorld
 class MetaPolicy(nn.Module):
     """A Gaussian actor with one adapted copy per task; follows the protocol of adapting agents (bidex_meta.agents).
 
-    Its own parameters are the meta-parameters. Before the first ``adapt`` every task acts by the meta-parameters.
-    ``seed`` seeds the exploring actions.
+    The parameters of the module are the meta-parameters. Before the first ``adapt`` the policy acts with the
+    meta-parameters in every task. ``seed`` seeds the exploring actions.
     """
 
     def __init__(
@@ -56,7 +56,10 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Set the task (N,) of each environment; environments of a task adapt together (None: each one separately)."""
+        """Set the task (N,) of each environment; environments of one task adapt together.
+
+        With None every environment adapts separately.
+        """
         if task_of_row is None:
             self.rows = None
         else:
@@ -64,7 +67,7 @@ class MetaPolicy(nn.Module):
         self.init()
 
     def init(self) -> None:
-        """Return to the meta-parameters and forget all adaptation and its data."""
+        """Return to the meta-parameters; discard adapted parameters and stored transitions."""
         self.adapted = None
         self.stage = Stage()
         self.elapsed = None
@@ -121,7 +124,7 @@ class MetaPolicy(nn.Module):
         return self._distribution(self.observations(obs))[0].clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Do nothing: no state has to be forgotten between episodes."""
+        """Do nothing, because the policy has no state that must be reset between episodes."""
 
     def _distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Return means (N, a) and log standard deviations, (N, a) or (a,), for normalised observations (N, d)."""
@@ -146,13 +149,13 @@ def make_meta_policy(
 
 
 class MetaLearner(Learner):
-    """Learns parameters that one gradient step on a task's own data improves strongly; runs in one process."""
+    """Learns parameters that improve strongly by one gradient step on a task's own data; runs in one process."""
 
     world: PooledWorld
     config: OuterConfig
     policy: MetaPolicy
     remedy = "lower inner_learning_rate or the outer step"
-    objective: ClassVar[Objective]  # what its inner step follows
+    objective: ClassVar[Objective]  # objective of the inner step
     capabilities = frozenset({Capability.ADAPTS})
     going_on = ("obs", "elapsed", "steps_with_tasks", *Learner.going_on)
 
@@ -187,7 +190,7 @@ class MetaLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
-        """Return the autoreset mode: whole episodes wait for each other, and slices of episodes go on."""
+        """Return DISABLED for whole episodes, which wait for each other, and SAME_STEP for slices of episodes."""
         if config.slice_steps is None:
             return "DISABLED"
         return "SAME_STEP"
@@ -257,9 +260,9 @@ class MetaLearner(Learner):
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
-        """Play a whole episode, or a slice, in every environment.
+        """Play a whole episode, or a slice of an episode, in every environment.
 
-        Raw observations go into the statistics ``seen``; clipped ones go to the policy.
+        The statistics ``seen`` are updated with raw observations. The policy reads normalised observations.
         """
         policy = self.policy
         rows = self.rows

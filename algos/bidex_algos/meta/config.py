@@ -10,7 +10,7 @@ from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
 USUAL_STEPS = 300
-"""Steps of an episode for estimates of memory when no world gives the length of its episodes."""
+"""Assumed number of steps per episode in estimates of memory, if the length of episodes is not known yet."""
 
 
 @dataclass(frozen=True)
@@ -19,14 +19,14 @@ class MetaConfig(LearnerConfig):
 
     hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
     activation: Activation = "tanh"  # Non-linearity of the hidden layers.
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start; part of what is adapted.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions; adapted too if adapted is all.
     std_range: tuple[Positive, Positive] = (0.1, 1.5)  # Bounds of the standard deviation of the actions.
     tasks_per_class: Count = 3
     """Tasks of each class in a meta-batch, drawn again for each meta-batch; fewer if a class has fewer. The class's
     environments are divided among these tasks, and each environment plays one rollout."""
-    max_adapt_steps: Count | None = None  # Longest episode that is played to adapt; None: whole episodes.
+    max_adapt_steps: Count | None = None  # Steps after which an adaptation episode is cut; None: whole episodes.
     slice_steps: Count | None = None
-    """Adapt on this many steps of running episodes, as Bi-DexHands did; None: on whole episodes."""
+    """Adapt on this number of steps of running episodes, as Bi-DexHands did; None: adapt on whole episodes."""
     inner_steps: Count = 1  # Adaptation steps before the outer objective is measured.
     inner_learning_rate: Positive = 0.1  # Size of an adaptation step.
     adapted: Adapted = "all"
@@ -35,8 +35,8 @@ class MetaConfig(LearnerConfig):
     """Inner step sizes that the outer step learns, starting from inner_learning_rate: one per tensor (layer, MAML++),
     one per weight (Meta-SGD), or none (fixed)."""
     step_size_rate: Positive = 0.01
-    """Adam's step size for these inner step sizes, relative to inner_learning_rate. A trust region moves them together
-    with all other parameters."""
+    """Adam's step size for learned inner step sizes, relative to inner_learning_rate. A trust-region step moves the
+    inner step sizes together with all other parameters."""
     advantage_scale: Literal["std", "variance"] = "std"
     """Divisor of the advantages in each task. With the variance, as in garage and Meta-World's baselines, the inner
     step depends on the scale of the rewards."""
@@ -59,7 +59,7 @@ class OuterConfig(MetaConfig):
     """Options shared by the outer steps. Each learner's config repeats them as fields, in its own order of flags."""
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
-    max_grad_norm: Positive  # Meta-gradients longer than this are shortened to it.
+    max_grad_norm: Positive  # Meta-gradients are clipped to this norm.
 
 
 # Table 48 of the Bi-DexHands appendix (ProMP), except the outer step. Its rollouts are eight steps of running episodes,

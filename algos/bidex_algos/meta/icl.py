@@ -2,8 +2,9 @@
 
 An iteration plays one trial in every environment: a few episodes of one task with one memory. Teachers, which see the
 goal, label each visited state with their action (DAgger); the actor learns these labels for the true goal. A model
-learns the reward that any goal would have given in a state. It turns observations and rewards into a belief about the
-goal. The policy acts on the mean of the belief, and when it explores, on a goal drawn from it (posterior sampling).
+learns the reward that any goal would have given in a state. With this model, observations and rewards give a belief
+about the goal. The policy acts on the mean of the belief. When the policy explores, it acts on a goal drawn from the
+belief (posterior sampling).
 """
 
 import math
@@ -32,7 +33,7 @@ from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.witness.teachers import Teachers
 from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
-# Added to the standard deviations of actions, which are the unit of errors: 1.5 % of an action's range.
+# Added to the labels' standard deviations, by which errors of actions are divided. It is 1.5 % of an action's range.
 _FLOOR = 0.03
 
 
@@ -40,26 +41,26 @@ _FLOOR = 0.03
 class ICLConfig(LearnerConfig):
     """All options of in-context learning; the defaults are the preset ``laptop``."""
 
-    hidden: Widths = (256, 128)  # Widths of the layers that an observation passes in the model of rewards.
+    hidden: Widths = (256, 128)  # Widths of the layers of the reward model that encode the observation.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
-    candidates: Count = 512  # Goals between which belief is divided.
-    trust: Fraction = 0.05  # What a step's log-likelihood counts: the model's errors in neighbouring steps are alike.
+    candidates: Count = 512  # Number of candidate goals; the belief gives each candidate a probability.
+    trust: Fraction = 0.05  # Factor of a step's log-likelihood, because errors in successive steps are correlated.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
-    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
+    episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
-    still_share: Fraction = 0.3  # Share of the episodes in which the policy tries nothing, as in one that is judged.
-    try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
+    still_share: Fraction = 0.3  # Share of the episodes in which the policy does not explore, as in an evaluation.
+    try_steps: Count = 50  # Mean number of steps for which an exploring policy acts on the same goal.
     reward_unit: Positive = 0.3
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
-    batch_size: Count = 1024  # Steps of an update, split evenly over the classes with a teacher.
-    goals: Count = 8  # Goals for which each trial's steps are rewarded in hindsight, beside the task's own.
-    trials: Count = 1024  # Trials that each process keeps; the oldest go first.
+    batch_size: Count = 1024  # Steps per update, split evenly over the classes with a teacher.
+    goals: Count = 8  # Number of goals, besides the task's own, for which the rewards of a trial are computed.
+    trials: Count = 1024  # Trials that each process keeps; the oldest are overwritten first.
     learning_rate: Positive = 1e-3  # Adam's step size.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and model apart.
+    max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm, separately for actor and model.
     teacher_steps: Whole = 300_000
-    """Environment steps over which the share of trials that the teacher plays falls from 1 to 0."""
+    """Environment steps over which the share of trials in which the teacher acts falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
@@ -73,7 +74,7 @@ PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
 
 
 class ICL(TrialLearner):
-    """In-context learning: a memory infers the task, as in VariBAD (arXiv 1910.08348); its teachers know the task."""
+    """In-context learning: a memory infers the task (as in VariBAD, arXiv 1910.08348), and teachers know the task."""
 
     name = "icl"
     remedy = "lower learning_rate"
@@ -158,7 +159,7 @@ class ICL(TrialLearner):
         return self._episodes_metrics() | as_numbers(tensors)
 
     def teachers_share(self) -> float:
-        """Return the share of the episodes beginning now that the teacher plays."""
+        """Return the probability that the teacher acts in a trial that begins now."""
         steps = self.config.teacher_steps
         if steps:
             return max(0.0, 1.0 - self.env_steps / steps)
@@ -184,10 +185,10 @@ class ICL(TrialLearner):
         return {"Loss/imitation": imitation.mean(), "Loss/reward": reward.mean(), "Loss/class": unlike.mean(), **found}
 
     def _descend(self, data: TaughtTrials) -> Tensor:
-        """Take a step down the mean of the classes' losses over all processes; return the losses (4, K).
+        """Take a gradient step on the mean loss over all classes and processes; return the losses (4, K) of K classes.
 
-        The rows are the losses of the actor, the model and the network that classifies classes, and the model's squared
-        errors.
+        The first three rows are the losses of the actor, of the reward model and of the network that predicts the
+        class. The last row is the reward model's squared error.
         """
         trial, row, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
@@ -206,7 +207,7 @@ class ICL(TrialLearner):
         return losses
 
     def _drawn(self, data: TaughtTrials, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw ``count`` trials evenly over the classes; return trial, environment and class of each, (B,)."""
+        """Draw ``count`` trials evenly over the classes; return the trial, environment and class of each draw, (B,)."""
         shape = len(self.tasks), math.ceil(count / len(self.tasks))
         trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
         # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
@@ -215,17 +216,21 @@ class ICL(TrialLearner):
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
-        """Return squared action errors in units of the class's standard deviation (1: as good as a constant), (K,)."""
+        """Return each class's squared error of actions, relative to the variance of the class's labels (K,).
+
+        An actor that always returns the mean label has an error of 1.
+        """
         policy = self.policy
         actions = policy.actor.act(policy.observations(steps.obs), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
         return self._of_class(off.square().mean(1))
 
     def _model(self, steps: Steps, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the negative log-likelihood of rewards for all goals, and their squared errors (1: a constant), (K,).
+        """Return the negative log-likelihood and the squared error of the rewards of all goals, for each class (K,).
 
-        The likelihood is weighted by the standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model
-        learns nothing in the states where it is unsure.
+        A model that always predicts the mean reward has a squared error of 1. The likelihood is weighted by the
+        standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model learns nothing in the states
+        where it is unsure.
         """
         policy = self.policy
         paid = steps.paid[:, None].float()
@@ -250,9 +255,9 @@ class ICL(TrialLearner):
         return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class, with the data set.
+        """Return the state as in the base class, with a copy of the data set.
 
-        The data set makes its own copy, because a second copy at the same time may not fit in memory.
+        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
         """
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
@@ -277,7 +282,7 @@ class _Pupil:
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Draw which episodes explore and reset the teachers."""
+        """Draw the episodes in which the policy explores, and reset the teachers."""
         learner = self._learner
         self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
         learner.teachers.reset(torch.ones_like(shown))
@@ -300,11 +305,14 @@ class _Pupil:
         goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:
-        """Return the squared distance of believed from hidden values, mean of entries and rows; 1/3 for a guess."""
+        """Return the mean squared difference between believed and hidden values, a scalar.
+
+        Hidden values lie in [-1, 1]. Without any knowledge of the task the difference is 1/3.
+        """
         return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Store the reward of the step, and the rewards that the other goals would have given."""
+        """Store the rewards of the step, and the rewards that the other goals would have given."""
         privileged = self._learner.teachers.privileged
         data = self._data
         data.rewards[slot, self._rows] = reward[:, None]
@@ -314,7 +322,7 @@ class _Pupil:
         data.rewards[slot, self._rows, 1:] = others.masked_fill(~valid, 0.0).T
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions of the teachers or the policy, and the memory's state; store the teachers' labels."""
+        """Return actions (from the teachers or the policy) and the memory's state; store the teachers' labels."""
         learner = self._learner
         data = self._data
         labels = learner.teachers.eval_action(obs)

@@ -1,4 +1,4 @@
-"""The agent of a policy that acts on a latent variable of the task, drawn from its posterior (PEARL)."""
+"""The agent of a policy that acts on a latent variable, which describes the task (PEARL)."""
 
 import torch
 from torch import Tensor

@@ -1,8 +1,9 @@
 """MAML: model-agnostic meta-learning (Finn et al. 2017) for policies, on a batch of tasks at once.
 
-Let theta_0 = theta and, on stages D_0 ... D_K, theta_k+1 = theta_k + rate * grad mean log pi(theta_k) * advantage. The
-outer step raises the mean of ratio(theta_K) * advantage on D_K over theta, while KL(sampling policy || theta_K) stays
-below max_kl; alternatively it is one step of Adam. ``first_order`` ignores the dependence of theta_K on theta.
+Let theta_0 = theta. On the data D_k of stage k the inner step is theta_k+1 = theta_k + rate * grad mean log pi(theta_k)
+* advantage. The outer step changes theta to raise the mean of ratio(theta_K) * advantage on the data D_K of the last
+stage, while KL(sampling policy || theta_K) stays below max_kl. With ``outer`` adam the outer step is one step of Adam.
+``first_order`` leaves out the second derivatives.
 """
 
 from dataclasses import dataclass
@@ -22,14 +23,14 @@ from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 class MAMLConfig(OuterConfig):
     """All options of MAML; the defaults are the preset ``laptop``."""
 
-    outer: Literal["trpo", "adam"] = "trpo"  # The meta-parameters' step: a trust-region one as in the paper, or Adam's.
+    outer: Literal["trpo", "adam"] = "trpo"  # Outer step: a trust-region step as in the paper, or a step of Adam.
     outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
-    max_grad_norm: Positive = 1.0  # Before a step of Adam, meta-gradients longer than this are shortened to it.
-    max_kl: Positive = 0.01  # Bound of the mean KL of adapted policies from the sampling ones in a trust-region step.
+    max_grad_norm: Positive = 1.0  # Meta-gradients are clipped to this norm before a step of Adam.
+    max_kl: Positive = 0.01  # Bound of the mean KL between sampling and adapted policies in a trust-region step.
     damping: NonNegative = 1e-2  # Added to the diagonal of the Fisher matrix.
     cg_iterations: Count = 10  # Conjugate-gradient iterations.
     backtracks: Count = 15  # Points that the line search tries.
-    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
+    backtrack_factor: Fraction = 0.8  # Factor by which the line search shortens the step at each try.
 
 
 PRESETS: dict[str, MAMLConfig] = {

@@ -12,8 +12,8 @@ from bidex_meta.agents import Timestep
 class MemoryAgent:
     """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` seeds its exploration.
 
-    Adaptation episodes write the memory of their environment. Evaluation episodes run on a copy, so each of them
-    follows the same shots. No weight changes.
+    Adaptation episodes write the memory of their environment. Each evaluation episode starts from a copy of this
+    memory, so all evaluation episodes follow the same adaptation episodes. No weight changes.
     """
 
     def __init__(self, policy: RecurrentPolicy, seed: int = 0):
@@ -40,7 +40,7 @@ class MemoryAgent:
         self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return sampled actions (N, a) in [-1, 1] for raw observations (N, d), and their Gaussian distribution."""
+        """Return sampled actions (N, a) in [-1, 1] for raw observations (N, d), and mean and std of the Gaussian."""
         self._learned = self._memory(self._learned, len(obs))
         self._drawn = self.policy.drawn(self._drawn, len(obs), self.noise)
         mean, self._next_state = self.policy.step(obs, self._learned, self._drawn)
@@ -75,8 +75,8 @@ class MemoryAgent:
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return mean actions (N, a) in [-1, 1] for raw observations (N, d).
 
-        The memory continues within the episode. Its input marks rewards as unknown, as in training (``blind_share``),
-        until :meth:`observe` shows them.
+        The memory continues within the episode. The reward in its input is marked as unknown, as in training
+        (``blind_share``), unless :meth:`observe` has passed the reward of the last step.
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)

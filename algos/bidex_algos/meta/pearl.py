@@ -1,10 +1,10 @@
 """PEARL: SAC conditioned on a latent variable, whose posterior is inferred from a task's transitions.
 
-An environment keeps its task and plays trials. In the first episode it acts on a latent variable drawn from the prior,
-in each later episode on one drawn from the posterior of the trial so far. In an update an encoder computes a posterior
-from the latest trials of some environments. Actor and critics learn on a sample of it, from all replayed transitions of
-these environments' tasks. The encoder minimises the critics' loss and the divergence from the prior. See
-docs/learners/pearl.md.
+An environment keeps its task and plays trials of a few episodes. In the first episode of a trial the policy acts on a
+latent variable drawn from the prior. In each later episode the variable is drawn from the posterior given the trial so
+far. In an update an encoder computes posteriors from the latest trials of some environments. Actor and critics learn
+with samples of these posteriors, from all replayed transitions of these environments' tasks. The encoder minimises the
+critics' loss and the divergence from the prior. See docs/learners/pearl.md.
 """
 
 import math
@@ -37,19 +37,19 @@ from bidex_meta.world.contract import Info, TaskWorld
 class PEARLConfig(MTSACConfig):
     """All options of PEARL; the defaults are the preset ``laptop``."""
 
-    latent: Count = 8  # Entries of the latent variable that stands for the task.
+    latent: Count = 8  # Number of entries of the latent variable, which describes the task.
     encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
-    context: Count = 64  # Transitions from which an update, or an episode, estimates what a task has shown.
+    context: Count = 64  # Transitions that are drawn to estimate a posterior, in an update or before an episode.
     tasks_per_update: Count = 16  # Environments whose tasks an update learns from, split evenly over the classes.
     kl_weight: NonNegative = 1e-4
-    """Factor of the posterior's divergence from the unit Gaussian in the encoder's loss. Where it weighs more than what
-    the critics gain by knowing the task, the posterior stays the prior; Loss/divergence shows it."""
+    """Factor of the posterior's divergence from the unit Gaussian in the encoder's loss. If this term outweighs what
+    the critics gain from knowing the task, the posterior stays equal to the prior, and Loss/divergence is near 0."""
     episodes_per_trial: Annotated[int, Meta(ge=2, le=1000)] = 3
-    """Episodes after which an environment forgets what its task has shown: those played to adapt, and one more."""
+    """Episodes after which an environment starts again from the prior: the adaptation episodes, and one more."""
     max_adapt_steps: Count | None = None
     """Steps after which an exploring episode of a meta-test is cut; None: whole episodes."""
     reward_unit: Positive = 0.3  # The encoder reads asinh(reward / reward_unit), normalised by running statistics.
-    value_heads: bool = False  # Give each critic an output per class; the latent variable then need not say which.
+    value_heads: bool = False  # Give each critic one output per class; the latent then need not identify the class.
     replay_steps: Count = 4000  # Vector steps that the replay keeps, if replay_memory allows.
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
@@ -141,7 +141,7 @@ class PEARL(MTSAC):
         return torch.randint(low, high, shape, generator=self.generator, device=self.device)
 
     def _below(self, counts: Tensor, *shape: int) -> Tensor:
-        """Draw uniform integers (shape) below ``counts``, which broadcast; 0 where a count is 0."""
+        """Draw uniform integers of the given shape below ``counts``, which are broadcast; a count of 0 gives 0."""
         # The remainder of so large a number favours no entry by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
@@ -174,7 +174,7 @@ class PEARL(MTSAC):
         return [self._infer(chosen[i], stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
     def _infer(self, rows: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """Update all networks with transitions (B) of the tasks of some environments (M,)."""
+        """Update all networks with the transitions ``draw`` (B) from the tasks of the environments ``rows`` (M,)."""
         episodes = self._uniform(1, self.config.episodes_per_trial, len(rows))
         trial = (self.played[rows] >= episodes).long()
         mean, std = self.policy.posterior(self._shown(rows, trial, episodes))

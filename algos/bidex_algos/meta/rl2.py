@@ -1,8 +1,8 @@
 """RL²: meta-learning with a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
 
 An iteration plays one trial in every environment: a few episodes of one task with one memory. The learner makes
-``epochs`` passes over the trial in mini-batches of chunks, and the next trial starts with an empty memory. The first
-trial only measures statistics.
+``epochs`` passes over the trial in mini-batches of chunks, which are runs of ``chunk`` steps. The next trial starts
+with an empty memory. The first trial is only used to measure statistics.
 """
 
 import math
@@ -34,28 +34,28 @@ from bidex_meta.world.contract import PooledWorld
 class RL2Config(PPOConfig):
     """All options of RL²; the defaults are the preset ``laptop``."""
 
-    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
-    activation: Activation = "elu"  # Non-linearity of the encoder.
-    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
+    hidden: Widths = (256, 128)  # Widths of the layers before the memory, the same for actor and critic.
+    activation: Activation = "elu"  # Non-linearity of the layers before the memory.
+    memory: Count = 128  # Size of an environment's memory (the state of a GRU); actor and critic have one each.
     value_heads: bool = True  # Give the critic one output per task class instead of one for all.
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
+    episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
     blind_share: Fraction = 0.0
-    """Share of the episodes whose rewards the policy is not shown, as in a meta-test with hidden rewards."""
+    """Share of the episodes in which the policy does not see rewards, as in a meta-test with hidden rewards."""
     reward_unit: Positive = 0.01
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
-    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
+    """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
+    gamma: Fraction = 0.93  # Discount per step; a return continues into the later episodes of the trial.
     lam: Fraction = 0.95  # Trace decay of the advantage estimate.
     chunk: Count | None = None
-    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
+    """Number of steps over which gradients flow back through the memory; None: all steps of the trial."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and critic apart.
+    max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm, separately for actor and critic.
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
     value_horizon: Positive = 100.0
-    """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
+    """Number of iterations over which old returns fade from the statistics that normalise the critic's targets."""
 
     @property
     def trial_steps(self) -> int:
@@ -98,7 +98,7 @@ PRESETS: dict[str, RL2Config] = {
 
 
 class RL2(TrialLearner):
-    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it."""
+    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory, by which it adapts to a task while it acts."""
 
     name = "rl2"
     remedy = "lower learning_rate"
@@ -181,7 +181,7 @@ class RL2(TrialLearner):
         return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
 
     def _outputs(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means (C, B, a) and values (C, B, heads) of the chosen chunks, int64 (B,)."""
+        """Return means (C, B, a) and values (C, B, heads) of the chunks with numbers ``chosen``, int64 (B,)."""
         chunk = b.chunk[chosen]
         row = b.row[chosen]
         x = self.policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
@@ -198,7 +198,7 @@ class RL2(TrialLearner):
         return self._episodes_metrics() | as_numbers(tensors)
 
     def _make_critic(self, heads: int) -> nn.Module:
-        """Return a network from steps (T, B, inputs) and a memory to values (T, B, heads) and the next memory."""
+        """Return a network that maps inputs (T, B, inputs) and a memory to values (T, B, heads) and the next memory."""
         config = self.config
         return RecurrentNet(
             self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation,

@@ -1,4 +1,4 @@
-"""One stage of adaptation: the transitions of all environments, and the batch by task that is made of them."""
+"""One stage of adaptation: the transitions of all environments, and the batch, grouped by task, made from them."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,10 +12,11 @@ from bidex_algos.meta.config import MetaConfig
 
 
 class TaskRows:
-    """Rows grouped by task, as a rectangle: a task with fewer environments repeats one of them with weight 0.
+    """Environments grouped by task, as a rectangle of M tasks by R environments.
 
-    ``task_of_row`` is the task of each environment, 0 to ``count`` - 1, int64 (N,). ``weight`` (M, R) is 1, or 0 for
-    repeated rows.
+    R is the largest number of environments per task. A task with fewer environments repeats one of them, with weight 0.
+    ``task_of_row`` is the task of each environment, 0 to ``count`` - 1, int64 (N,). ``weight`` (M, R) is 0 for
+    repetitions and 1 otherwise.
     """
 
     def __init__(self, task_of_row: Tensor):
@@ -52,7 +53,10 @@ class TaskRows:
 
 
 def features(obs: Tensor, elapsed: Tensor) -> Tensor:
-    """Return observation, its square, three powers of time and 1: (..., d) and (...) to (..., 2 d + 4), float32."""
+    """Return features (..., 2 d + 4) of observations (..., d) and elapsed steps (...), float32.
+
+    The features are the observation, its square, three powers of the time and 1.
+    """
     bounded = obs.clamp(-10.0, 10.0)
     t = elapsed[..., None].to(obs.dtype) / 100.0
     return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)
@@ -62,10 +66,11 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
     """Fit the returns by ridge regression in each task and return the predictions (tasks, B).
 
     Observations are (tasks, B, d), all other arguments (tasks, B). The penalty on coefficients of observations is
-    ``ridge`` times features per sample, relative to the mean of the Gram matrix's diagonal; the four coefficients of
-    time are hardly penalised. A ``ridge`` of 1 gives the best linear prediction if features and noise explain equal
-    parts of the returns. A fit with almost no penalty (1e-5) memorises the returns. On ML1-wide we measured the
-    correlation of advantages with the advantages of a baseline fitted to other rollouts, for 7, 20 and 50 rollouts::
+    ``ridge`` times the number of features per sample, relative to the mean of the Gram matrix's diagonal. The
+    coefficients of time and of the constant are hardly penalised. A ``ridge`` of 1 gives the best linear prediction if
+    features and noise explain equal parts of the returns. A fit with almost no penalty (1e-5) memorises the returns. On
+    ML1-wide we measured the correlation of advantages with the advantages of a baseline fitted to other rollouts, for
+    7, 20 and 50 rollouts::
 
         ridge 1e-5     0.19, 0.18, 0.47
         no baseline    0.71, 0.63, 0.62
@@ -93,12 +98,12 @@ class Stage:
     obs: list[Tensor] = field(default_factory=list)  # normalised observations before the step (N, d)
     actions: list[Tensor] = field(default_factory=list)  # sampled actions, not clamped (N, a)
     means: list[Tensor] = field(default_factory=list)  # means of the sampling policies (N, a)
-    rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 where not valid
-    terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode came to a true end
+    rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 if not valid
+    terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode terminated
     ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
-    # Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing.
+    # Bool (N,), False if the environment was waiting or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
-    elapsed: list[Tensor] = field(default_factory=list)  # steps of the episode before this one (N,)
+    elapsed: list[Tensor] = field(default_factory=list)  # number of earlier steps in the same episode (N,)
 
     def add(self, **step: Tensor) -> None:
         """Append a step, with every field given by name."""
@@ -115,10 +120,10 @@ class Stage:
 
 @torch.no_grad()
 def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig) -> TaskBatch:
-    """Make the batch that tasks adapt on; ``log_std`` (M, a) is of the sampling policies.
+    """Make the batch on which tasks adapt; ``log_std`` (M, a) is that of the sampling policies.
 
-    Returns count to the end of the stage and no further, because a baseline fitted to these returns knows nothing
-    beyond that point.
+    The return of a step sums rewards only up to the end of the stage, because a baseline fitted to these returns knows
+    nothing beyond that point.
     """
     recorded = (stage.rewards, stage.terminated, stage.ended, stage.valid)
     rewards, terminated, ended, valid = (torch.stack(steps) for steps in recorded)
@@ -149,11 +154,11 @@ class Outcome(NamedTuple):
 
     earned: Tensor  # undiscounted, unscaled return of each environment (N,)
     success: Tensor  # whether each environment succeeded, bool (N,)
-    steps: Tensor  # environment steps, int64 (); a row that waits for the others takes none
+    steps: Tensor  # number of environment steps, int64 (); steps of waiting environments do not count
 
 
 def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean, variance and count of each column of (N, d), over the rows of a mask (N,)."""
+    """Return mean (d,), variance (d,) and count of the rows of ``x`` (N, d) that the mask ``counted`` (N,) selects."""
     count = counted.sum()
     x = x.masked_fill(~counted[:, None], 0.0)
     mean = x.sum(0) / count.clamp_min(1)

@@ -15,16 +15,16 @@ from bidex_meta.training.learner import State
 
 
 class Steps(NamedTuple):
-    """Steps of trials, with the reward that each of g goals would have given for reaching them."""
+    """States in trials, with the rewards that each of g goals would have given for reaching these states."""
 
     obs: Tensor
     """Raw observations (B, d)."""
     labels: Tensor
     """The teachers' actions in these states (B, a)."""
     goals: Tensor
-    """The tasks' hidden values, and other goals (B, g, k)."""
+    """Goals (B, g, k); the first of the g goals is the hidden values of the step's own task."""
     rewards: Tensor
-    """For each goal (B, g)."""
+    """Rewards under each goal (B, g)."""
     paid: Tensor
     """True if the step had a reward, False at the beginning of an episode, bool (B,)."""
 
@@ -32,9 +32,9 @@ class Steps(NamedTuple):
 class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
-    ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,) are filled while ``trials`` is
-    played; then ``keep`` stores everything. The first of ``g`` goals is the task's own; the same steps are rewarded in
-    hindsight for the other goals.
+    ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,), the trials in which teachers
+    act, are filled while ``trials`` is played; then ``keep`` stores everything. The first of g goals is the task's own.
+    Rewards are also computed for the other goals, in hindsight.
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int, size: int):
@@ -65,7 +65,7 @@ class TaughtTrials:
         return min(self.added, self.kept)
 
     def keep(self) -> None:
-        """Store the trials that were played."""
+        """Store the trial that every environment has just played."""
         t = self.trials
         # Rewards move one slot later, to the state that they led to; an episode's last reward led to no recorded state.
         rewards, paid = (torch.cat([torch.zeros_like(x[:1]), x[:-1]]) for x in (self.rewards, t.valid & ~t.ended))
@@ -75,9 +75,10 @@ class TaughtTrials:
         self.added += 1
 
     def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
-        """Return one step of each given trial (B,), a number below ``filled``, of environments (B,).
+        """Return one step of each of the trials ``trial`` (B,) of the environments ``row`` (B,).
 
-        The step is chosen by its share in [0, 1) of the trial's length (B,).
+        Numbers of trials are below ``filled``. ``share`` (B,), in [0, 1), is the position of the step in its trial,
+        relative to the trial's length.
         """
         slot = (share * self._ring["lengths"][trial, row]).long()
         ring = self._ring
@@ -89,7 +90,7 @@ class TaughtTrials:
         return {"added": self.added, **{name: ring[: self.filled].clone() for name, ring in self._ring.items()}}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raises BidexError if its environments or trials differ."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if ``state`` has other environments or trials."""
         here = self._ring["obs"].shape[1:]
         there = state["obs"].shape[1:]
         if here != there or len(state["obs"]) != min(state["added"], self.kept):

@@ -1,4 +1,4 @@
-"""The base of learners with a memory: trials, tasks by turns, statistics of first and last episodes."""
+"""The base of learners with a memory: trials, rotation of tasks, statistics of first and last episodes."""
 
 from dataclasses import replace
 from typing import Any
@@ -28,7 +28,7 @@ def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str
 
 
 class TrialLearner(Learner):
-    """Base: an iteration plays one trial, a few episodes of one task with one memory, in every environment."""
+    """Base class; in an iteration every environment plays one trial: a few episodes of one task with one memory."""
 
     world: PooledWorld
     policy: RecurrentPolicy
@@ -43,7 +43,7 @@ class TrialLearner(Learner):
         self.agent = MemoryAgent(self.policy, own_seed(seed))
         self.trials_played = 0
         self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
-        """Maximum steps of an episode of each environment (N,)."""
+        """Maximum number of steps per episode, for each environment (N,)."""
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
         # Pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()

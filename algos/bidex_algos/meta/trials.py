@@ -1,7 +1,7 @@
 """Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-An environment whose episode is over waits, and its memory does not change. Steps spent waiting are not recorded, so
-index t holds the t-th step that the memory has seen.
+An environment whose episode is over waits for the others, and its memory does not change. Steps spent waiting are not
+recorded, so slot t of a trial holds the t-th step that the memory has seen.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,10 @@ from bidex_meta.world.contract import VectorWorld
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
-    """Return the slots and the chunk size of a trial of at most ``steps`` steps.
+    """Return the number of slots and the chunk size for a trial of at most ``steps`` steps.
 
-    One slot is added for the last observation. The number of slots is a multiple of the chunk size.
+    A slot holds one step, and one slot is added for the last observation. The number of slots is a multiple of the
+    chunk size. If ``chunk`` is None, the whole trial is one chunk.
     """
     if chunk is None or chunk >= steps:
         size = steps + 1
@@ -34,7 +35,8 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 class Trials:
     """One trial of N environments, preallocated on the device and overwritten by each :func:`play`.
 
-    The slots S are the whole chunks that the longest trial needs; ``limits`` are the maximum steps of an episode (N,).
+    The S slots hold the longest possible trial, rounded up to whole chunks. ``limits`` (N,) is the maximum number of
+    steps per episode.
     """
 
     def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, chunk: int | None):
@@ -48,10 +50,10 @@ class Trials:
             return torch.zeros(slots, rows, *shape, dtype=dtype, device=limits.device)
 
         self.longest = longest
-        # Per slot: the raw observation before the step (the slot after the last step holds the resulting one), the
-        # sampled and unclamped action, the reward (0 if not valid, when physics broke), whether the policy was shown
-        # it, true ends, and the steps left until the time limit. ``lengths`` (N,) counts the slots that each
-        # environment has filled.
+        # Per slot: the raw observation before the step (the slot after the last step holds the last observation), the
+        # sampled and unclamped action, the reward (0 if physics broke, that is, if the step is not valid), whether the
+        # policy saw the reward, whether the episode ended or terminated, and the steps left until the time limit.
+        # ``lengths`` (N,) counts the slots that each environment has filled.
         self.obs = zeros(observations)
         self.actions = zeros(actions)
         self.rewards = zeros()
@@ -65,10 +67,11 @@ class Trials:
         return slot[:, None] < self.lengths
 
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the memory's inputs besides the observation: last action (slots, N, a), last reward, shown, end.
+        """Return the memory's inputs besides the observation, for the first ``slots`` slots.
 
-        The slot after the last step counts as part of the same episode, because its value replaces the rewards that the
-        time limit cut off.
+        These are the last action (slots, N, a), the last reward, whether the policy saw this reward, and whether an
+        episode has just ended, each (slots, N). The slot after the last step counts as part of the same episode,
+        because its value replaces the rewards that the time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
@@ -77,8 +80,8 @@ class Trials:
     def discounts(self, slots: int, gamma: float) -> Tensor:
         """Return the discount of the state after each of the first ``slots`` transitions, (slots, N): gamma per step.
 
-        After a true end a row stands still without reward until its time limit. Otherwise ending an episode would be
-        rewarded with the early start of a new one.
+        After a termination, all steps that were left until the time limit are discounted too. Otherwise ending an
+        episode early would be rewarded, because the next episode would start earlier.
         """
         left = self.left[:slots].masked_fill(~self.terminated[:slots], 0)
         return gamma ** (1.0 + left.float())
@@ -88,7 +91,7 @@ class Player(Protocol):
     """Chooses the actions in a trial."""
 
     def begin(self, shown: Tensor) -> None:
-        """Begin an episode in all environments; ``shown`` (N,) marks those in which the policy sees rewards."""
+        """Begin an episode in all environments; ``shown`` (N,) marks environments in which the policy sees rewards."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return unclamped actions (N, a) for raw observations (N, d), and the memory's next state (N, memory).
@@ -98,7 +101,10 @@ class Player(Protocol):
         ...
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Record the step's rewards (N,), which are 0 for a row that is not ``valid``: broken physics, or waiting."""
+        """Record the step's rewards (N,).
+
+        A row is not ``valid``, and its reward is 0, if its physics broke or if it is waiting for the next episode.
+        """
 
 
 class Sampling:
@@ -112,7 +118,7 @@ class Sampling:
         """Do nothing."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
-        """Sample without clamping: the world clamps, and the density must be of the sampled action."""
+        """Sample actions without clamping: the world clamps, but the density must be that of the sampled action."""
         mean, state = self._policy.step(obs, memory)
         noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
         return mean + self._policy.log_std.exp() * noise, state
@@ -128,8 +134,8 @@ def play(
 ) -> None:  # fmt: skip
     """Fill ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
 
-    In a ``blind_share`` of the episodes the policy is not shown rewards. ``statistics`` are the counters to update for
-    each episode of a trial.
+    In a ``blind_share`` of the episodes the policy does not see rewards. ``statistics`` has one list of counters for
+    each episode of a trial; the counters are updated when that episode ends.
     """
     rows = torch.arange(world.num_envs, device=world.device)
     device = world.device
@@ -181,25 +187,25 @@ def play(
 
 @dataclass
 class Batch:
-    """A trial prepared for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
+    """A trial prepared for the update: T slots (a multiple of the chunk size C) of N rows, and its S filled chunks."""
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
     # Inputs of the memory besides the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
     old_means: Tensor  # means of the sampling policy (T, N, a)
-    old_log_probs: Tensor  # log-density of the actions under it (T, N)
+    old_log_probs: Tensor  # log-density of the actions under the sampling policy (T, N)
     advantages: Tensor  # normalised advantages (T, N)
-    targets: Tensor  # what the critic shall predict, in its own units (T, N)
+    targets: Tensor  # the critic's targets: normalised returns (T, N)
     weights: Tensor  # 1, or 0 for slots that teach nothing (T, N)
     actor_states: Tensor  # the actor's memory before each chunk (T / C, N, memory)
-    critic_states: Tensor  # the critic's (T / C, N, memory)
-    chunk: Tensor  # number of each chunk that holds a step, int64 (S,)
-    row: Tensor  # its row, int64 (S,)
+    critic_states: Tensor  # the critic's memory before each chunk (T / C, N, memory)
+    chunk: Tensor  # position in time, 0 to T / C - 1, of each chunk that holds a step, int64 (S,)
+    row: Tensor  # row of each chunk that holds a step, int64 (S,)
 
     @property
     def size(self) -> int:
-        """Return the steps of a chunk, C."""
+        """Return C, the number of steps per chunk."""
         return len(self.weights) // len(self.actor_states)
 
     def take(self, x: Tensor, chosen: Tensor) -> Tensor:
@@ -209,7 +215,10 @@ class Batch:
 
 
 def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
-    """Select one value (T, B) of a critic's outputs (T, B, heads): the only one, or the one of each task (B,)."""
+    """Select values (T, B) from a critic's outputs (T, B, heads).
+
+    With several heads, ``task_id`` (B,) selects the head of each column.
+    """
     if outputs.shape[-1] == 1:
         return outputs.squeeze(-1)
     return outputs.gather(2, task_id.expand(len(outputs), -1)[..., None]).squeeze(-1)
@@ -220,7 +229,7 @@ class Discounting(Protocol):
 
     @property
     def chunk(self) -> int | None:
-        """Return the steps that gradients flow back through the memory; None: the whole trial."""
+        """Return the number of steps over which gradients flow back through the memory; None means the whole trial."""
         ...
 
     @property
@@ -239,7 +248,7 @@ def make_batch(
     t: Trials, policy: RecurrentPolicy, critic: nn.Module, return_stats: RunningStats, task_id: Tensor,
     config: Discounting
 ) -> tuple[Batch, Tensor]:  # fmt: skip
-    """Pass a trial through the networks, chunk by chunk from empty memories, and estimate advantages.
+    """Pass a trial through the networks, chunk by chunk, starting with empty memories, and estimate advantages.
 
     Also returns the explained variance per task (num_tasks,). ``return_stats`` is updated with the trial's returns.
     """

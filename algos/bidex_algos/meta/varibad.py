@@ -1,8 +1,9 @@
 """VariBAD: RL² whose memory is a belief about the task (Zintgraf et al. 2020); see docs/learners/varibad.md.
 
-An encoder turns the trial so far into a Gaussian over a latent variable. From a sample of the latent a decoder predicts
-the rewards of the whole trial; this prediction trains encoder and decoder. Policy and critic read the belief; PPO
-trains them but not the encoder, whose beliefs about a trial are computed once.
+An encoder turns the trial so far into a belief: a Gaussian over a latent variable. From a sample of the latent a
+decoder predicts the rewards of the whole trial; the error of this prediction trains encoder and decoder. Policy and
+critic read the belief. PPO trains policy and critic but not the encoder, so the beliefs about a trial are computed only
+once.
 """
 
 from dataclasses import dataclass
@@ -24,22 +25,22 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
 _TIMES = 16
-"""Times of a trial whose beliefs a mini-batch decodes."""
+"""Number of times in a trial at which a mini-batch decodes the belief."""
 _STEPS = 64
-"""Steps whose rewards each belief predicts."""
+"""Number of steps whose rewards are predicted from each of these beliefs."""
 _BATCHES = 4
-"""Mini-batches of whole trials in a pass of encoder and decoder, at most; a GRU is slow where they are small."""
+"""Largest number of mini-batches per pass of encoder and decoder; a GRU is slow on small mini-batches."""
 
 
 @dataclass(frozen=True)
 class VariBADConfig(RL2Config):
     """All options of VariBAD; the defaults are the preset ``laptop``."""
 
-    latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
-    kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
+    latent: Count = 8  # Size of the latent; the policy reads the mean and log standard deviation of each entry.
+    kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the previous one, relative to the error of all rewards.
     belief_learning_rate: Positive = 1e-3  # Adam's step size for encoder and decoder.
     reward_unit: Positive = 0.3
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""
@@ -86,12 +87,15 @@ class BeliefActor(RecurrentNet):
         return mean, log_std.clamp(-6.0, 2.0), state
 
     def pays(self, x: Tensor, latent: Tensor) -> Tensor:
-        """Decode normalised rewards (K, M, B) for reaching inputs (M, B, inputs) from latent samples (K, B, latent)."""
+        """Decode latent samples (K, B, latent) to normalised rewards (K, M, B) for reaching inputs (M, B, inputs)."""
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
     def knowing(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return steps (T, B, inputs) with their beliefs, (T, B, inputs + 2 latent), and the memory; no gradient."""
+        """Append beliefs to inputs (T, B, inputs), without gradient.
+
+        Returns the result (T, B, inputs + 2 latent) and the memory after these steps.
+        """
         with torch.no_grad():
             mean, log_std, state = self.believe(x, state)
         return torch.cat([x, mean, log_std], dim=-1), state
@@ -110,7 +114,7 @@ class BeliefCritic(nn.Module):
         self.values = values
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values (T, B, heads) of steps (T, B, inputs), and the memory after them."""
+        """Return values (T, B, heads) of inputs (T, B, inputs), and the memory after these steps."""
         x, state = self._actor[0].knowing(x, state)
         return self.values(x), state
 
@@ -150,7 +154,7 @@ class VariBAD(RL2):
         return losses | {"Loss/reward": reward, "Loss/divergence": divergence}
 
     def _prepare(self) -> tuple[Batch, Tensor]:
-        """Prepare a trial as RL² does, and its steps with their beliefs, which PPO does not change."""
+        """Prepare a trial as RL² does, and store the inputs with their beliefs, which PPO does not change."""
         b, explained = super()._prepare()
         found = []
         for number, begin in enumerate(range(0, len(b.obs), b.size)):
@@ -166,7 +170,7 @@ class VariBAD(RL2):
         return self.net.actor(known), critic.values(known)
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """Take one step of encoder and decoder; return the result of :meth:`_bound` over all processes (2,)."""
+        """Take one step of encoder and decoder; return :meth:`_bound`, summed over all processes (2,)."""
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()

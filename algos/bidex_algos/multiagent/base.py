@@ -1,6 +1,6 @@
 """The base of on-policy learners of several agents: the agents' policy, a common critic, and the critic's loss.
 
-For the base class, the agents form one policy whose action joins their actions; an update splits it again.
+The base class treats the agents as one policy, whose action joins the agents' actions. An update splits this action.
 """
 
 import math
@@ -45,15 +45,15 @@ class MultiAgentConfig(OnPolicyConfig):
     """Options of agents and of the critic's loss."""
 
     agents: Partition = "hands"
-    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
-    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
-    huber_delta: Positive = 10.0  # Error of the critic, in its units, beyond which its loss grows no faster than that.
-    value_clip: NonNegative = 0.0  # How far a value may leave the old one before it earns nothing more; 0: no bound.
-    popart: bool = False  # When the statistics of returns change, move the critic's output layer so that values stay.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it: each agent's, and the critic's.
+    """Division of the hands into agents: hands (two agents), fingers (twelve: five fingers and the palm of each hand),
+    single (one), a TOML file with a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+    huber_delta: Positive = 10.0  # Error, in the critic's units, beyond which the critic's loss grows linearly.
+    value_clip: NonNegative = 0.0  # Distance from the old value at which the loss clips a value; 0: no clipping.
+    popart: bool = False  # Adjust the critic's output layer when the statistics of returns change, to preserve values.
+    max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm, separately for each agent and the critic.
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
+    adam_eps: NonNegative = 1e-8  # Constant that Adam adds to its denominators.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,19 +67,20 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """Options shared by IPPO, MAPPO and HAPPO; the defaults are the preset ``laptop``."""
 
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
-    value_loss_weight: Finite = 1.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
+    value_loss_weight: Finite = 1.0  # Factor of the value loss; it only matters for max_grad_norm, as Adam cancels it.
     entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
     desired_kl: Positive = 0.03
-    """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
-    agent's has an even share."""
+    """KL between the sampling and the current joint policy that the adaptive step sizes aim at. Each agent has an equal
+    share of this KL."""
 
 
 @dataclass(frozen=True)
 class InTurnConfig(LearnerConfig):
-    """Options shared by HAPPO and HATRPO. A config that inherits others too lists these fields after the others'."""
+    """Options shared by HAPPO and HATRPO, which list these options after their other options."""
 
     max_factor: NonNegative = 4.0
-    """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""
+    """Largest factor by which the likelihood ratios of the previous agents may scale an agent's advantage; 0: no
+    bound."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,17 +100,17 @@ LiftUnderarm; B.2.1 and B.2.4 describe the clipped value."""
 PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
-"""PAPER with the passes and the clip of both tables."""
+"""PAPER with the values of both tables that only apply to PPO."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # the values of both tables' column for LiftUnderarm that differ
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # values that differ in both tables' column for LiftUnderarm
 
 
 @torch.no_grad()
 def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> None:
-    """Move the critics' output layers so that std V + mean stays: PopArt (van Hasselt 2016, Hessel et al. 2019).
+    """Adjust the critics' output layers to preserve std V + mean: PopArt (van Hasselt 2016, Hessel et al. 2019).
 
-    Each critic has an output for each task. ``before`` and ``after`` are mean and standard deviation of the returns
-    that define the critics' units, each (critics * tasks,).
+    Each critic has an output for each task. ``before`` and ``after`` are the old and new mean and standard deviation of
+    the returns, which define the critics' units, each (critics * tasks,).
     """
     given = [x.view(len(critics), -1) for x in (*before, *after)]
     for critic, old_mean, old_std, mean, std in zip(critics, *given, strict=True):
@@ -121,16 +122,16 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
 
 @dataclass
 class AgentBatch:
-    """Samples (B,) of one agent with a_i actions, cut out of the batch once, so that mini-batches only select rows."""
+    """B samples of one agent with a_i actions, cut out of the batch once, so that mini-batches only select rows."""
 
-    seen: Tensor  # what its network is fed (B, d_i)
-    task: Tensor  # the tasks' one-hot (B, heads); without columns where the agent has one head
-    actions: Tensor  # its part of the sampled actions (B, a_i)
-    old_means: Tensor  # of the sampling policy (B, a_i)
-    old_log_std: Tensor  # of the sampling policy (B, a_i)
-    old_log_probs: Tensor  # log-density of its part under the sampling policy (B,)
-    gain: Tensor  # the advantages it shall climb (B,)
-    weights: Tensor  # as in the batch (B,)
+    seen: Tensor  # input of the agent's network (B, d_i)
+    task: Tensor  # the tasks' one-hot (B, heads); (B, 0) if the agent has one head
+    actions: Tensor  # the agent's part of the sampled actions (B, a_i)
+    old_means: Tensor  # means of the sampling policy (B, a_i)
+    old_log_std: Tensor  # log standard deviations of the sampling policy (B, a_i)
+    old_log_probs: Tensor  # log-density of ``actions`` under the sampling policy (B,)
+    gain: Tensor  # advantages in the agent's surrogate (B,)
+    weights: Tensor  # weights of the samples, as in the batch (B,)
 
     def select(self, index: Tensor) -> "AgentBatch":
         """Return the samples at ``index``."""
@@ -196,7 +197,8 @@ class MultiAgent(OnPolicy):
     def _value_loss(self, b: Batch, old_values: Tensor, weights: Tensor) -> Tensor:
         """Return twice Huber's loss, a scalar.
 
-        With ``value_clip`` the loss is at least the loss of the value clipped to that distance from the old value.
+        With ``value_clip`` the loss of a sample is the larger one of two losses: that of the value, and that of the
+        value clipped to a distance of ``value_clip`` from the old value.
         """
         delta = self.config.huber_delta
         reach = self.config.value_clip
@@ -233,7 +235,7 @@ class MultiAgent(OnPolicy):
 
 
 class OwnAdams(MultiAgent):
-    """Agents whose networks each have an optimiser, whose step size follows the agent's share of the KL."""
+    """Agents with one optimiser per network; the step size of each optimiser follows the agent's share of the KL."""
 
     config: MultiAgentPPOConfig
 
@@ -253,9 +255,9 @@ class OwnAdams(MultiAgent):
 class Sequential(MultiAgent):
     """Agents that are updated one after another, in a random order that is equal in all processes (Kuba et al. 2022).
 
-    Each agent sees the advantage times the ratios, new over old, of all agents before it. All agents learn from the
-    same samples, so every agent can raise the ratios of the same few samples: with twelve agents the products grew to
-    20,000 within an update. ``max_factor`` bounds the products.
+    The advantage of an agent is multiplied by the likelihood ratios, new over old, of all agents updated before it. All
+    agents learn from the same samples, so every agent can raise the ratios of the same few samples. With twelve agents
+    the products of ratios grew to 20,000 within an update. ``max_factor`` bounds the products.
     """
 
     config: Any
@@ -265,9 +267,10 @@ class Sequential(MultiAgent):
         self.order = torch.Generator().manual_seed(seed)
 
     def _in_turn(self, batch: Batch) -> Iterator[tuple[int, AgentBatch]]:
-        """Yield (agent, share) in turn, with the advantage scaled by the previous agents' ratios as ``gain``.
+        """Yield each agent's index and its part of the batch, in the order of updates.
 
-        The product of the ratios is at most ``max_factor``.
+        The field ``gain`` is the advantage times the product of the previous agents' ratios, which is at most
+        ``max_factor``.
         """
         actor = self.policy.actor
         task = self.policy.actor.one_hot(batch.obs)

@@ -1,7 +1,8 @@
 """HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
 
-The order of agents is random in each iteration. Each agent climbs PPO's clipped surrogate with the advantage times the
-ratios of the agents before it, so that its step improves the joint policy. Afterwards the common critic learns.
+The order of agents is random in each iteration. Each agent maximises PPO's clipped surrogate. The advantage in the
+surrogate is multiplied by the likelihood ratios of the agents updated before, so that the agent's step improves the
+joint policy. Afterwards the common critic learns.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +41,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(OwnAdams, Sequential):
-    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HAPPO, PPO with agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name = "happo"
     remedy = "lower learning_rate"

@@ -21,7 +21,7 @@ class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
     """All options of HATRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.05
-    """Mean KL of the new joint policy from the sampling one that no update exceeds; each agent has an even share."""
+    """Upper bound of the mean KL between the sampling and the new joint policy. Each agent has an equal share."""
 
 
 PRESETS: dict[str, HATRPOConfig] = {
@@ -39,7 +39,7 @@ TASK_PRESETS = {
 
 
 class HATRPO(Sequential):
-    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HATRPO, TRPO with agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name = "hatrpo"
     remedy = "lower max_kl or critic_learning_rate"

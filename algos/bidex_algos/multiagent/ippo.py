@@ -1,4 +1,4 @@
-"""IPPO: PPO of several agents, each with a critic of its own observations (de Witt et al. 2020; appendix B.2.1).
+"""IPPO: PPO of several agents, each with a critic on its own observations (de Witt et al. 2020; appendix B.2.1).
 
 IPPO differs from MAPPO only in the critics: each agent has its own values, returns and advantages, normalised per task.
 """

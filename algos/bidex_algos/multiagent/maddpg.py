@@ -1,8 +1,8 @@
 """MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
 
-Each agent i climbs Q(x, a_1, ..., mu_i(o_i), ..., a_n) with the other agents' actions from the replay; the rest is
-DDPG. The original has a critic for each agent because rewards may differ. Here the agents share rewards, so all critics
-would be equal and there is only one.
+Each agent i maximises Q(x, a_1, ..., mu_i(o_i), ..., a_n) with the other agents' actions from the replay. Everything
+else is as in DDPG. The original has a critic for each agent because rewards may differ. Here the agents share rewards,
+so one critic is enough.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ class MADDPGConfig(DDPGConfig):
     """All options of MADDPG; the defaults are the preset ``laptop``."""
 
     agents: Partition = "hands"
-    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
-    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+    """Division of the hands into agents: hands (two agents), fingers (twelve: five fingers and the palm of each hand),
+    single (one), a TOML file with a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

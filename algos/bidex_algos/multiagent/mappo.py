@@ -1,7 +1,7 @@
 """MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
 
-MAPPO with one agent equals MT-PPO. In each mini-batch every agent climbs its own clipped surrogate. All agents share
-one advantage, normalised per task like the returns.
+MAPPO with one agent equals MT-PPO. In each mini-batch every agent maximises its own clipped surrogate. All agents share
+one advantage, which is normalised per task, as the returns are.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,8 @@ class MAPPOConfig(MultiAgentPPOConfig):
     """All options of MAPPO; the defaults are the preset ``laptop``."""
 
     share_parameters: bool = False
-    """Share one network between agents with equal observation groups and action sizes; it sees who acts."""
+    """Share one network between agents with equal sizes of observation groups and actions. The input of this network
+    includes a one-hot of the agent."""
 
 
 PRESETS: dict[str, MAPPOConfig] = {

@@ -1,4 +1,4 @@
-"""One network per agent on its own observations; agents of one form are computed in one pass."""
+"""One network per agent on its own observations; agents with inputs and outputs of equal size share a forward pass."""
 
 import math
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` per agent; with ``share`` one per form (columns of groups, actions) that sees which agent acts.
+    """One :class:`MLP` per agent; agent i has network ``nets[net_of[i]]``.
 
-    Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
+    Agents with equal sizes of observation groups and actions form a family (``families``). With ``share`` a family has
+    one network, whose input includes a one-hot of the agent.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class Team(nn.Module):
         self.nets = nn.ModuleList(made)
 
     def output(self, agent: int, x: Tensor) -> Tensor:
-        """Return one agent's network output for normalised observations (B, d): float32 (B, its outputs)."""
+        """Return one agent's network output for normalised observations (B, d): float32 (B, outputs[agent])."""
         return self.nets[self.net_of[agent]](self.seen(agent, x))
 
     def outputs(self, x: Tensor) -> list[Tensor]:
@@ -115,7 +116,7 @@ class TeamActor(Team):
 
     @property
     def own(self) -> list[Tensor]:
-        """Return each agent's indices of the world's actions."""
+        """Return, for each agent, the indices of its actions in the world's action."""
         return list(self._taken.split(self._sizes))
 
     @property
@@ -150,8 +151,8 @@ class TeamActor(Team):
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """Return the logarithms of standard deviations for observations (B, d).
 
-        The shape is (a,) with one head, otherwise (B, a). The values are rows of ``log_std``; None stands for the
-        network's own ``log_std``.
+        The shape is (a,) with one head, otherwise (B, a). The values are rows of the argument ``log_std``, by default
+        of the attribute ``log_std``.
         """
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 

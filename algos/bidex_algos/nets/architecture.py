@@ -1,4 +1,4 @@
-"""The choice of the network between observation and output, and the critics of actions that are built from it."""
+"""The choice of the network between observation and output, and the critics that are built from such networks."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +20,7 @@ _TRUNKS: dict[str, MakeNetwork] = {
     "soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer,
     "towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0),
 }  # fmt: skip
-_MODULES = 4  # modules of a layer of soft_modules, parameter sets of paco, experts of moore, heads of attention
+_MODULES = 4  # modules per layer of soft_modules, parameter sets of paco, experts of moore, attention heads
 
 
 class Networks(Protocol):
@@ -52,16 +52,16 @@ class NetworkConfig(LearnerConfig):
     """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
-    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
-    heads. All but shared for MT suites, whose observations show the task."""
-    hidden: Layers = (256, 256)  # Widths of the hidden layers, of actor and critics alike.
+    """shared: one trunk for all tasks. multi_head: the same trunk with policy_heads and value_heads. towers: tasks
+    share only the first layer. separate: tasks share no layer. soft_modules, paco, moore, transformer: other trunks,
+    each with or without heads. All except shared need an MT suite, whose observations show the task."""
+    hidden: Layers = (256, 256)  # Widths of the hidden layers, the same for actor and critics.
     activation: Activation = "relu"  # Non-linearity of the hidden layers.
     policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
     task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    """Size of a learned vector that each network reads instead of the task's one-hot; 0: networks read the one-hot."""
     point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    """Widths of the layers that all points of a point cloud share (PointNet), if the world shows a point cloud."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,13 +114,16 @@ def network_of(config: Networks) -> MakeNetwork:
 
 
 def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
-    """Return the bytes of ``copies`` networks on observations of a ``width``, with gradient and Adam's two moments."""
+    """Return the bytes that ``copies`` networks take with their gradients and Adam's two moments.
+
+    ``width`` is the number of entries of an observation.
+    """
     widths = (width, *hidden)
     return 4 * 4 * copies * sum(a * b for a, b in zip(widths, hidden, strict=False))
 
 
 class Critics(nn.Module):
-    """``count`` networks of observation and action that differ only in their initial weights.
+    """``count`` critics: networks of observation and action that differ only in their initial weights.
 
     ``inputs`` are the groups of observation and action together; ``heads`` is the number of outputs of each network,
     one per task or 1. Two networks reduce overestimation (Fujimoto et al. 2018).
@@ -137,7 +140,7 @@ class Critics(nn.Module):
         self.nets = nn.ModuleList(network(*given) for _ in range(count))
 
     def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Return values of actions: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
+        """Return values (count, B) of actions (B, a) for normalised observations (B, d) and tasks (B,)."""
         x = torch.cat([obs, actions], dim=1)
         all_values = torch.stack([net(x) for net in self.nets])
         if self.heads == 1:
@@ -147,6 +150,6 @@ class Critics(nn.Module):
 
 @torch.no_grad()
 def follow(target: nn.Module, network: nn.Module, tau: float) -> None:
-    """Move a target network a share ``tau`` of the way to its network (Polyak averaging)."""
+    """Move the weights of ``target`` a share ``tau`` of the way to those of ``network`` (Polyak averaging)."""
     for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
         behind.lerp_(ahead, tau)

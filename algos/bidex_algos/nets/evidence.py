@@ -1,8 +1,8 @@
-"""Inference of a goal from rewards: a reward model for any goal, candidate goals, and a policy on their belief.
+"""Inference of a goal from rewards by a reward model, and a policy that acts on the resulting belief.
 
-The model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348) for a goal whose numbers are known in
-training. The belief follows from Bayes' rule: the memory holds the log-likelihood of each fixed candidate, and every
-rewarded step adds its own log-likelihood.
+The reward model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348), but it reads the goal, which
+is known in training, instead of a latent variable. The belief follows from Bayes' rule: the memory holds the
+log-likelihood of each fixed candidate, and every rewarded step adds its log-likelihood to this sum.
 """
 
 import math
@@ -33,10 +33,10 @@ def spread(count: int, size: int) -> Tensor:
 
 
 class BeliefNet(nn.Module):
-    """A model of rewards, and an actor that is given a goal; ``hidden`` are the model's layers for an observation.
+    """A reward model and an actor, which both read a goal; ``hidden`` are the model's layers for an observation.
 
-    With more than one of ``classes``, whose numbers the observation does not show, a third network predicts the class.
-    Each class has its own weights for a goal in the model, and its own layers of the actor after the first.
+    The observation does not show the class. If there is more than one of ``classes``, a third network predicts it. In
+    the model each class has its own weights for the goal. In the actor each class has its own layers after the first.
     """
 
     def __init__(
@@ -70,7 +70,8 @@ class BeliefNet(nn.Module):
     def pays(self, seen: Tensor, goals: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
         """Predict mean and log standard deviation (B, g) of the rewards for goals (B, g, n) or (g, n).
 
-        The states are (B, d), their classes (B,); all numbers are normalised.
+        ``seen`` are observations (B, d), ``task`` are their classes (B,). Observations, goals and rewards are
+        normalised.
         """
         if self.classes == 1:
             wanted = self.goal(goals)
@@ -82,7 +83,7 @@ class BeliefNet(nn.Module):
         return mean, log_std.clamp(-6.0, 2.0)
 
     def act(self, seen: Tensor, goal: Tensor, task: Tensor) -> Tensor:
-        """Return mean actions (B, actions) for normalised observations and goals, in states of classes (B,)."""
+        """Return mean actions (B, actions) for normalised observations (B, d), goals (B, n) and classes (B,)."""
         given = torch.cat([seen, goal], dim=1)
         if self.classes == 1:
             return self.head(given)
@@ -94,7 +95,7 @@ class BeliefNet(nn.Module):
 
 
 class Belief(Protocol):
-    """Infers the goal, of n normalised numbers, from rewards: a belief over a fixed list of candidates."""
+    """Infers the goal, n numbers in [-1, 1], from rewards: a belief over a fixed list of candidates."""
 
     @property
     def candidates(self) -> Tensor:
@@ -102,7 +103,10 @@ class Belief(Protocol):
         ...
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return log-likelihoods (N, C) of rewards (N,) that led to raw observations (N, d); 0 if not ``known``."""
+        """Return log-likelihoods (N, C) of the last rewards (N,); 0 if a reward is not ``known``.
+
+        ``obs`` are the raw observations (N, d) after the rewarded step.
+        """
         ...
 
     def believed(self, state: Tensor) -> Tensor:
@@ -111,7 +115,7 @@ class Belief(Protocol):
 
 
 class ModelBelief:
-    """The belief by the reward model of a policy's ``actor``, over ``actor.candidates``.
+    """The belief over ``actor.candidates`` that the reward model of a policy's ``actor`` implies.
 
     Each log-likelihood is multiplied by ``trust``, because the model's errors in successive steps are correlated.
     """
@@ -128,7 +132,7 @@ class ModelBelief:
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
         """Return the log-likelihoods that :class:`Belief` describes.
 
-        The evidence takes most of a step's time, so unknown rewards are skipped on the CPU, where a host sync is free.
+        This takes most of a step's time. On the CPU, where a host sync is free, unknown rewards are therefore skipped.
         """
         if maths.may_look(known.device):
             found = torch.zeros(len(obs), len(self.candidates))
@@ -150,10 +154,10 @@ class ModelBelief:
 
 
 class BeliefPolicy(RecurrentPolicy):
-    """A policy that acts on its belief about the goal; when it explores, on a candidate drawn from the belief.
+    """A policy that acts on its belief about the goal; an exploring policy acts on a candidate drawn from the belief.
 
-    ``actor`` is a :class:`BeliefNet`. The memory (N, candidates) sums the evidence of the steps. A candidate is tried
-    for ``try_steps`` steps on average.
+    ``actor`` is a :class:`BeliefNet`. The memory (N, candidates) sums the evidence of the steps. A drawn candidate is
+    kept for ``try_steps`` steps on average.
     """
 
     actor: BeliefNet
@@ -165,7 +169,7 @@ class BeliefPolicy(RecurrentPolicy):
         """Make the networks and the belief.
 
         Args:
-            inputs: As of :class:`RecurrentPolicy`, like ``actions`` and ``rest``.
+            inputs: Inputs of the networks, as for :class:`RecurrentPolicy`.
             actions: Number of actions.
             candidates: Number of candidates of the actor.
             goals: Number of entries of a goal.
@@ -180,9 +184,10 @@ class BeliefPolicy(RecurrentPolicy):
         self.belief: Belief = belief or ModelBelief(self, trust)
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
-        """Draw the candidate that each of ``rows`` environments tries.
+        """Draw the candidate on which each of ``rows`` environments acts when it explores.
 
-        The result (rows, 1) is a position in [0, 1) within the cumulative probabilities of the candidates.
+        The result (rows, 1) is a position in [0, 1) within the cumulative probabilities of the candidates. A row keeps
+        its ``last`` position with a probability of 1 - 1 / ``try_steps``.
         """
         device = self.log_std.device
         new, again = torch.rand(2, rows, 1, generator=generator, device=device)
@@ -192,7 +197,7 @@ class BeliefPolicy(RecurrentPolicy):
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return mean actions and state as in the base class; a row with negative ``drawn`` tries no candidate."""
+        """Return mean actions and state as in the base class; a row with negative ``drawn`` does not explore."""
         known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
         goal = self.belief.believed(state)

@@ -14,7 +14,7 @@ from bidex_meta.world.contract import ObservationGroup, plain_groups
 
 
 class Columns(nn.Module):
-    """Reads and writes some columns, in ascending order, of tensors (..., d); checkpoints do not contain it."""
+    """Reads and writes some columns, in ascending order, of tensors (..., d); adds nothing to checkpoints."""
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
@@ -41,8 +41,8 @@ class Columns(nn.Module):
 
 
 MakeEncoder = Callable[[int, torch.Generator], nn.Module]
-"""Makes an encoder for a group, given its number of entries and a CPU generator for the weights: a module that maps
-(..., entries) to (..., ``size``) and has the attribute ``size``."""
+"""Makes an encoder for a group, given the group's number of entries and a CPU generator for the weights. The encoder is
+a module that maps (..., entries) to (..., ``size``) and has the attribute ``size``."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,14 @@ class Inputs:
 
     @classmethod
     def of(cls, inputs: "int | Inputs") -> "Inputs":
-        """Return ``inputs``; an integer becomes a single kind of that many columns."""
+        """Return ``inputs``; an integer becomes a single group with this number of columns."""
         if isinstance(inputs, int):
             return cls(plain_groups(inputs, 0))
         return inputs
 
     @property
     def width(self) -> int:
-        """Return the columns of the observation, d."""
+        """Return d, the number of columns of the observation."""
         return sum(group.size for group in self.groups)
 
     def columns(self, *names: str) -> Columns:
@@ -81,12 +81,12 @@ class Inputs:
         return Columns(chain.from_iterable(ranges[name] for name in names))
 
     def extended(self, name: str, size: int) -> "Inputs":
-        """Append a group behind the others, for example the actions that a critic judges."""
+        """Append a group after all other groups, for example the actions that a critic judges."""
         end = slice(self.width, self.width + size)
         return replace(self, groups=(*self.groups, ObservationGroup(name, (end,))))
 
     def encoded(self, name: str, make: MakeEncoder, scaled: bool = True) -> "Inputs":
-        """Add an encoder for a group; if not ``scaled``, running statistics leave its columns unchanged."""
+        """Add an encoder for a group; if not ``scaled``, the group's columns are not normalised."""
         if scaled:
             unscaled = self.unscaled
         else:
@@ -124,7 +124,7 @@ class GroupEncoder(nn.Module):
         self.identity = self.plain.size == inputs.width
 
     def forward(self, x: Tensor) -> Tensor:
-        """Encode (..., d)."""
+        """Encode observations (..., d) as (..., size)."""
         if self.identity:
             return x
         encoded = [encoder(self.columns[name](x)) for name, encoder in self.groups.items()]
@@ -132,7 +132,10 @@ class GroupEncoder(nn.Module):
 
 
 class TaskEmbedding(nn.Module):
-    """Maps the one-hot of a task (..., tasks) to its vector (..., size), drawn from N(0, 1); ``unit``: of length 1."""
+    """Maps the one-hot of a task (..., tasks) to a learned vector of the task (..., size).
+
+    The entries of the vectors are initially drawn from N(0, 1). If ``unit``, the vectors are scaled to length 1.
+    """
 
     def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):
         super().__init__()
@@ -150,7 +153,7 @@ class TaskEmbedding(nn.Module):
 
 
 def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
-    """Encode the task by an embedding of ``size`` entries, of length 1 if ``unit``; 0 leaves ``inputs`` unchanged."""
+    """Add a :class:`TaskEmbedding` with ``size`` entries; a ``size`` of 0 leaves ``inputs`` unchanged."""
     if size:
         return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit))
     return inputs

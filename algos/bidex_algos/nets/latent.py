@@ -12,15 +12,15 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 
 _NOT_NOTED = ("right_hand", "left_hand", "padding", "task_id")
-"""Groups hidden from the encoder: given the hands, it memorises fifty tasks instead of reading the rewards."""
+"""Groups that the encoder does not read. An encoder that reads the hands memorises fifty tasks and ignores rewards."""
 
 
 class LatentPolicy(SquashedPolicy):
     """A policy whose ``actor`` reads normalised observations followed by a latent variable of ``size`` entries.
 
-    The posterior is the unit Gaussian times a Gaussian factor for each transition of the task, which an ``encoder``
-    computes from (s, a, r, s'). Two sums therefore define it, of precisions and of precisions times means, both 0 at
-    first.
+    The posterior is the unit Gaussian times one Gaussian factor per transition of the task. An ``encoder`` computes the
+    factor from (s, a, r, s'). Two sums over the transitions therefore define the posterior: the sum of precisions and
+    the sum of precisions times means. Both are 0 before the first transition.
     """
 
     def __init__(
@@ -36,14 +36,14 @@ class LatentPolicy(SquashedPolicy):
         self.encoder = MLP(transition, hidden, 2 * size, 1.0, generator, activation)
 
     def compressed(self, reward: Tensor) -> Tensor:
-        """Compress rewards (...) to the input (..., 1) of ``rewards``.
+        """Compress rewards (...) to inputs (..., 1) of the normaliser ``rewards``.
 
-        Rewards of unknown classes differ by orders of magnitude.
+        Rewards are compressed because those of unknown classes differ by orders of magnitude.
         """
         return torch.asinh(reward / self.reward_unit)[..., None]
 
     def evidence(self, obs: Tensor, actions: Tensor, reward: Tensor, next_obs: Tensor) -> Tensor:
-        """Return each transition's addend to the sums (..., 2 * size).
+        """Return the terms that each transition adds to the two sums, (..., 2 * size).
 
         Observations (..., d) and rewards (...) are raw.
         """

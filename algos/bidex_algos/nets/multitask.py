@@ -1,4 +1,7 @@
-"""Trunks that replace an ``MLP``: MOORE, PaCo, soft modules and towers divide weights among tasks; a transformer."""
+"""Trunks that replace an ``MLP``.
+
+MOORE, PaCo, soft modules and towers divide weights among tasks. The transformer attends to groups of the observation.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +19,7 @@ from bidex_meta.utils import maths
 
 
 class StackedLinear(nn.Module):
-    """``count`` (K) parallel linear layers of the same size, with orthogonal weights of a ``gain``, zero biases."""
+    """``count`` (K) parallel linear layers of the same size, with orthogonal weights (``gain``) and zero biases."""
 
     def __init__(
         self, count: int, inputs: int, outputs: int, gain: float, generator: torch.Generator, bias: bool = True
@@ -31,7 +34,7 @@ class StackedLinear(nn.Module):
             nn.init.orthogonal_(layer, gain, generator=generator)
 
     def each(self) -> list[Callable[[Tensor], Tensor]]:
-        """Return the layers one by one: (batch, inputs) to (batch, outputs)."""
+        """Return each layer as a function that maps (batch, inputs) to (batch, outputs)."""
         if self.bias is None:
             biases = [None] * len(self.weight)
         else:
@@ -51,9 +54,9 @@ class StackedLinear(nn.Module):
 
 
 class TaskWeights(nn.Module):
-    """``count`` (K) numbers for each task, selected by its one-hot.
+    """``count`` (K) mixture weights for each task, selected by the task's one-hot.
 
-    The numbers of a task are drawn with length 1, so that mixtures keep their size.
+    Initially the weights of a task are a random vector of length 1, so that a mixture is as large as its parts.
     """
 
     def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
@@ -63,7 +66,7 @@ class TaskWeights(nn.Module):
         self.rows = nn.Parameter(drawn / drawn.norm(dim=1, keepdim=True))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the numbers (batch, K), float32, of the tasks of observations (batch, d)."""
+        """Return the weights (batch, K), float32, for the tasks in observations (batch, d)."""
         with torch.autocast(x.device.type, enabled=False):  # a bfloat16 weight would round means by 0.4 %
             return self.one_hot(x).to(self.rows.dtype) @ self.rows
 
@@ -104,9 +107,9 @@ def gram_schmidt(vectors: Tensor) -> Tensor:
 class Moore(Headed):
     """MOORE: a mixture of orthogonal experts (Hendawy et al. 2024).
 
-    y = head(V w_k), with V the Gram-Schmidt basis of K experts' representations of a state and w_k task k's weights of
-    the experts. The task's one-hot selects w_k and is not fed to the experts. Heads per task are the paper's multi-head
-    variant.
+    The output is y = head(V w_k). The columns of V are K experts' representations of a state, made orthonormal by
+    Gram-Schmidt; w_k are the weights of the experts in task k. The task's one-hot selects w_k and is not fed to the
+    experts. Heads per task are the paper's multi-head variant.
 
     Our additions: the mixture is multiplied by the root of its width, so that its entries are as large as the entries
     of another layer, and passes through the config's non-linearity; w starts as a random direction of length 1.
@@ -182,11 +185,11 @@ class PaCo(nn.Module):
 class SoftModules(Headed):
     """Soft modularisation: layers of modules, with soft routes between them for each task (Yang et al. 2020).
 
-    Let e = f(s) * h(k), entry by entry. Then p^1 = D^1 relu(e), p^l+1 = D^l+1 relu(U^l p^l * e) are logits of the
-    routes, and the input of module i is g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first entry of ``hidden`` is the
-    width of f(s); each further entry is the width of a layer of modules. Our changes: the head weights the modules of
-    the last layer, while the paper adds them up; f is one layer; modules have the config's non-linearity. We omit the
-    weighting of losses by temperature.
+    Let f(s) and h(k) be embeddings of state s and task k, and e their product, entry by entry. The logits of the routes
+    are p^1 = D^1 relu(e) and p^l+1 = D^l+1 relu(U^l p^l * e), and the input of module i is g_i = sum_j softmax_j(p_ij)
+    relu(W_j g_j). The first entry of ``hidden`` is the width of f(s); each further entry is the width of a layer of
+    modules. Our changes: the head weights the modules of the last layer, while the paper adds them up; f is one layer;
+    modules have the config's non-linearity. We omit the weighting of losses by temperature.
     """
 
     def __init__(
@@ -210,9 +213,9 @@ class SoftModules(Headed):
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def routes(self, x: Tensor, state: Tensor) -> list[Tensor]:
-        """Return shares (batch, receiving modules, giving modules) between layers, with sum 1.
+        """Return the weights of the routes from each layer, (batch, receiving modules, sending modules).
 
-        ``state`` (batch, width) is the embedding of x.
+        The weights of a receiving module sum to 1. ``state`` (batch, width) is the embedding of x.
         """
         both = state * self.task(self.one_hot(x).to(state.dtype))
         logits = self.down[0](both.relu())
@@ -223,7 +226,7 @@ class SoftModules(Headed):
         return [each.unflatten(1, (-1, self.modules_of_layer)).softmax(-1) for each in found]
 
     def embedded(self, x: Tensor) -> Tensor:
-        """Return embeddings of the states of observations (batch, inputs): (batch, width)."""
+        """Return embeddings (batch, width) of the states in observations (batch, inputs)."""
         return self.between(self.state(self.encoder(x)))
 
     def features(self, x: Tensor) -> Tensor:

@@ -16,9 +16,9 @@ from bidex_meta.utils.validation import Width
 Activation = Literal["elu", "relu", "tanh"]
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
-Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; none makes a linear map
+Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; without any, a map is linear
 MakeNetwork = Callable[..., Any]
-"""Takes the arguments of :class:`MLP`; the result has ``output_bias``, the biases of the output (outputs,)."""
+"""Makes a network from the arguments of :class:`MLP`; its ``output_bias`` are the biases of the output (outputs,)."""
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
@@ -71,7 +71,10 @@ class Headed(nn.Module):
 
 
 class MLP(Headed):
-    """Fully connected network: zero biases, orthogonal weights of gain sqrt 2 and, in the output, ``output_gain``."""
+    """Fully connected network with orthogonal weights and zero biases.
+
+    The gain of the weights is sqrt 2 in the hidden layers and ``output_gain`` in the output layer.
+    """
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
@@ -121,7 +124,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 
 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
-    """Make a layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
+    """Make a layer with zero biases and with orthogonal weights (``gain``), drawn from a CPU generator."""
     # The layer is made without memory first: the default initialisation would draw from the global generator.
     layer = Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
@@ -130,7 +133,7 @@ def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -
 
 
 def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
-    """Select from outputs (..., heads * n) the outputs (..., n) of the head that a one-hot (..., heads) names."""
+    """Select from outputs (..., heads * n) the outputs (..., n) of the head that a one-hot (..., heads) marks."""
     if heads == 1:
         return out
     with torch.autocast(out.device.type, enabled=False):  # like the output layer: means would be rounded
@@ -148,8 +151,8 @@ def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
 class GaussianActor(nn.Module):
     """Diagonal Gaussian: a network computes the mean; the standard deviations do not depend on the state.
 
-    With several heads the group ``task_id`` selects the head. ``log_std`` is (actions,), or (heads, actions) with
-    several.
+    With several heads the group ``task_id`` selects the head. ``log_std`` is (actions,) with one head and
+    (heads, actions) with several.
     """
 
     def __init__(
@@ -171,7 +174,7 @@ class GaussianActor(nn.Module):
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """Return log standard deviations for observations (batch, d): (actions,) with one head, else (batch, actions).
 
-        The values are rows of ``log_std``; None stands for the network's own ``log_std``.
+        The values are rows of the argument ``log_std``, by default of the attribute ``log_std``.
         """
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 

@@ -9,7 +9,7 @@ from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.training.distributed import pool_moments
 from bidex_meta.training.learner import LearnerConfig
 
-_FLOOR = 3e-3  # of a standard deviation: a column that was constant so far must not amplify noise a thousandfold
+_FLOOR = 3e-3  # least standard deviation, so that a column that was constant so far does not amplify noise too much
 _FOREVER = 1e18  # a count so large that further observations have no weight
 
 
@@ -44,14 +44,17 @@ class RunningStats(nn.Module):
         return (self.var + floor**2).sqrt()
 
     def normalise(self, x: Tensor, element: Tensor) -> Tensor:
-        """Scale ``x`` (..., n) to zero mean and unit variance by the statistics of each entry's element, int64 (n,)."""
+        """Scale ``x`` (..., n) to zero mean and unit variance.
+
+        ``element``, int64 (n,), is the element of the statistics that applies to each column.
+        """
         return (x - self.mean.float()[element]) / self.std().float()[element]
 
     def restore(self, x: Tensor, element: Tensor) -> Tensor:
         """Invert :meth:`normalise` for ``x`` (..., n); the result is 0 if the element has no statistics yet.
 
-        An untrained critic outputs numbers of about 1, which may be a hundred times a return. The first statistics
-        would be of these outputs, and a hundred iterations would be needed to forget them.
+        An untrained critic outputs numbers of about 1, which may be a hundred times a return. If these outputs entered
+        the first statistics, a hundred iterations would be needed to forget them.
         """
         return (x * self.std().float()[element] + self.mean.float()[element]) * (self.count > 0)[element]
 
@@ -84,7 +87,7 @@ class ObservationNormaliser(nn.Module):
         return ((obs - self.shift) * self.scale).clamp_(-self.clip, self.clip)
 
     def some(self, obs: Tensor, columns: Columns) -> Tensor:
-        """Normalise only some columns (..., n)."""
+        """Normalise observations (..., n) that consist of only the given columns."""
         if not self.enabled:
             return obs
         return ((obs - columns(self.shift)) * columns(self.scale)).clamp_(-self.clip, self.clip)
@@ -106,7 +109,10 @@ class ObservationNormaliser(nn.Module):
 
     @torch.no_grad()
     def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
-        """Add moments of raw observations, of all processes, to the statistics: (measured columns,) each."""
+        """Add the moments of raw observations of all processes to the statistics.
+
+        Mean, variance and count have the shape of the statistics.
+        """
         if not self.enabled:
             return
         self.stats.merge(*pool_moments(mean, var, count))
@@ -123,7 +129,7 @@ def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) ->
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Normalises by the statistics of each of ``tasks`` tasks, which the group ``task_id`` identifies."""
+    """Normalises an observation by the statistics of its task, one of ``tasks``, which the group ``task_id`` shows."""
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)

@@ -13,16 +13,17 @@ from bidex_algos.nets.products import Linear
 from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
 
-POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
-_SPREAD = 0.2  # metres; divides distances from a cloud's centre: about a hand's length
-_CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
+POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are point clouds, and the values per point
+_SPREAD = 0.2  # metres, about a hand's length; distances from a cloud's centre are divided by this length
+_CACHED = 1 << 19  # number of outputs of a layer that a CPU computes at once
 
 
 class PointNet(nn.Module):
-    """Maps clouds (..., entries) to features (..., size): the maximum of each over all points, and the centre (metres).
+    """Maps point clouds (..., entries) to features (..., size).
 
-    Points of ``channels`` numbers, position first, enter relative to the centre of their cloud, so that the first
-    layers see shapes rather than the position of the hands.
+    The features are the maximum of each learned feature over all points, and the centre of the cloud (metres). A point
+    has ``channels`` values; the first three are its position. The layers read positions relative to the cloud's centre,
+    so that they see shapes rather than the place of the hands.
     """
 
     def __init__(self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3):
@@ -38,7 +39,7 @@ class PointNet(nn.Module):
         self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
 
     def forward(self, x: Tensor) -> Tensor:
-        """Encode clouds."""
+        """Encode point clouds (..., entries) as (..., size)."""
         cloud = x.unflatten(-1, (-1, self.channels))
         place = cloud[..., :3]
         rest = cloud[..., 3:]
@@ -76,7 +77,7 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
-    """Add a PointNet for unscaled clouds; raise BidexError if the config has no ``point_widths``."""
+    """Add a PointNet for each point cloud, which is not normalised; raise BidexError without ``point_widths``."""
     options = vars(config)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)

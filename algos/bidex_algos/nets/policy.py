@@ -34,12 +34,12 @@ class ActorPolicy(nn.Module):
 
     @classmethod
     def made_of(cls, actor: nn.Module, config: Any, inputs: Inputs, shape: Shape, device: torch.device) -> Self:
-        """Make the policy of an actor, with the statistics and the precision that a learner's config asks for."""
+        """Make the policy of an actor, with the statistics and the precision that a learner's config requires."""
         observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return cls(observations, actor, use_bfloat16(config.autocast, device))
 
     def reset(self, env_mask: Tensor) -> None:
-        """Do nothing: no state has to be forgotten between episodes; the argument is part of the Agent protocol."""
+        """Do nothing, because the policy has no state; the argument is part of the Agent protocol."""
 
 
 class GaussianPolicy(ActorPolicy):
@@ -140,8 +140,8 @@ def deterministic_policy(
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Return the log-density of the action tanh(raw), with raw drawn from N(mean, exp(log_std)^2).
 
-    The argument is the value before squashing, (..., a) to (...), because in float32 tanh rounds to 1 at 9 and above,
-    and then has no finite inverse.
+    ``raw`` (..., a) is the value before squashing, and the result is (...). The squashed action is not enough, because
+    in float32 tanh rounds to 1 at 9 and above, and 1 has no finite inverse.
     """
     # log(1 - tanh(u)^2), written without a difference of almost equal numbers.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
@@ -157,8 +157,8 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 class SquashedActor(nn.Module):
     """Mean and log standard deviation, before squashing, from one network.
 
-    The log standard deviation moves between its bounds on a tanh. Beyond a hard clamp it would have no gradient and
-    never return.
+    A tanh keeps the log standard deviation between its bounds. With a hard clamp, a value beyond a bound would have no
+    gradient and would never return.
     """
 
     def __init__(

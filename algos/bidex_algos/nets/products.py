@@ -1,4 +1,4 @@
-"""The products of layers with weights, by the faster of the two libraries that PyTorch uses on a CPU.
+"""Products of inputs with a layer's weights, by the faster of the two libraries that PyTorch uses on a CPU.
 
 PyTorch prefers MKL, which does not use AVX-512 on AMD's processors. On these, oneDNN is more than twice as fast with
 the same precision: MT-PPO learned for 0.57 instead of 0.90 s per iteration (one core, preset ``laptop``).
@@ -14,7 +14,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-_LEAST = 1 << 21  # multiplications from which oneDNN is faster; below, the call's overhead exceeds the gain
+_LEAST = 1 << 21  # least number of multiplications for oneDNN; with fewer, the call's overhead exceeds the gain
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -32,7 +32,7 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Pad both with zero columns to a multiple of eight; otherwise cuBLAS takes a slow bfloat16 kernel of older GPUs.
+    """Pad inputs and weights with zero columns to a multiple of eight; otherwise cuBLAS chooses a slow bfloat16 kernel.
 
     With 422 columns the first layer took 51 of the 106 ms of MT-PPO's products on an H200, although it has only 18 % of
     the multiplications.
@@ -57,7 +57,10 @@ def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Ten
 
 
 def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]]) -> Tensor:
-    """Apply to each row (B, inputs) the one of ``layers`` at ``index``, int64 (B,): (B, outputs); needs a host sync."""
+    """Apply to each row of ``x`` (B, inputs) the layer ``layers[index]`` and return (B, outputs); needs a host sync.
+
+    ``index``, int64 (B,), has one entry per row.
+    """
     sizes = torch.bincount(index, minlength=len(layers)).tolist()
     in_order = bool((index[1:] >= index[:-1]).all())  # batches drawn task by task need no reordering
     if in_order:
@@ -72,10 +75,10 @@ def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]
 
 
 def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int) -> Tensor:
-    """Apply to each row its own layer: (B, inputs), (heads * n, inputs), (heads * n,), int64 (B,) to (B, n).
+    """Apply to each row of ``x`` (B, inputs) the output layer of its head ``index``, int64 (B,), and return (B, n).
 
-    The function needs a host sync. With twenty heads of 52 actions it takes a twentieth of the time that all heads take
-    on all rows.
+    ``weight`` (heads * n, inputs) and ``bias`` (heads * n,) hold the layers of all heads. The function needs a host
+    sync. With twenty heads of 52 actions it takes a twentieth of the time of applying all heads to all rows.
     """
     layers = zip(weight.unflatten(0, (heads, -1)), bias.unflatten(0, (heads, -1)), strict=True)
     return by_own(x, index, [partial(affine, weight=each, bias=offset) for each, offset in layers])
@@ -90,7 +93,10 @@ class Linear(nn.Linear):
 
 
 class _Affine(torch.autograd.Function):
-    """oneDNN's product, which has no gradient of its own; the gradients here are products, so they have one too."""
+    """oneDNN's product with the gradient that PyTorch's operation lacks.
+
+    The gradient consists of calls of :func:`affine`, so that it can be differentiated again.
+    """
 
     generate_vmap_rule = True
 

@@ -13,11 +13,12 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 
 
 class RecurrentNet(nn.Module):
-    """An encoder, a GRU on its features, and a linear output of both, so that a reflex can bypass the memory.
+    """An encoder, a GRU on the encoder's features, and a linear output layer.
 
-    All layers are float32, because a memory would carry the rounding of bfloat16 on. At the start the memory's numbers
-    fade over 2 to ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv
-    1804.11188).
+    The output layer reads both the features and the GRU's output, so that a reaction to the current step need not pass
+    through the memory. All layers are float32, because rounding to bfloat16 would accumulate in the memory. Before
+    training, the entries of the memory fade over 2 to ``lasting`` + 1 steps, and the logarithms of these times are
+    evenly spaced (after Tallec and Ollivier 2018, arXiv 1804.11188).
     """
 
     def __init__(
@@ -40,9 +41,9 @@ class RecurrentNet(nn.Module):
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after them.
+        """Return outputs (T, B, outputs) for inputs (T, B, inputs), and the memory (B, memory) after these steps.
 
-        ``state`` is the memory before the steps.
+        ``state`` is the memory before these steps.
         """
         features = self.encoder(x)
         remembered, last = self.gru(features, state[None].contiguous())
@@ -53,8 +54,8 @@ class RecurrentNet(nn.Module):
 class Memory:
     """The values that each environment carries over from the previous step; zeros at first.
 
-    ``state`` (N, memory) belongs to the network. The action (N, a) is executed clamped to [-1, 1]. ``known`` (N,) is
-    whether the policy is shown the reward (N,); ``done`` (N,) is whether the step ended an episode.
+    ``state`` (N, memory) is the network's memory. ``action`` (N, a) is not clamped yet; the world clamps it to [-1, 1].
+    ``known`` (N,) marks rewards (N,) that the policy sees. ``done`` (N,) marks steps that ended an episode.
     """
 
     state: Tensor
@@ -72,9 +73,9 @@ class Memory:
 class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory reads observation, last action, last reward and end of episode.
 
-    Rewards of unknown classes differ by orders of magnitude, so all rewards enter as asinh(reward / ``reward_unit``),
-    normalised by running statistics. ``inputs`` is extended by a group ``last_step`` of all inputs besides the
-    observation; ``make_actor`` gets the result.
+    Rewards of unknown classes differ by orders of magnitude, so all rewards are read as asinh(reward /
+    ``reward_unit``), normalised by running statistics. A group ``last_step``, which holds all inputs besides the
+    observation, is appended to ``inputs``; ``make_actor`` makes the actor from the extended inputs.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class RecurrentPolicy(nn.Module):
         return mean[0], state
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor | None:
-        """Draw what each of ``rows`` exploring environments tries next, given the ``last`` draw; None if nothing."""
+        """Return None; a subclass may draw what each of ``rows`` environments tries next, given the ``last`` draw."""
         return None
 
     def fresh_memory(self, rows: int) -> Memory:

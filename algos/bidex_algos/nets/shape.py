@@ -10,15 +10,15 @@ from bidex_meta.world.contract import ObservationGroup, VectorWorld
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of a world's spaces, observations (d) and actions (a), and the named parts of its observation."""
+    """Sizes of a world's observations (d) and actions (a), and the named parts of an observation."""
 
     observations: int
     actions: int
     groups: tuple[ObservationGroup, ...]
     hidden: int = 0
-    """Numbers of a task that the world knows and does not show: those of goals in a meta suite."""
+    """Number of hidden values per task, which the world does not show: the goal in a meta suite."""
     classes: int = 1
-    """Classes that the observation does not name; 1 where it has the task's one-hot."""
+    """Number of classes that the observation does not tell apart; 1 if the observation has the task's one-hot."""
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
@@ -35,7 +35,7 @@ class Shape:
 
     @property
     def num_id_columns(self) -> int:
-        """Return the entries of the task's one-hot, 0 if the observation has none."""
+        """Return the number of entries of the task's one-hot; 0 if the observation has no one-hot."""
         return sum(group.size for group in self.groups if group.name == "task_id")
 
     def sizes(self) -> dict[str, int]:
@@ -84,7 +84,7 @@ def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: S
 
 
 def check_discounts(name: str, world: VectorWorld, by_class: bool) -> None:
-    """Raise BidexError if classes of a suite have their own discounts and the learner has a single one."""
+    """Raise BidexError if classes of a suite have their own discounts and the learner has a single discount."""
     own = [task for task, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
     if own and not by_class:
         raise BidexError(

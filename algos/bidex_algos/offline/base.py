@@ -31,17 +31,17 @@ from bidex_meta.world.contract import VectorWorld
 class OfflineConfig(NetworkConfig):
     """Options of networks, batches and statistics; the defaults are the preset ``laptop``."""
 
-    updates_per_iteration: Count = 1000  # Updates between two reports, which --evaluate-every and --video-every count.
-    batch_size: Count = 256  # Transitions of an update, split evenly over the tasks.
-    batch_per_task: Count | None = None  # Take this many of each task instead.
+    updates_per_iteration: Count = 1000  # Updates per iteration; --evaluate-every and --video-every count iterations.
+    batch_size: Count = 256  # Transitions per update, split evenly over the tasks.
+    batch_per_task: Count | None = None  # Transitions of each task per update; replaces batch_size.
     learning_rate: Positive = 3e-4  # Adam's step size for the actor.
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
+    adam_eps: NonNegative = 1e-8  # Constant that Adam adds to its denominators.
     max_grad_norm: Positive | None = None
-    """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
+    """Gradients are clipped to this norm, separately for each network; None: no clipping."""
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
-    normalise_per_task: bool = False  # By statistics of each task's data apart; the world must show the task's one-hot.
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX.
+    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot is not changed."""
+    normalise_per_task: bool = False  # Use separate statistics for each task; the world must show the task's one-hot.
+    autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of the networks; the data are counted when they are read."""
@@ -54,19 +54,19 @@ class CriticConfig(OfflineConfig):
 
     value_heads: bool = True  # Give each critic one output per task instead of one for all.
     critic_layer_norm: bool = True
-    """Normalise the hidden layers of the critics, which keeps values of actions that no data show from growing."""
+    """Apply layer norm in the critics. It keeps the values of actions that do not occur in the data from growing."""
     critic_learning_rate: Positive = 3e-4  # Adam's step size for the critics.
     gamma: BelowOne = 0.99  # Discount per step.
-    tau: Share = 0.005  # Share of the networks that enters their targets in each update (1 - Polyak's factor).
+    tau: Share = 0.005  # Share of a network that enters its target network in each update (1 - Polyak's factor).
     per_task_rewards: bool = True  # Divide rewards by the standard deviation of their task's discounted returns.
 
 
 PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
-"""Options that the preset ``paper`` turns off in all learners with critics: Table 46 and the papers lack them."""
+"""Options that the preset ``paper`` turns off in learners with critics. Table 46 and the papers do not have them."""
 
 
 class Batches:
-    """Transitions on a device, in batches of ``per_task`` of each of ``num_tasks`` tasks."""
+    """Transitions on a device; a batch has ``per_task`` transitions of each of ``num_tasks`` tasks."""
 
     def __init__(self, data: Joined, num_tasks: int, per_task: int, device: torch.device):
         self._per_task = per_task
@@ -82,7 +82,7 @@ class Batches:
         self.fingerprint = data.fingerprint()
 
     def draw(self, batches: int, generator: torch.Generator) -> Tensor:
-        """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        """Draw indices uniformly within each task: int64 (batches, num_tasks * per_task), ordered by task."""
         shape = (batches, len(self._count), self._per_task)
         # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
         drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]
@@ -103,10 +103,11 @@ class Batches:
 
 
 def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Tensor:
-    """Return the standard deviation of each task's discounted returns, from every state to the end: (num_tasks,).
+    """Return the standard deviation of each task's discounted returns (num_tasks,), over the returns from all states.
 
-    An episode that a time limit cut counts up to the cut. The result is 1 if all returns are equal. ``gamma`` is a
-    number or (num_tasks,). The steps that a sum spans are doubled until the sum spans the longest episode.
+    In an episode that a time limit cut, rewards are summed up to the cut. The result is 1 if all returns are equal.
+    ``gamma`` is a number or (num_tasks,). The number of steps that a sum spans is doubled until it spans the longest
+    episode.
     """
     returns = data.rewards.double()
     factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]
@@ -126,10 +127,10 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
 
 
 class Offline(Learner):
-    """A learner from data (``Sources.data``).
+    """Base of the learners that learn from stored data (``Sources.data``).
 
-    ``generator`` draws only transitions, so that learners of one seed see the same transitions; ``noise`` draws
-    everything else. A batch has ``batch_per_task`` transitions of each task, task after task (``task_of_draw``).
+    ``generator`` draws only transitions, so that learners with the same seed see the same transitions; ``noise`` draws
+    everything else. A batch has ``batch_per_task`` transitions of each task, ordered by task (``task_of_draw``).
     """
 
     capabilities = frozenset({Capability.OFFLINE, Capability.DISCOUNTS_BY_CLASS})
@@ -155,7 +156,7 @@ class Offline(Learner):
         self._batches = self._read(sources.data)
 
     def _read(self, data: Joined) -> Batches:
-        """Return the batches of transitions, and compute their statistics of observations and returns."""
+        """Return the transitions as batches; compute the statistics of observations and returns."""
         tasks = self.world.num_tasks
         batches = Batches(data, tasks, self.batch_per_task, self.device)
         for chunk in batches.chunks():
@@ -167,7 +168,7 @@ class Offline(Learner):
 
     @abstractmethod
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
-        """Update all networks once with a batch, task after task; return scalars to be logged, as means."""
+        """Update all networks once with a batch that is ordered by task; return scalars whose means are logged."""
 
     def _make_critics(self) -> Critics:
         if self.config.value_heads:

@@ -1,4 +1,4 @@
-"""BC: an actor that repeats the data's action in each state (behaviour cloning), by the mean squared distance."""
+"""BC (behaviour cloning): an actor learns to repeat the data's action in each state, by the mean squared error."""
 
 from dataclasses import dataclass
 

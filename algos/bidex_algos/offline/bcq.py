@@ -1,8 +1,8 @@
 """BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; appendix B.3.1).
 
-G minimises |G(s, z) - a|^2 + KL, with z the code of a. Let a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, with
-|xi'| <= Phi. Q_i regresses to r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j). xi maximises
-Q_1(s, a + xi(s, a)).
+The model G, a variational autoencoder, minimises |G(s, z) - a|^2 + KL, with z the code of a. Let a'_j = G(s', z_j) +
+xi'(s', G(s', z_j)), j = 1...n, with |xi'| <= Phi. Q_i regresses to r + gamma (1 - terminated) max_j [w min_i + (1 - w)
+max_i] Q'_i(s', a'_j). The perturbation xi of an action maximises Q_1(s, a + xi(s, a)).
 """
 
 import copy
@@ -25,7 +25,7 @@ from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-_FARTHEST = 0.5  # bound of the codes of proposed actions: the model has seen most data near the middle
+_FARTHEST = 0.5  # bound of the codes of proposed actions, because most of the data have codes near 0
 _LOG_STD = (-4.0, 15.0)
 
 
@@ -33,13 +33,13 @@ _LOG_STD = (-4.0, 15.0)
 class BCQConfig(CriticConfig):
     """All options of BCQ; the defaults are the preset ``laptop``."""
 
-    vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the actions' model, a variational autoencoder.
-    vae_learning_rate: Positive = 1e-3  # Adam's step size for it.
-    latent: Count = 2  # Entries of its code, for each action.
-    kl_weight: NonNegative = 0.5  # Weight of the codes' divergence from a normal beside an action's squared error.
-    candidates: Count = 10  # Actions that are drawn for a state; the best one is taken.
-    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05  # The most by which a candidate is changed (Phi).
-    lower_weight: Fraction = 0.75  # Weight of the lower of both critics in a target; the higher one has the rest.
+    vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the variational autoencoder of actions.
+    vae_learning_rate: Positive = 1e-3  # Adam's step size for the variational autoencoder.
+    latent: Count = 2  # Size of the autoencoder's code, per entry of an action.
+    kl_weight: NonNegative = 0.5  # Weight of the codes' divergence from a normal, relative to the actions' error.
+    candidates: Count = 10  # Number of actions proposed in a state; the policy takes the best one.
+    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05  # Largest change of a proposed action (Phi).
+    lower_weight: Fraction = 0.75  # Weight of the lower critic's value in a target; the higher value has the rest.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class, with the autoencoder."""
@@ -69,12 +69,12 @@ class ActionModel(nn.Module):
         self.decoder = MLP(decoded, config.vae_hidden, actions, 1.0, generator, config.activation)
 
     def encode(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and log standard deviation of the codes of actions (B, a): (B, z) each."""
+        """Return mean and log standard deviation, (B, z) each, of the codes of actions (B, a) in states (B, d)."""
         mean, log_std = self.encoder(torch.cat([obs, actions], 1)).chunk(2, 1)
         return mean, log_std.clamp(*_LOG_STD)
 
     def decode(self, obs: Tensor, codes: Tensor) -> Tensor:
-        """Return actions (B, a) in [-1, 1] of codes (B, z)."""
+        """Decode codes (B, z) to actions (B, a) in [-1, 1], given normalised observations (B, d)."""
         return torch.tanh(self.decoder(torch.cat([obs, codes], 1)))
 
 
@@ -124,7 +124,7 @@ class BCQPolicy(nn.Module):
         return moved.clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Do nothing: no state has to be forgotten between episodes; the argument is part of the Agent protocol."""
+        """Do nothing, because the policy has no state; the argument is part of the Agent protocol."""
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
@@ -212,6 +212,9 @@ class BCQ(Offline):
 
 
 def best_of(values: Tensor, count: int, lower_weight: float) -> Tensor:
-    """Return the best proposal's value of each state (B,) from both critics' values (2, B * count), by state."""
+    """Return the value of the best of ``count`` proposals in each state (B,).
+
+    ``values`` (2, B * count) are both critics' values of all proposals, ordered by state.
+    """
     mixed = lower_weight * values.amin(0) + (1.0 - lower_weight) * values.amax(0)
     return mixed.view(-1, count).amax(1)

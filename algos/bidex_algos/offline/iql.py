@@ -27,11 +27,12 @@ class IQLConfig(CriticConfig):
     """All options of IQL; the defaults are the preset ``laptop``."""
 
     expectile: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.7
-    """Which expectile of the values of the data's actions a state is worth: 0.5 their mean, towards 1 the best one."""
-    beta: NonNegative = 3.0  # Weight of an action in the actor's update: exp(beta * advantage); 0: BC.
-    max_weight: Positive = 100.0  # That weight is cut to this.
-    init_std: Positive = 1.0  # Standard deviation of the actor at the start.
-    std_range: tuple[Positive, Positive] = (0.0067, 7.4)  # Its bounds, exp(-5) and exp(2).
+    """The value of a state is this expectile of the values of the data's actions: 0.5 is their mean; the nearer to 1,
+    the nearer to the best value."""
+    beta: NonNegative = 3.0  # The weight of an action in the actor's update is exp(beta * advantage); 0: all equal.
+    max_weight: Positive = 100.0  # Upper bound of an action's weight in the actor's update.
+    init_std: Positive = 1.0  # Initial standard deviation of the actor.
+    std_range: tuple[Positive, Positive] = (0.0067, 7.4)  # Bounds of the standard deviation: exp(-5) and exp(2).
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,8 +103,8 @@ class IQL(Offline):
 
 
 def expectile_loss(ahead: Tensor, expectile: float) -> Tensor:
-    """Return |t - 1(u < 0)| u^2 of each difference u, in the shape of u.
+    """Return |t - 1(u < 0)| u^2 for each difference u in ``ahead``, in the shape of ``ahead``; t is ``expectile``.
 
-    The mean of the loss is smallest if the subtracted value is the t-expectile.
+    If u = x - v, the mean loss over all x is smallest if v is the t-expectile of x.
     """
     return torch.where(ahead < 0.0, 1.0 - expectile, expectile) * ahead.square()

@@ -1,7 +1,7 @@
 """TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
 
-Targets and delay are TD3's. mu minimises (mu(s) - a)^2 - lambda Q_1(s, mu(s)), with lambda = alpha / mean |Q_1(s,
-mu(s))|.
+The targets and the delay of the actor's updates are TD3's. The actor mu minimises (mu(s) - a)^2 - lambda Q_1(s, mu(s)),
+with lambda = alpha / mean |Q_1(s, mu(s))|.
 """
 
 import copy
@@ -25,10 +25,11 @@ class TD3BCConfig(CriticConfig):
     """All options of TD3+BC; the defaults are the preset ``laptop``."""
 
     alpha: NonNegative = 2.5
-    """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
+    """Weight of the value relative to the squared distance to the data's action. The value is divided by its mean
+    absolute value in the batch. 0: behaviour cloning."""
     target_std: NonNegative = 0.2  # Standard deviation of the noise on the target actor's actions.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
-    policy_delay: Count = 2  # Updates of the critics for each of the actor and the targets.
+    target_bound: NonNegative = 0.5  # The noise on the target actor's actions is clipped to plus and minus this value.
+    policy_delay: Count = 2  # Updates of the critics for each update of the actor and the target networks.
 
 
 # "paper": alpha is from Table 46, whose other numbers are the defaults. The table omits noise, its bound and the delay;

@@ -36,30 +36,30 @@ class OffPolicyConfig(NetworkConfig):
 
     value_heads: bool = True  # Give each critic one output per task instead of one for all.
     critic_layer_norm: bool = True
-    """Normalise the hidden layers of the critics, which keeps many updates per step from blowing values up."""
+    """Apply layer norm in the critics. It keeps values from diverging with many updates per step."""
     replay_steps: Count = 500  # Vector steps that the replay keeps, if replay_memory allows.
-    replay_memory: Positive = 2.0  # The most that the replay of each process may take, in GB (10^9 bytes).
+    replay_memory: Positive = 2.0  # Upper bound of the memory for the replay of each process, in GB (10^9 bytes).
     cut_share: Share = 0.0625
-    """Room in it for last observations before time limits, as a share of all transitions. Too small where episodes are
-    shorter than 1 / cut_share; Train/weightless shows it."""
+    """Space in the replay for last observations before time limits, as a share of all transitions. The space is too
+    small if episodes are shorter than 1 / cut_share steps; Train/weightless then rises."""
     warmup_steps: Whole = 20  # Vector steps of uniform actions before the first update.
     steps_per_iteration: Count = 8  # Vector steps between two reports.
     updates_per_step: Count = 4  # Updates of all networks after each vector step.
-    batch_size: Count = 1024  # Transitions of an update, split evenly over the tasks.
-    batch_per_task: Count | None = None  # Take this many of each task instead.
+    batch_size: Count = 1024  # Transitions per update, split evenly over the tasks.
+    batch_per_task: Count | None = None  # Transitions of each task per update; replaces batch_size.
     gamma: BelowOne = 0.93  # Discount per step.
-    n_steps: Count = 1  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    n_steps: Count = 1  # Number of steps whose rewards a target sums before it adds the value of the next state.
     tau: Share = 0.02  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
     learning_rate: Positive = 3e-4  # Adam's step size for the actor.
     critic_learning_rate: Positive = 1e-3  # Adam's step size for the critics.
-    weight_decay: NonNegative = 0.0  # Share of its step size by which a step shortens all weights (AdamW).
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, those of actor and critics apart.
+    weight_decay: NonNegative = 0.0  # Weight decay of AdamW, relative to the step size; 0: Adam.
+    adam_eps: NonNegative = 1e-8  # Constant that Adam adds to its denominators.
+    max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm, separately for actor and critics.
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot is not changed."""
     per_task_rewards: bool = True
-    """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Divide drawn rewards by the running standard deviation of their task's discounted return."""
+    autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""
@@ -73,7 +73,8 @@ class OffPolicyConfig(NetworkConfig):
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Returns of a task are forgotten after ``horizon`` newer returns. ``gamma`` is a number, or one per environment (N,).
+    The sums of a task fade from the statistics over ``horizon`` newer sums. ``gamma`` is a number, or one number per
+    environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -103,10 +104,11 @@ class ReturnScale:
 
 
 class OffPolicy(Learner):
-    """An actor and critics that learn from a replay; critics learn from the next state's value by target networks.
+    """An actor and critics that learn from a replay; target networks estimate the value of the next state.
 
-    With several processes each has a replay and draws ``batch_per_task`` transitions of each task, task after task
-    (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are the discounts of environments and of a draw.
+    With several processes each has a replay and draws ``batch_per_task`` transitions of each task, ordered by task
+    (``task_of_draw``). ``gamma_of_rows`` are the discounts of the environments, ``gamma_of_draw`` those of a draw's
+    transitions.
     """
 
     config: OffPolicyConfig
@@ -157,9 +159,10 @@ class OffPolicy(Learner):
 
     @abstractmethod
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """Update the networks once with a draw (B).
+        """Update the networks once with the B transitions of a draw; return scalars to be logged.
 
-        ``weights`` (B,) are 0 for transitions that teach nothing; ``counts`` cover all processes.
+        ``weights`` (B,) are 0 for transitions that teach nothing, otherwise 1. ``counts`` (num_tasks,) are the sums of
+        the weights of each task over all processes.
         """
 
     def _own_parts(self) -> Parts:
@@ -203,7 +206,7 @@ class OffPolicy(Learner):
         return info["unstable"].sum()
 
     def _note(self, reward: Tensor, info: Info) -> None:
-        """Handle rewards (N,) and info of a step, after the replay and the statistics."""
+        """Process rewards (N,) and info of a step, after replay and statistics have been updated."""
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()
@@ -229,7 +232,10 @@ class OffPolicy(Learner):
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Return targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next value, 0 after a true end."""
+        """Return targets (B,): scaled reward + gamma^steps * ``following``.
+
+        ``following`` (B,) is the value of the next state; it counts as 0 after a termination.
+        """
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
         return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
@@ -239,7 +245,8 @@ class OffPolicy(Learner):
     ) -> dict[str, Tensor]:  # fmt: skip
         """Take one step of all critics towards ``target`` (B, ...), for normalised observations (B, d).
 
-        The parameters ``also`` belong to the critics' optimiser and descend the critics' loss plus the loss ``beside``.
+        The loss ``beside`` is added to the critics' loss. The parameters ``also``, which belong to the critics'
+        optimiser, take a step on the same sum.
         """
         losses, values = self._critic_losses(obs, draw.actions, target)
         loss = (weights / counts.sum().clamp_min(1.0) * losses).sum()
@@ -254,7 +261,10 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """Take one step of the named optimisers on ``loss``, summed over processes; also sum ``numbers`` (n,)."""
+        """Take one step of the named optimisers on ``loss``, summed over processes.
+
+        Returns ``numbers`` (n,), summed over processes. Only gradients of the parameters ``clipped`` are clipped.
+        """
         weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
             self.adams[name].zero_grad()
@@ -274,10 +284,13 @@ class OffPolicy(Learner):
         return {**networks, "adams": self.adams, **statistics}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; the replay copies itself, because two copies at once may not fit."""
+        """Return the state as in the base class, with a copy of the replay.
+
+        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
+        """
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; a ``BidexError`` if the world or the replay had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the replay had another size."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)

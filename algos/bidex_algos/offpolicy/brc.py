@@ -1,8 +1,8 @@
-"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks, one large critic.
+"""BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks with large critics.
 
 Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' the mean of both critics'
 distributions. The critics are wide residual networks. Rewards are divided by their task's largest return (equation 2 of
-the paper). The task enters as a learned vector of length 1. The rest is described in ``mtsac.py`` and
+the paper). The networks read the task as a learned vector of length 1. Everything else is described in ``mtsac.py`` and
 ``categorical.py``; see ``docs/learners/brc.md``.
 """
 
@@ -25,7 +25,10 @@ from bidex_meta.utils.validation import Count, Finite, NonNegative, Share, Whole
 
 
 class ResidualBlock(nn.Module):
-    """Adds to x two normalised layers of x, with the non-linearity between the layers; sizes do not change."""
+    """Residual block: x plus the output of two layers on x.
+
+    Each layer has a layer norm, and the non-linearity is between the layers. All widths are equal.
+    """
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -41,8 +44,8 @@ class ResidualBlock(nn.Module):
 class ResidualMLP(MLP):
     """One normalised layer followed by residual blocks; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` repeats the width once per block, plus once for the first layer. The layer norm is always used;
-    ``layer_norm`` has no effect.
+    ``hidden`` lists one width several times: once for the first layer and once for each block. The layer norm is always
+    used; ``layer_norm`` has no effect.
     """
 
     def __init__(
@@ -58,19 +61,19 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
     """All options of BRC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (256, 256, 256)
-    """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
-    hidden: Layers = (256, 256)  # The same of the actor.
+    """Width of the critics' layers, once for the first layer and once for each residual block of two layers."""
+    hidden: Layers = (256, 256)  # Width of the actor's layers, listed in the same way.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     task_embedding: Whole = 32
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    """Size of a learned vector that each network reads instead of the task's one-hot; 0: networks read the one-hot."""
     updates_per_step: Count = 4  # Updates of all networks after each vector step.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    n_steps: Count = 3  # Number of steps whose rewards a target sums before it adds the value of the next state.
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    clipped_double_q: bool = False  # Targets and actor take the critic that says less; off: the mean of both.
-    weight_decay: NonNegative = 1e-4  # Share of its step size by which a step shortens all weights (AdamW).
+    clipped_double_q: bool = False  # Targets and actor use the critic with the lower value; off: the mean of both.
+    weight_decay: NonNegative = 1e-4  # Weight decay of AdamW, relative to the step size; 0: Adam.
     target_entropy_per_action: Finite = -0.5
-    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
-    one_temperature: bool = False  # One temperature for all tasks, led by their mean entropy.
+    """Target of the temperatures: entropy of the squashed policy per entry of the action. Uniform actions have 0.69."""
+    one_temperature: bool = False  # Use one temperature for all tasks, which adapts to their mean entropy.
 
     def __post_init__(self) -> None:
         super().__post_init__()

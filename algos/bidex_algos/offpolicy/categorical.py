@@ -1,9 +1,9 @@
 """The base of FastTD3, BRC and FlashSAC: critics that predict a distribution of the return, trained by cross-entropy.
 
-Z(s, a) has probabilities of fixed values ("atoms"). Targets r + gamma (1 - terminated) Z'(s', a') are projected back on
-the atoms (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike in regression, the gradient does not grow with the
-scale of a task's returns. However, rewards must be scaled into the atoms' range by the task's largest return
-(``ReturnBound``).
+The distribution Z(s, a) gives probabilities to fixed values ("atoms"). Targets r + gamma (1 - terminated) Z'(s', a')
+are projected back onto the atoms (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike in regression, the gradient
+does not grow with the scale of a task's returns. However, rewards must be divided so that the task's largest return
+(``ReturnBound``) lies within the atoms' range.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from bidex_meta.world.contract import VectorWorld
 
 
 class Atoms(nn.Module):
-    """``count`` (A >= 2) evenly spaced values with probabilities given by a distribution; the module has no weights."""
+    """``count`` (A >= 2) evenly spaced values, to which a distribution gives probabilities; has no weights."""
 
     def __init__(self, low: float, high: float, count: int):
         super().__init__()
@@ -60,13 +60,13 @@ class Atoms(nn.Module):
 class CategoricalConfig(OffPolicyConfig):
     """Options of the critics' distributions and layers, in addition to the options of all off-policy learners."""
 
-    critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; ``hidden`` is then the actor's alone.
-    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Values that a distribution of the return gives probabilities to.
-    value_bound: Positive = 10.0  # They lie evenly from minus this to this, in scaled rewards.
-    clipped_double_q: bool = True  # Targets and actor take the critic that says less; off: the mean of both.
+    critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; hidden only applies to the actor.
+    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Number of values over which a return's distribution is defined.
+    value_bound: Positive = 10.0  # The atoms are evenly spaced from minus this value to this value, in scaled rewards.
+    clipped_double_q: bool = True  # Targets and actor use the critic with the lower value; off: the mean of both.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes as in the base class, which counts ``hidden`` for all networks, plus the critics'."""
+        """Estimate the bytes as in the base class, which counts ``hidden`` for all networks, and add the critics."""
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 
@@ -103,9 +103,9 @@ class CategoricalCritics(nn.Module):
         self.nets = nn.ModuleList(nets)
 
     def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Return each atom's log-probability: observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms).
+        """Return each atom's log-probability (count, B, atoms) for actions (B, a) and tasks (B,).
 
-        The observations are normalised.
+        ``obs`` (B, d) are normalised observations.
         """
         x = torch.cat([obs, actions], dim=1)
         logits = torch.stack([net(x) for net in self.nets])
@@ -123,12 +123,13 @@ RECENT = 0.9  # decay per step of the mean of recent rewards: about the last ten
 
 
 class ReturnBound(ReturnScale):
-    """Adds to the statistics the largest absolute return of each task, which a fixed range of values must contain.
+    """Extends the statistics by the largest absolute return of each task, because all returns must be within the atoms.
 
-    The sum is discounted towards the episode's beginning, because its end is unknown; both directions weigh any stretch
-    of rewards equally. At a time limit the episode is assumed to continue at its mean reward, or at its most recent
-    reward if that is larger. ``mass`` is the sum (N,) if all rewards had been 1; ``recent`` holds both sums with a
-    discount of at most :data:`RECENT` (2, N).
+    A sum discounts earlier rewards instead of later ones, because the end of the episode is not known yet. The sum of
+    the discount factors over successive rewards is the same in both directions. At a time limit the episode is assumed
+    to continue with its mean reward, or with the mean of its most recent rewards if that is larger. ``mass`` (N,) is
+    the sum that would result if all rewards had been 1. ``recent`` (2, N) holds the sums of rewards and of ones with a
+    discount of at most :data:`RECENT`.
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -164,7 +165,7 @@ class ReturnBound(ReturnScale):
 class Categorical(OffPolicy):
     """The part of a learner with categorical critics that does not depend on the actor.
 
-    In a class's bases it precedes the learner whose actor it uses.
+    A subclass with several bases lists this class before the learner whose actor is used.
     """
 
     config: CategoricalConfig

@@ -1,9 +1,9 @@
-"""DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
+"""DDPG: a deterministic actor that maximises a critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
-Q regresses to r + gamma (1 - terminated) Q'(s', mu'(s')); mu maximises Q(s, mu(s)). The critic's slope drives actions
-to the bounds, where tanh has almost no slope (on two hands 86 % of the actions exceeded 0.99 after 0.4 M steps);
-``squash_price`` prevents this. The noise is normal; its size differs between the environments of a task (the spread of
-Horgan et al. 2018).
+The critic Q regresses to r + gamma (1 - terminated) Q'(s', mu'(s')); the actor mu maximises Q(s, mu(s)). The critic's
+gradient drives actions to the bounds, where tanh has almost no slope (on two hands 86 % of the actions exceeded 0.99
+after 0.4 M steps); ``squash_price`` prevents this. The noise on actions is normal. Its standard deviation differs
+between the environments of a task, as in Horgan et al. (2018).
 """
 
 import copy
@@ -27,8 +27,9 @@ class DDPGConfig(OffPolicyConfig):
     """All options of DDPG; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
-    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
-    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
+    """Standard deviations of the noise on actions in each task's first and last environment. The values of the other
+    environments are evenly spaced between the two."""
+    squash_price: NonNegative = 1.0  # Weight, in the actor's loss, of the mean square of the actions before tanh.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,9 +1,9 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-Few updates of many transitions follow each vector step. Targets use the present actor's actions, and target networks
-follow fast. mu climbs min_i E Z_i, returns may span several steps, and weights decay. Rewards are divided by
-max(standard deviation, largest / bound) of their task's returns. The distributions are described in ``categorical.py``;
-see ``docs/learners/fasttd3.md``.
+Few updates with many transitions follow each vector step. Targets use the current actor's actions, and target networks
+follow fast. The actor maximises min_i E Z_i, targets may sum rewards over several steps, and weights decay. Rewards are
+divided by max(standard deviation, largest absolute value / bound) of their task's returns. The distributions are
+described in ``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass
@@ -27,15 +27,16 @@ class FastTD3Config(CategoricalConfig):
     """All options of FastTD3; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
-    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
-    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
-    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
+    """Standard deviations of the noise on actions in each task's first and last environment. The values of the other
+    environments are evenly spaced between the two."""
+    squash_price: NonNegative = 1.0  # Weight, in the actor's loss, of the mean square of the actions before tanh.
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the next actions in targets.
+    target_bound: NonNegative = 0.5  # The noise in targets is clipped to plus and minus this value.
     policy_delay: Count = 2  # Updates of the critics and of their targets for each update of the actor.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    n_steps: Count = 3  # Number of steps whose rewards a target sums before it adds the value of the next state.
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    weight_decay: NonNegative = 0.1  # Share of its step size by which a step shortens all weights (AdamW).
+    weight_decay: NonNegative = 0.1  # Weight decay of AdamW, relative to the step size; 0: Adam.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,7 +107,7 @@ class FastTD3(Categorical):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """Return the critics' targets (B, atoms), for the present actor's actions with clipped noise."""
+        """Return the critics' targets (B, atoms), for the current actor's actions with clipped noise."""
         with autocast(self.device, self.low_precision):
             action = self.policy.actor(next_obs)
         bound = self.config.target_bound
@@ -115,7 +116,7 @@ class FastTD3(Categorical):
         return self._projected(draw, self._following(next_obs, action), torch.zeros_like(draw.rewards))
 
     def _climb(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
-        """Move the actor up its value, at a price on what tanh is taken of."""
+        """Take one step of the actor towards higher values, with a penalty on actions before tanh."""
         raw = self.policy.raw(obs)
         value = self._pooled(self._values(self.critic, obs, torch.tanh(raw)))
         price = self.config.squash_price * raw.square().mean(1)

@@ -1,9 +1,9 @@
-"""FlashSAC: SAC with bounded networks and few updates of large batches (Kim et al. 2026, arXiv 2604.04539).
+"""FlashSAC: SAC with bounded networks and few updates with large batches (Kim et al. 2026, arXiv 2604.04539).
 
-Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' of the critic with the lower mean.
-Layers have rows of length 1, and batch norms bound their outputs; a critic sees (s, a) and (s', a') as one batch. Each
-environment repeats its noise for some steps. The rest is described in ``mtsac.py`` and ``categorical.py``; for
-differences from the paper see ``docs/learners/flashsac.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), where Z' comes from the critic with the lower
+mean. The rows of a layer's weights have length 1, and batch norms bound the layer's outputs. A critic processes (s, a)
+and (s', a') in one batch. Each environment repeats its noise for some steps. Everything else is described in
+``mtsac.py`` and ``categorical.py``; for differences from the paper see ``docs/learners/flashsac.md``.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ from bidex_meta.utils.validation import Count, Finite, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
 WIDER = 4  # ratio of the width within a block to the width of its input
-MOMENTUM = 0.01  # share of a batch in the running statistics
+MOMENTUM = 0.01  # weight of a new batch in the running statistics of batch norms
 
 
 def _directions(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
@@ -38,7 +38,11 @@ def _directions(inputs: int, outputs: int, generator: torch.Generator) -> nn.Lin
 
 
 class InvertedBlock(nn.Module):
-    """Adds to x two layers of x without biases, each with batch norm and non-linearity; the block is wider inside."""
+    """Residual block: x plus the output of two layers on x.
+
+    The layers have no biases; each is followed by a batch norm and a non-linearity. The first layer's output is
+    :data:`WIDER` times as wide as x.
+    """
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
@@ -64,8 +68,8 @@ class FloatRMSNorm(nn.RMSNorm):
 class UnitMLP(MLP):
     """Batch norm, a layer, inverted blocks, RMS norm, output; replaces :class:`MLP` and takes its arguments.
 
-    ``hidden`` repeats the width once per block, plus once for the first layer; ``output_gain`` and ``layer_norm`` have
-    no effect. Batch norms use running statistics except within :func:`by_batch`.
+    ``hidden`` lists one width several times: once for the first layer and once for each block. ``output_gain`` and
+    ``layer_norm`` have no effect. Batch norms use running statistics except within :func:`by_batch`.
     """
 
     def __init__(
@@ -86,7 +90,10 @@ class UnitMLP(MLP):
 
     @torch.no_grad()
     def to_sphere(self) -> None:
-        """Scale rows of weights to length 1, and scales and shifts of n-wide norms, as one vector, to sqrt(n)."""
+        """Scale each row of a layer's weights to length 1, and the weights of each norm to length sqrt(n).
+
+        The weights of a norm of width n are its scales and shifts, taken as one vector.
+        """
         for layer in (*self.body.modules(), self.head):
             if isinstance(layer, nn.Linear):
                 layer.weight.div_(layer.weight.norm(dim=1, keepdim=True).clamp_min(1e-8))
@@ -103,7 +110,7 @@ def _of(module: nn.Module) -> list[UnitMLP]:
 
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
-    """Let batch norms within the context use their input's statistics and merge these into the running statistics."""
+    """Let batch norms in this context use their input's statistics and merge these into the running statistics."""
     network.train()
     yield
     network.eval()
@@ -114,20 +121,21 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
     """All options of FlashSAC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (128, 128, 128)
-    """Width of the critics as often as there are blocks, and once more for the first layer; within a block four times
-    that."""
-    hidden: Layers = (64, 64, 64)  # The same of the actor.
+    """Width of the critics' layers, once for the first layer and once for each block; inside a block layers are four
+    times as wide."""
+    hidden: Layers = (64, 64, 64)  # Width of the actor's layers, listed in the same way.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     updates_per_step: Count = 2  # Updates of the critics after each vector step.
-    policy_delay: Count = 2  # Updates of the critics for each of the actor and the temperatures.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    policy_delay: Count = 2  # Updates of the critics for each update of the actor and the temperatures.
+    n_steps: Count = 3  # Number of steps whose rewards a target sums before it adds the value of the next state.
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    value_bound: Positive = 5.0  # The atoms lie evenly from minus this to this, in scaled rewards.
+    value_bound: Positive = 5.0  # The atoms are evenly spaced from minus this value to this value, in scaled rewards.
     target_entropy_per_action: Finite = -0.478
-    """Entropy of the squashed policy that each temperature aims at, for each action: that of a normal distribution of
-    deviation 0.15, log(0.15 sqrt(2 pi e)); uniform actions have 0.69."""
+    """Target of the temperatures: entropy of the squashed policy per entry of the action. The default is the entropy of
+    a normal distribution with standard deviation 0.15, log(0.15 sqrt(2 pi e)). Uniform actions have 0.69."""
     noise_repeats: Count = 16
-    """Most steps for which an environment keeps the noise of its actions; n of them as often as n^-2; 1: none."""
+    """Largest number of steps for which an environment keeps the noise of its actions. A number n is drawn with a
+    probability proportional to n^-2. 1: new noise at each step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -222,7 +230,7 @@ class FlashSAC(Categorical, MTSAC):
 
     @torch.no_grad()
     def _share_statistics(self) -> None:
-        """Average the running statistics over processes, each of which uses its own batch."""
+        """Average the running statistics over all processes, because each process updates them with its own batch."""
         if world_size() == 1:
             return
         nets = (self.policy.actor, self.critic, self.target_critic)

@@ -1,4 +1,4 @@
-"""MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each.
+"""MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each task.
 
 Q_i regresses to r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')). pi minimises alpha_k log pi -
 min_i Q_i. log alpha_k minimises -log alpha_k (log pi + H), averaged over task k only. A single temperature would be set
@@ -27,12 +27,12 @@ from bidex_meta.world.contract import VectorWorld
 class MTSACConfig(OffPolicyConfig):
     """All options of MT-SAC; the defaults are the preset ``laptop``."""
 
-    init_std: Positive = 0.5  # Standard deviation of the actions at the start, before the squashing.
-    std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Its bounds.
+    init_std: Positive = 0.5  # Initial standard deviation of the actions before squashing.
+    std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Bounds of the standard deviation before squashing.
     alpha_learning_rate: Positive = 3e-3  # Adam's step size for the logarithms of the temperatures.
-    init_alpha: Positive = 0.001  # Temperature of every task at the start.
+    init_alpha: Positive = 0.001  # Initial temperature of every task.
     target_entropy_per_action: Finite = -1.0
-    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
+    """Target of the temperatures: entropy of the squashed policy per entry of the action. Uniform actions have 0.69."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -143,7 +143,8 @@ class MTSAC(OffPolicy):
 class SAC(MTSAC):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
-    The class is MT-SAC with presets of Table 43, SAC's own, which has the same numbers in all columns.
+    The class is MT-SAC with additional presets for Humanoid-v5 (Table 49). The preset ``paper`` is from SAC's own Table
+    43, which has the same numbers in all columns.
     """
 
     task_presets = TASK_PRESETS

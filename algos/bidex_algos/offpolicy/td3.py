@@ -17,8 +17,8 @@ from bidex_meta.world.contract import VectorWorld
 class TD3Config(DDPGConfig):
     """All options of TD3; the defaults are the preset ``laptop``."""
 
-    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the next actions in targets.
+    target_bound: NonNegative = 0.5  # The noise in targets is clipped to plus and minus this value.
     policy_delay: Count = 2  # Updates of the critics for each update of the actor and of all target networks.
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations beside reinforcement: a term of behaviour cloning in PPO's loss, and cloning before the training."""
+"""Demonstrations for PPO: a term of behaviour cloning in the loss, and behaviour cloning before the training."""
 
 import torch
 from torch import Tensor
@@ -9,17 +9,17 @@ from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import own_seed, sum_gradients, world_size
 
-WEIGHT = 0.1  # of the term at the start
-HALF_LIFE = 500_000.0  # environment steps in which the weight falls to half
+WEIGHT = 0.1  # initial weight of the term of behaviour cloning
+HALF_LIFE = 500_000.0  # environment steps after which the weight has halved
 
-_DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
+_DEMONSTRATED = 0xDE30  # seeds a separate generator, so that demonstrations do not change the learner's draws
 
 
 class Demonstrations:
-    """Transitions to be imitated in addition to reinforcement; some tasks may have none.
+    """Transitions that a policy imitates while it learns from rewards; some tasks may have no transitions.
 
-    The loss gets a term of behaviour cloning that fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation
-    6). Normalised advantages replace DAPG's weighting by the largest advantage.
+    A term of behaviour cloning is added to the loss, and its weight fades, as in DAPG (Rajeswaran et al. 2018, arXiv
+    1709.10087, equation 6). Normalised advantages replace DAPG's weighting by the largest advantage.
     """
 
     def __init__(self, data: Joined, batch_size: int, seed: int, device: torch.device):
@@ -38,7 +38,10 @@ class Demonstrations:
         return WEIGHT * 0.5 ** (env_steps / HALF_LIFE)
 
     def draw(self) -> tuple[Tensor, Tensor]:
-        """Draw raw observations (B, d) and actions (B, a), on average equally often for each task that has some."""
+        """Draw raw observations (B, d) and actions (B, a).
+
+        All tasks that have transitions are drawn equally often on average.
+        """
         size = (self.batch_size,)
         device = self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
@@ -59,7 +62,7 @@ class Demonstrations:
         return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
 
     def clone(self, policy: GaussianPolicy, steps: int) -> None:
-        """Clone the behaviour in ``steps`` steps: update statistics of observations, then train only the mean."""
+        """Clone the demonstrated behaviour: update observation statistics, then train the mean for ``steps`` steps."""
         if not steps:
             return
         policy.observations.update(self._obs)
@@ -73,7 +76,7 @@ class Demonstrations:
             adam.step()
 
     def check(self, learner: str, stored: dict[str, float] | None) -> None:
-        """Raise BidexError if a checkpoint's ``stored`` fingerprint, if any, is that of other data."""
+        """Raise BidexError if ``stored``, the fingerprint in a checkpoint (None: no fingerprint), is of other data."""
         if stored is not None and stored != self.fingerprint:
             raise BidexError(
                 f"{learner}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "

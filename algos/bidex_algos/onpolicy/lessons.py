@@ -1,4 +1,4 @@
-"""Teachers' labels and the updates that imitate them: all of DAgger's learning, and an addition to PPO's."""
+"""Teachers' labels and updates that imitate these labels; used by DAgger, and by PPO in addition to its own updates."""
 
 import math
 
@@ -18,13 +18,13 @@ from bidex_meta.world.contract import VectorWorld
 # does not outweigh all others. It is 1.5 % of an action's range, or about 0.02 rad of a finger joint.
 _FLOOR = 0.03
 
-SUCCESS = 0.8  # of a class's last 100 episodes, from which its teacher counts nothing beside PPO
-# The first few episodes say little: up to this number, the missing episodes count as failures.
+SUCCESS = 0.8  # success rate over a class's last 100 episodes at which PPO stops learning from the class's teacher
+# The first few episodes say little: if there are fewer than this number, the missing episodes count as failures.
 _EPISODES = 20.0
 
 
 def needs(episodes: EpisodeStatistics) -> Tensor:
-    """Return each class's relative distance from ``SUCCESS``, from 1 to 0: (num_tasks,)."""
+    """Return each class's need of a teacher (num_tasks,): it falls from 1 without any success to 0 at ``SUCCESS``."""
     _, _, successes, counts = all_sum(episodes.sums)
     return (1.0 - successes / counts.clamp_min(_EPISODES) / SUCCESS).clamp_min(0.0)
 
@@ -32,9 +32,10 @@ def needs(episodes: EpisodeStatistics) -> Tensor:
 class Lessons:
     """Labelled observations of a world, and an optimiser of the mean of ``policy``; standard deviations do not change.
 
-    The error of an action is measured in units of its variance among the labels of its class; all classes have equal
-    weight. The newest ``samples`` labels of each process are kept, and at least ``least_steps`` of each environment.
-    An update takes ``batch_size`` of them, split evenly over the taught classes. The defaults are those beside PPO.
+    The squared error of each entry of an action is divided by the variance of this entry among the labels of the class;
+    all classes have equal weight. The newest ``samples`` labels of each process are kept, and at least ``least_steps``
+    labels of each environment. An update uses ``batch_size`` labels, split evenly over the classes with a teacher. The
+    defaults are those for PPO.
     """
 
     def __init__(
@@ -56,14 +57,14 @@ class Lessons:
 
     @torch.no_grad()
     def label(self, obs: Tensor) -> Tensor:
-        """Label raw observations (N, d) of a step and store the labels: actions (N, a)."""
+        """Label raw observations (N, d) with the teachers' actions, store both, and return the labels (N, a)."""
         labels = self.teachers.eval_action(obs)
         self.data.add(obs, labels)
         return labels
 
     @torch.no_grad()
     def take_moments(self, steps: int) -> None:
-        """Add the labels of the last steps to the statistics of their classes."""
+        """Add the labels of the newest ``steps`` vector steps to the statistics of their classes."""
         mean, var, count = self.label_stats.mean.new_zeros(3, *self.label_stats.mean.shape)
         for task, labels in zip(self.data.tasks.tolist(), self.data.of_last(steps), strict=True):
             var[task], mean[task] = torch.var_mean(labels.double(), dim=0, correction=0)
@@ -71,7 +72,10 @@ class Lessons:
         self.label_stats.merge(*pool_moments(mean, var, count))
 
     def learn(self, updates: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
-        """Take ``updates`` steps down the mean of the classes' losses, weighted (K,); return the unweighted losses."""
+        """Take ``updates`` gradient steps on the mean of the losses of the K classes with a teacher.
+
+        The losses are multiplied by ``weights`` (K,), if given. Returns the unweighted losses to be logged.
+        """
         data = self.data
         device = generator.device
         tasks = data.tasks.repeat_interleave(self.batch_per_task)
@@ -91,7 +95,10 @@ class Lessons:
     def learn_by_need(
         self, updates: int, generator: torch.Generator, episodes: EpisodeStatistics
     ) -> dict[str, Tensor]:  # fmt: skip
-        """Take up to ``updates`` steps, weighted by the classes' :func:`needs`: all where a class never succeeds."""
+        """Take steps as in :meth:`learn`, with losses weighted by the classes' :func:`needs`.
+
+        The number of steps is ``updates`` times the largest need, so all of them are taken if a class never succeeds.
+        """
         tasks = self.data.tasks
         need = needs(episodes)
         most = need[tasks].max()
@@ -102,7 +109,7 @@ class Lessons:
         return losses | {f"Policy/teacher_weight/{self.world.task_names[task]}": need[task] for task in tasks.tolist()}
 
     def _descend(self, of_class: Tensor, weights: Tensor | None) -> Tensor:
-        """Take a step on the losses summed over processes; return the classes' losses (K,)."""
+        """Take one step on the classes' losses (K,), summed over processes; return the summed losses, unweighted."""
         parameters = list(self.policy.actor.mean.parameters())
         self.adam.zero_grad()
         (of_class if weights is None else weights * of_class).mean().backward()

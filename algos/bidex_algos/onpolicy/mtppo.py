@@ -30,9 +30,9 @@ from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.graphs import GraphCache, cuda_graph
 
-_VALUE_HORIZON = 100.0  # iterations after which returns fade from the statistics that define the critic's units
-_VALUE_LOSS_WEIGHT = 2.0  # Adam undoes it, so it matters only for the clipping of the critic's gradients
-_MAX_GRAD_NORM = 1.0  # gradients longer than this are shortened to it, those of actor and critic apart
+_VALUE_HORIZON = 100.0  # iterations over which old returns fade from the statistics that define the critic's units
+_VALUE_LOSS_WEIGHT = 2.0  # Adam cancels this factor, so it matters only for the clipping of the critic's gradients
+_MAX_GRAD_NORM = 1.0  # gradients are clipped to this norm, separately for actor and critic
 
 
 @dataclass(frozen=True)
@@ -40,23 +40,23 @@ class OnPolicyConfig(LearnerConfig):
     """Options of networks, rollouts and statistics; the defaults are the preset ``laptop``."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
-    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
-    heads. All but shared for MT suites, whose observations show the task."""
-    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, of actor and critic alike.
+    """shared: one trunk for all tasks. multi_head: the same trunk with policy_heads and value_heads. towers: tasks
+    share only the first layer. separate: tasks share no layer. soft_modules, paco, moore, transformer: other trunks,
+    each with or without heads. All except shared need an MT suite, whose observations show the task."""
+    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, the same for actor and critic.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
     policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
     value_heads: bool = True  # Give the critic one output per task instead of one for all.
     point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    """Widths of the layers that all points of a point cloud share (PointNet), if the world shows a point cloud."""
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     rollout_steps: Count = 8  # Steps taken in every environment between two updates.
     gamma: Fraction = 0.93  # Discount per step.
     lam: Fraction = 0.95  # Trace decay of the advantage estimate.
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot is not changed."""
+    autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,25 +73,25 @@ class MTPPOConfig(OnPolicyConfig):
     """All options of MT-PPO; the defaults are the preset ``laptop``."""
 
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    epochs: Count = 4  # Passes over what was collected, per update.
-    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
+    epochs: Count = 4  # Passes over the rollout per update.
+    clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
     learning_rate: Positive = 3e-4  # Adam's step size at the start.
     desired_kl: Positive = 0.03
-    """KL of the sampling policy from the current one: the step size is divided by 1.5 above twice this value, and
-    multiplied by 1.5 below half of it."""
+    """Desired KL of the sampling policy from the current policy. The step size is divided by 1.5 if the KL is above
+    twice this value, and multiplied by 1.5 if the KL is below half of it."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
-    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
+    critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
     gradient_surgery: Balancing = "none"
-    """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
-    2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
-    so that all fall at one rate (Liu et al. 2023)."""
-    demonstration_batch: Count = 256  # With --demonstrations: transitions in each mini-batch, of each process.
-    demonstration_cloning: Whole = 0  # Steps on demonstrations in which the policy is cloned before it plays.
+    """Combination of the tasks' policy gradients. none: sum. pcgrad: sum, after removing from each gradient what points
+    against another task's gradient (Yu et al. 2020). cagrad: sum, turned towards the task whose loss it would lower
+    least (Liu et al. 2021). famo: sum, weighted so that all losses fall at the same rate (Liu et al. 2023)."""
+    demonstration_batch: Count = 256  # With --demonstrations: demonstrated transitions per mini-batch and process.
+    demonstration_cloning: Whole = 0  # With --demonstrations: steps of behaviour cloning before the training.
     teacher_updates: Whole = 20
-    """With --teacher: DAgger's updates after each of PPO's, while a taught class never succeeds; 0: none."""
+    """With --teacher: DAgger updates per PPO update while a taught class never succeeds, fewer later; 0: none."""
     critic_first: Whole = 0
-    """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
-    or of --start-from), which a critic that knows nothing would spoil."""
+    """Environment steps at the start in which only the critic learns. Use this for a policy that begins with a skill
+    (cloned, or from --start-from), because updates with an untrained critic would spoil the skill."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,14 +123,14 @@ PRESETS: dict[str, MTPPOConfig] = {
 class Batch:
     """A rollout prepared for the update, with steps and rows flattened into B samples."""
 
-    obs: Tensor  # normalised observations (B, d), in the precision the hidden layers run in
+    obs: Tensor  # normalised observations (B, d), in the precision of the hidden layers
     task_id: Tensor  # task of each sample (B,)
     actions: Tensor  # sampled actions (B, a)
     old_means: Tensor  # means of the sampling policy (B, a)
     old_log_probs: Tensor  # log-density of the actions under the sampling policy (B,)
-    advantages: Tensor  # normalised advantages (B,); of several critics (B, critics)
-    targets: Tensor  # what the critic shall predict, in its own units (B,); of several (B, critics)
-    weights: Tensor  # 1, or 0 for a transition where physics broke (B,)
+    advantages: Tensor  # normalised advantages (B,); with several critics (B, critics)
+    targets: Tensor  # the critic's targets: normalised returns (B,); with several critics (B, critics)
+    weights: Tensor  # 0 if physics broke in the transition, otherwise 1 (B,)
 
     def select(self, index: Tensor) -> "Batch":
         """Return the samples at ``index``."""
@@ -347,7 +347,7 @@ class MTPPO(OnPolicy):
         return reported
 
     def _descend(self, first: bool, critic_alone: bool, *inputs: Tensor) -> Tensor:
-        """Take one step on a mini-batch's fields, the sum of its weights and the old log standard deviations."""
+        """Take one step on a mini-batch; ``inputs`` are its fields, sum of weights and old log standard deviations."""
         *fields, count, old_log_std = inputs
         b = Batch(*fields)
         actor = self.policy.actor
@@ -389,7 +389,7 @@ class MTPPO(OnPolicy):
         )  # fmt: skip
 
     def _least(self, b: Batch, count: Tensor) -> Tensor:
-        """Return the minimum of each sample's surrogate loss (B,): no ratio earns more than the clip allows."""
+        """Return the smallest surrogate loss that each sample can reach (B,), given the clip of the ratio."""
         return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
@@ -429,7 +429,7 @@ class MTPPO(OnPolicy):
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; the labels copy themselves, because two copies at once may not fit."""
+        """Return the state as in the base class; labels are copied only once, as two copies may not fit in memory."""
         return super().state_dict() | ({} if self.lessons is None else {"data": self.lessons.data.state_dict()})
 
     def load_state_dict(self, state: State) -> None:

@@ -27,20 +27,20 @@ from bidex_meta.world.contract import VectorWorld
 class MTTRPOConfig(OnPolicyConfig):
     """All options of MT-TRPO; the defaults are the preset ``laptop``."""
 
-    max_kl: Positive = 0.1  # Mean KL of the new policy from the sampling one that an update may not exceed.
-    damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal: shortens steps that samples tell nothing of.
+    max_kl: Positive = 0.1  # Upper bound of the mean KL between the sampling and the new policy in an update.
+    damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal; shortens steps along poorly known directions.
     cg_iterations: Count = 10  # Conjugate-gradient iterations.
-    fisher_stride: Count = 4  # Every so many-th sample goes into the Fisher matrix; it needs fewer than gradients.
+    fisher_stride: Count = 4  # One in this number of samples enters the Fisher matrix; it needs fewer than gradients.
     backtracks: Count = 10  # Points that the line search tries.
-    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
+    backtrack_factor: Fraction = 0.8  # Factor by which the line search shortens the step at each try.
     accept_ratio: Fraction = 0.1
-    """Share of the improvement promised by the gradient that must come true where the line search stops; more keeps to
-    steps along which the surrogate is almost straight."""
+    """Share of the improvement predicted by the gradient that a step must reach to be accepted. With a larger share
+    only steps along which the surrogate is almost linear are accepted."""
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
     critic_epochs: Count = 4  # The critic's passes over the rollout per update.
     num_minibatches: Count = 4  # The critic's mini-batches per epoch.
-    max_grad_norm: Positive = 1.0  # Gradients of the critic longer than this are shortened to it.
-    autocast: Autocast = "off"  # Hidden layers in bfloat16: too coarse for the Fisher matrix, so off by default.
+    max_grad_norm: Positive = 1.0  # Gradients of the critic are clipped to this norm.
+    autocast: Autocast = "off"  # Use bfloat16 in hidden layers; off, because it is too coarse for the Fisher matrix.
 
 
 PRESETS: dict[str, MTTRPOConfig] = {
@@ -59,9 +59,9 @@ def gaussian_step(
     parameters: list[nn.Parameter], distribution: Callable[[], tuple[Tensor, Tensor]], keep_bounds: Callable[[], None],
     b: Any, gain: Tensor, old_log_std: Tensor, own_kl: Tensor, config: Any, max_kl: float
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Take a trust-region step of a Gaussian policy on samples ``b`` that increases ratio times ``gain`` (B,).
+    """Take a trust-region step of a Gaussian policy that increases the mean of ratio times ``gain`` (B,).
 
-    Returns scalars to be logged.
+    ``b`` are the samples. ``own_kl`` is the result of :func:`kl_from_itself`. Returns scalars to be logged.
     """
     weight = b.weights / all_sum(b.weights.sum()).clamp_min(1.0)
 
@@ -158,8 +158,8 @@ class MTTRPO(OnPolicy):
 class TRPO(MTTRPO):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
-    The class is MT-TRPO with the presets of a single task: networks of Table 42, the rest as in MT-TRPO, because the
-    appendix has no table for TRPO.
+    The class is MT-TRPO with presets for a single task. The networks are from Table 42. All other values are those of
+    MT-TRPO, because the appendix has no table for TRPO.
     """
 
     presets = PRESETS | {"paper": replace(PRESETS["paper"], hidden=(1024, 1024, 512))}

@@ -15,17 +15,17 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 
 @dataclass(frozen=True)
 class PPOConfig(LearnerConfig):
-    """Options of passes, clip and step sizes. A config that inherits others too lists these fields last."""
+    """Options of epochs, clip and step sizes; a config with several bases lists these options last."""
 
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    epochs: Count = 4  # Passes over what was collected, per update.
-    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
+    epochs: Count = 4  # Passes over the collected data per update.
+    clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
     learning_rate: Positive = 3e-4  # Adam's step size at the start.
     adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: Positive = 0.03  # KL of the sampling policy from the current one that the adaptive step size aims at.
+    """Divide the step size by 1.5 if the KL is above twice desired_kl; multiply it by 1.5 if below half of it."""
+    desired_kl: Positive = 0.03  # Desired KL of the sampling policy from the current policy, for adaptive step sizes.
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
-    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
+    critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
 
     @property
     def followed_kl(self) -> float | None:
@@ -43,8 +43,8 @@ def mini_batches(
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:  # fmt: skip
     """Iterate over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
-    Yields whether the mini-batch is the very first, its samples int64 (b,), and the sum of their weights over all
-    processes, at least 1.
+    Yields whether the mini-batch is the first of all, the indices of its samples, int64 (b,), and the sum of these
+    samples' weights over all processes (at least 1).
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -58,7 +58,7 @@ class PolicyLoss(NamedTuple):
 
     surrogate: Tensor  # minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)
     entropy: Tensor  # entropy of the policy
-    kl: Tensor  # KL of the sampling policy from the present one; without a gradient
+    kl: Tensor  # KL of the sampling policy from the current policy; without a gradient
     outside: Tensor  # share of the ratios outside the clip range; without a gradient
     earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
@@ -74,10 +74,11 @@ def policy_loss(
     actions: Tensor, means: Tensor, log_std: Tensor, old_means: Tensor, old_log_std: Tensor, old_log_probs: Tensor,
     advantages: Tensor, weights: Tensor, clip: float
 ) -> PolicyLoss:  # fmt: skip
-    """Return the loss of samples of any shape (...), summed with ``weights`` (...); 0 for samples that teach nothing.
+    """Return the loss of samples of any shape (...), summed with ``weights`` (...).
 
-    Actions and means are (..., a), log standard deviations (a,) or (..., a), log-densities and normalised advantages
-    (...). ``old`` refers to the sampling policy. A ratio beyond ``clip`` from 1 earns nothing more.
+    A weight of 0 excludes a sample. Actions and means are (..., a), log standard deviations (a,) or (..., a),
+    log-densities and normalised advantages (...). ``old`` refers to the sampling policy. The objective is clipped at a
+    distance of ``clip`` of the ratio from 1.
     """
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
@@ -113,7 +114,7 @@ class _Adam(torch.optim.Adam):
 class AdaptiveAdam:
     """Adam whose step size is divided by 1.5 above twice the desired KL and multiplied by 1.5 below half of it.
 
-    The step size is a tensor, so the host does not wait for the device. It stays the same if ``desired_kl`` is None.
+    The step size is a tensor, so the host does not wait for the device. If ``desired_kl`` is None, it is constant.
     """
 
     def __init__(
@@ -131,13 +132,13 @@ class AdaptiveAdam:
         self.actor.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
-        """Take one step along clipped gradients; the step size follows the KL of the last step (None at first)."""
+        """Adapt the step size to the last step's KL (None at first), then take one step along clipped gradients."""
         self.follow(kl)
         nn.utils.clip_grad_norm_(self.weights, max_grad_norm)
         self.actor.step()
 
     def follow(self, kl: Tensor | None) -> None:
-        """Adapt the step size to the KL of its last step, a scalar."""
+        """Adapt the step size to the KL of the last step, a scalar; None leaves it unchanged."""
         if kl is not None and self.desired_kl is not None:
             self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
@@ -147,7 +148,10 @@ class AdaptiveAdam:
 
 
 class AdaptiveAdams(AdaptiveAdam):
-    """Adam for the actor and for the critic; ``critic_learning_rate`` is fixed, or None to follow the actor's."""
+    """Adam for the actor and Adam for the critic.
+
+    ``critic_learning_rate`` is the critic's fixed step size. With None the critic uses the actor's step size.
+    """
 
     def __init__(
         self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], learning_rate: float,
@@ -162,12 +166,12 @@ class AdaptiveAdams(AdaptiveAdam):
         self.critic = _Adam(self.critic_weights, self.critic_rate)
 
     def zero_grad(self) -> None:
-        """Reset the gradients of both."""
+        """Reset the gradients of actor and critic."""
         super().zero_grad()
         self.critic.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float, critic_alone: bool = False) -> None:
-        """Take one step of both, with each norm clipped separately; ``critic_alone``: the actor does not change."""
+        """Take one step of actor and critic, clipped separately; if ``critic_alone``, only the critic takes a step."""
         self.follow(None if critic_alone else kl)
         for weights in (self.weights, self.critic_weights):
             nn.utils.clip_grad_norm_(weights, max_grad_norm)
