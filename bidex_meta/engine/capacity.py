@@ -16,7 +16,7 @@ class Capacity:
     contacts: (
         Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world
     )
-    convex: Whole  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
+    convex: Whole  # pairs of one kind that the convex collider (eggs, cylinders) treats at a time; also a shared pool
     rows: Whole  # constraint rows, a hard limit for each world
 
 

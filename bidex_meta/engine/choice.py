@@ -33,7 +33,7 @@ def choose_engine(
 
 
 def known_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name, even if it is missing here; raise BidexError unless it is a CPU or CUDA device."""
+    """Return the device with this name, even if this machine lacks it; raise BidexError if it is not CPU or CUDA."""
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError, ValueError):
@@ -47,7 +47,7 @@ def known_device(device: str | torch.device) -> torch.device:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name, with ``auto`` resolved; raise BidexError if this machine has no such device."""
+    """Return the device with this name, with ``auto`` resolved; raise BidexError if this machine has no such device."""
     if isinstance(device, str) and device == "auto":
         if torch.cuda.is_available():
             device = "cuda"

@@ -87,7 +87,7 @@ def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
 
 
 def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Return whether each of some rows (indices, (k,)) has a number out of bounds or not finite, bool (k,)."""
+    """Return for each row in ``rows`` (indices, (k,)) whether a number is out of bounds or not finite, bool (k,)."""
     bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for name, value in fields.items():  # a comparison with NaN is false
         if name in ("qpos", "qvel", "mocap_pos", "mocap_quat"):

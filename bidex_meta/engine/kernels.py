@@ -156,9 +156,9 @@ class Guard:
     """Detection and quarantine of broken worlds. Nothing here waits for the device."""
 
     def __init__(self, model: mujoco.MjModel, data: mjw.Data) -> None:
-        """Allocate on the current device; ``keep`` must follow before the first step."""
+        """Allocate on the current device; ``keep`` must be called before the first step."""
         self.failed = wp.zeros(data.nworld, dtype=bool)
-        """Which worlds broke since their last reset, shape (num,), bool."""
+        """True for worlds that broke since their last reset, shape (num,), bool."""
         self._quaternions = wp.array(quaternion_columns(model)[::4].astype(np.int32), dtype=int)
         self._fixtures = [wp.clone(data.mocap_pos), wp.clone(data.mocap_quat)]
 
@@ -171,7 +171,10 @@ class Guard:
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Mark and disarm, before a control step, worlds broken by hand in numbers that no substep checks."""
+        """Mark and disarm worlds in which a number that no substep checks was broken by hand.
+
+        This runs before each control step.
+        """
         applied = [d.ctrl, d.qfrc_applied, d.xfrc_applied]
         width = max(array.shape[1] for array in applied)
         fixtures = d.mocap_pos.shape[1]

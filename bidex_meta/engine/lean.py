@@ -57,7 +57,7 @@ class Lean:
 
 
 def lean(m: mjw.Model) -> Lean:
-    """Make lean copies of a model, whose arrays must not gain a feature later that they lack now."""
+    """Make lean copies of a model; the model's arrays must not gain a feature later that they lack now."""
     implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
     none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
     early = "early"
@@ -95,7 +95,10 @@ def lean(m: mjw.Model) -> Lean:
 
 
 def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
-    """Return the callback that ends passive forces: gravity was off during them and is switched on again."""
+    """Return the callback that runs after all other passive forces, which are computed with gravity switched off.
+
+    It switches gravity on again and adds the gravity compensation of the bodies that have one.
+    """
     bodies = wp.array(np.flatnonzero(m.body_gravcomp.numpy().any(axis=0)), dtype=int, device=m.body_gravcomp.device)
     constants = [m.opt.gravity, m.body_rootid, m.body_mass, m.body_gravcomp, m.body_isdofancestor, bodies]
 

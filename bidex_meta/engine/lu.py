@@ -1,7 +1,8 @@
 """The implicit integrator's linear system, one warp of threads per world (mujoco_warp: one thread).
 
-The matrix has entries where one degree of freedom is the other's ancestor, or itself: mujoco_warp's D structure.
-Eliminating from the last degree of freedom on fills no entry in. The results equal mujoco_warp's, bit for bit.
+The matrix has an entry for two degrees of freedom if they are the same or if one is the ancestor of the other
+(mujoco_warp's D structure). Elimination begins with the last degree of freedom and therefore needs no further entries.
+The results equal mujoco_warp's, bit for bit.
 """
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -22,7 +23,7 @@ Numbers = wp.array2d[float]
 
 @wp.func_native(snippet="WP_TILE_SYNC();")
 def _wait() -> None:
-    """Wait until all threads of the world are here."""
+    """Wait until all threads of the world have reached this point."""
     ...
 
 
@@ -67,7 +68,7 @@ def _solve(
 
 
 class ImplicitSolver:
-    """``mjw.implicit`` of a model with the fully implicit integrator."""
+    """A replacement of ``mjw.implicit`` for a model with the fully implicit integrator."""
 
     def __init__(self, m: mjw.Model) -> None:
         """List the entries that each elimination updates; arrays are on the model's device."""

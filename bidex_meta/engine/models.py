@@ -13,7 +13,7 @@ _LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
 
 
 def model_identity(model: mujoco.MjModel) -> str:
-    """Return 12 hexadecimal digits of all solver options and all numbers of bodies, joints, geoms and actuators.
+    """Return 12 hexadecimal digits: a digest of solver options and numbers of bodies, joints, geoms and actuators.
 
     Names, appearance and MuJoCo's version do not matter. Numbers are rounded to six digits, so that a processor that
     rounds the compiler's sums differently gives the same digits.
@@ -28,7 +28,7 @@ def model_identity(model: mujoco.MjModel) -> str:
 
 
 def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
-    """Return the common ``model_identity`` of several models, by name."""
+    """Return one digest (12 hexadecimal digits) of several models and their names, from each ``model_identity``."""
     texts = [f"{name} {model_identity(models[name])}" for name in sorted(models)]
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 

@@ -21,14 +21,14 @@ class Engine(Protocol):
     num: int
     device: torch.device
     masked: bool
-    """Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in a step may
-    wait for a value or have a shape that depends on one."""
+    """True if the engine suits accelerators: resets write all rows under a mask, and nothing in a step may wait for a
+    value or have a shape that depends on a value."""
     qpos: Tensor  # shape (num, nq)
     qvel: Tensor  # shape (num, nv)
     ctrl: Tensor  # position targets, shape (num, nu)
     xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
     sensordata: Tensor  # shape (num, nsensordata)
-    _state: dict[str, Tensor]  # views of what a state holds
+    _state: dict[str, Tensor]  # views of the fields in a saved state
     _mocap: list[Tensor]  # positions and quaternions of movable fixtures, or empty
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
@@ -55,15 +55,16 @@ class Engine(Protocol):
         ...
 
     def warnings(self) -> Tensor:
-        """Return how many kinds of warnings each simulation has raised since its last reset. Shape (num,), int64."""
+        """Return the number of kinds of warnings of each simulation since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
         """Restart the simulations of a mask (num,), bool.
 
         ``start``: ``qpos``, then position and quaternion (w, x, y, z) of each fixture whose place differs from
-        task to task. It has one row for each true entry, (k, nq + 7 nmocap). If the engine is ``masked`` and must not
-        count them, it has one row for every simulation, and rows outside the mask are ignored.
+        task to task. It has one row for each true entry of the mask, (k, nq + 7 nmocap). A ``masked`` engine must not
+        count true entries; for such an engine ``start`` has a row for every simulation, and rows outside the mask are
+        ignored.
         """
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -43,7 +43,7 @@ class WarpEngine(Engine):
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after changing the model otherwise. On CUDA graphs run on the engine's own stream,
+    place, and call ``recapture`` after any other change of the model. On CUDA graphs run on the engine's own stream,
     between the work that torch's current stream got before the call and the work it gets afterwards.
 
     ``unstable`` reports a world with a bad number. The world stands at the model's reference pose until its reset: left
@@ -276,7 +276,10 @@ class WarpEngine(Engine):
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:
-        """Run Warp on the engine's stream, which waits for torch's stream before, as torch's does for it after."""
+        """Run Warp on the engine's stream.
+
+        First that stream waits for torch's stream, and afterwards torch's stream waits for it.
+        """
         if self._lent is None:
             with wp.ScopedDevice(self._device):
                 yield
@@ -335,7 +338,7 @@ def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Mo
 
 
 def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> None:
-    """Write each world's frames of static geoms, which no step computes, from its own model."""
+    """Write the frames of static geoms, which no step computes, into each world, from the world's own model."""
     frames = [mujoco.MjData(model) for model in models]
     for model, one in zip(models, frames, strict=True):
         mujoco.mj_kinematics(model, one)

@@ -15,14 +15,15 @@ CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
 """The hand's centre of mass in the mount frame at zero pose, metres: the point at which a moving base is driven
 (docs/figures.md, base)."""
 LINEAR_DAMPING, ANGULAR_DAMPING = (501.0, 501.0, 501.0), (2.60, 2.65, 1.12)
-"""Damping of a moving base, N s/m, and about its own axes, N m s/rad: the hand's 5.011 kg and inertia times the
-original's 100 per second (docs/figures.md, base)."""
+"""Linear damping of a moving base, N s/m, and angular damping about the base's axes, N m s/rad: the hand's mass of
+5.011 kg and its inertia, times the original's 100 per second (docs/figures.md, base)."""
 FORCE_PER_SCALE, TORQUE_PER_SCALE = 100_000.0 / 60.0, 1_000.0 / 60.0
-"""N and N m per unit of action and of a class's translation and orientation scale (docs/figures.md, base)."""
+"""Force (N) of an action of 1 at a translation scale of 1, and torque (N m) of an action of 1 at an orientation scale
+of 1 (docs/figures.md, base)."""
 TOUCHED = (*(f"{finger}distal" for finger in FINGERS), "palm", "lfmetacarpal")
 """Bodies with touch sensors: fingertips, palm, and the little finger's metacarpal, which is the palm's outer edge."""
 DISTAL_PER_MIDDLE = 0.00805 / 0.00705
-"""Distal over middle joint angle when the coupling tendon is at rest (docs/figures.md, hand joints)."""
+"""Ratio of the distal to the middle joint angle when the coupling tendon is at rest (docs/figures.md, hand joints)."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +65,21 @@ def hand() -> Hand:
 
 
 SIDES = ("right", "left")
-"""Both hands use the same right-hand model; every table has this order."""
+"""The hands, in the order that every table has. Both hands use the same right-hand model."""
 
 RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
-"""Contact bits. Geoms of one hand never collide by bits (only by its 18 listed pairs), nor do fixtures with each
-other; all other kinds collide. An object's file marks a geom INNER if a table always touches another geom of the object
-first, so that tables need not test it."""
+"""Contact bits. Geoms of one hand never collide by bits, but only in the 18 listed pairs. Fixtures do not collide with
+each other. All other kinds collide. An object's file marks a geom INNER if a table always touches another geom of the
+object first, so that tables need not test it."""
 _ALL = RIGHT | LEFT | OBJECT
 _COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: _ALL, FIXTURE: _ALL, INNER: _ALL | INNER}
 _TOUCH_RADIUS = 0.12
-"""Of a touch sensor's site about its body's origin, metres; the palm reaches 0.1 m."""
+"""Radius of a touch sensor's site, which is centred at the body's origin, metres; the palm reaches 0.1 m."""
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}
 
 
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
-    """Give geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER geoms keep theirs."""
+    """Give geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER geoms keep their bits."""
     for geom in geoms:
         if geom.contype:  # others are visual only
             own = INNER if geom.contype == INNER else kind

@@ -12,7 +12,7 @@ from bidex_meta.hands.hand import FINGERS, SIDES
 Section = tuple[float, float, float, float, float]
 """A cross-section: z, centre x and y, half-widths along x and y, millimetres, in the frame of a body."""
 _AROUND, _ALONG, _DOME = 20, 4, 4
-"""Corners of a ring, rings from one section to the next, rings of a rounded end."""
+"""Numbers of corners of a ring, of rings from one section to the next, and of rings of a rounded end."""
 _HIDDEN_GROUP = 3
 """Viewers leave out geoms of this group."""
 _OF_HANDS = tuple(f"{side}/" for side in SIDES)

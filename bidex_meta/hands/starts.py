@@ -17,16 +17,18 @@ hand frames)."""
 _PALM_OFFSET = 0.034
 _PALM_HALF_THICKNESS = 0.0111
 _ROOTS = ((0.033, 0.095), (0.011, 0.099), (-0.011, 0.095), (-0.034, 0.088))
-"""x and z of the four fingers' roots in the palm frame, metres, index to little finger (the same place)."""
+"""x and z of the four fingers' roots in the palm frame, metres, from index to little finger (docs/figures.md, hand
+frames)."""
 _CUP_LIFT, _CUP_TILT = 0.039, 0.571
-"""Metres of root height and radians of bend that a radian of LFJ4 gives the little finger (docs/figures.md, hand
-joints)."""
+"""Rise of the little finger's root, metres, and bend of the little finger, radians, per radian of LFJ4
+(docs/figures.md, hand joints)."""
 _METACARPAL = ((-0.0335, 0.019, 0.040), (-0.0335, 0.033, 0.068))
-"""Ends of the little finger's metacarpal in the palm frame: x and z in metres, between them the height that a radian of
-LFJ4 gives its outer edge (docs/figures.md, hand joints and hand geoms)."""
+"""Ends of the little finger's metacarpal in the palm frame: x, metres; rise of the outer edge per radian of LFJ4,
+metres; z, metres (docs/figures.md, hand joints and hand geoms)."""
 _METACARPAL_RADIUS = 0.0111
 _THUMB = ((0.0339, -0.009, 0.0289), (0.1019, -0.009, 0.0969))
-"""Ends of the thumb's centre line in the palm frame, all its joints zero, metres (docs/figures.md, hand geoms)."""
+"""Ends of the thumb's centre line in the palm frame, metres, if all its joints are at zero (docs/figures.md, hand
+geoms)."""
 _THUMB_RADIUS = 0.013
 _THUMB_ABOVE_PALM = _THUMB_RADIUS + 0.009 - _PALM_HALF_THICKNESS
 _LENGTHS = (0.045, 0.025, 0.024)
@@ -37,12 +39,13 @@ _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _SLACK = 0.002
 """Overlap left at a start, metres, so that contacts carry the object from the first step; 5 mm is allowed."""
 _MAX_CROSSING = 0.1
-"""Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
-roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
+"""Largest difference between the side angles of neighbouring fingers at which their tips stay apart, rad. The roots are
+22 mm apart, the tips are 94 mm away from the roots and have radii of 7 mm, and 3 mm of overlap is allowed."""
 
 
 _Support = Callable[[Tensor, Tensor], Tensor]
-"""Extent of a body from its origin against vectors (n, ..., 3) of the given lengths (n, ...), metres."""
+"""Function of vectors (n, ..., 3) that point to a body's origin, and of their lengths (n, ...): the extent of the body
+from its origin in the opposite direction, metres."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +82,10 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
 def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
     """Lift an egg off the palm and open the fingers that noise would push into it.
 
-    Joint angles, rad, (n, 24); the egg's centre and long axis (unit) in the mount frame, (n, 3); its short and long
-    semi-axis. Returns the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres.
-    The distance to the palm's plane and the fingers' capsules is bounded by the spheroid's support towards its centre.
+    ``joints`` (n, 24) are the joint angles, rad; ``position`` and ``axis`` (n, 3) are the egg's centre and the unit
+    vector along its long axis, in the mount frame; ``radius`` and ``half`` are its short and long semi-axes. Returns
+    the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres. Distances to the
+    palm's plane and to the fingers' capsules are bounded by the spheroid's support towards them.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
@@ -99,8 +103,8 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
     """Do the same as ``make_room`` for the convex hull of some balls; also lay the thumb flat and out of the way.
 
-    Arguments: the object's origin (n, 3) in the mount frame; the balls' centres relative to it (n, k, 3), turned with
-    the object; their radii (k,), 0 for corners; metres.
+    ``position`` (n, 3) is the object's origin in the mount frame. ``points`` (n, k, 3) are the balls' centres relative
+    to the origin, turned with the object. ``radii`` (k,) are the balls' radii, 0 for corners. Lengths in metres.
     """
     joints = joints.clone()
     joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0
@@ -124,10 +128,10 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
 
 
 def meets_box(joints: Tensor, pose: HandPose, box: Tensor, half: tuple[float, float, float]) -> Tensor:
-    """Return in which starts a finger penetrates a box by more than the slack. Shape (n,), bool.
+    """Return for each start whether a finger penetrates a box by more than the slack. Shape (n,), bool.
 
-    Joint angles, rad, (n, 24), of a hand that starts at ``pose``; the box's poses (n, 7), quaternion (x, y, z, w), and
-    its half sizes, metres. Each link is tested at five points of its centre line.
+    ``joints`` (n, 24) are the joint angles, rad, of a hand that starts at ``pose``. ``box`` (n, 7) are the box's poses,
+    quaternion (x, y, z, w); ``half`` are its half sizes, metres. Each link is tested at five points of its centre line.
     """
     start, along, length = _finger_segments(joints)
     share = constant(_SHARES, joints)
@@ -154,7 +158,7 @@ def _wrist_axis(joints: Tensor) -> Tensor:
 
 
 def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:
-    """Return joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
+    """Return joints with opened fingers and the shift off the palm; ``reach`` is the support towards the palm, (n,)."""
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
     start, along, length = _finger_segments(joints)

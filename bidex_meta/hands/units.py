@@ -1,7 +1,7 @@
 """Fingers and palms as agents (appendix A.2): a partition of the hands' units is one line of text. Imports no torch.
 
-``single``, ``hands``, ``fingers`` (twelve agents), ``thrower=right/palm+right/thumb;helper=...``, or the path of a TOML
-file with a table ``[agents]``: ``thrower = ["right/palm", "right/thumb"]``.
+A partition is ``single``, ``hands``, ``fingers`` (twelve agents), ``thrower=right/palm+right/thumb;helper=...``, or the
+path of a TOML file with a table ``[agents]``: ``thrower = ["right/palm", "right/thumb"]``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,10 @@ UNITS: dict[str, str] = {"palm": "WR", "first": "FF", "middle": "MF", "ring": "R
 """The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base if it
 moves."""
 NAMED = ("single", "hands", "fingers")
-"""Partitions that need no list."""
+"""Names of partitions that need no list of units."""
 
 Agents = str | Path | Mapping[str, Sequence[str]]
-"""A partition: a name of :data:`NAMED`, a line, a TOML file, or units by the agent's name."""
+"""A partition: a name of :data:`NAMED`, a line, a TOML file, or a mapping from each agent's name to its units."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,10 @@ def partition_line(agents: Agents) -> str:
 
 
 def units_by_agent(line: str) -> dict[str, list[str]]:
-    """Return the units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
+    """Return the units of each agent in a line ``name=unit+unit;name=unit``.
+
+    Raises BidexError for another form, or if an agent occurs twice.
+    """
     found: dict[str, list[str]] = {}
     for part in line.split(";"):
         name, equals, units = (each.strip() for each in part.partition("="))

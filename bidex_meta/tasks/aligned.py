@@ -9,12 +9,12 @@ from bidex_meta.tasks.variation import VariationSpace
 
 
 class Hidden(NamedTuple):
-    """A part of a task that only goal entries show; success requires each part separately."""
+    """A part of a task that observations show only in goal entries; success requires each part separately."""
 
     names: tuple[str, ...]
     """Components of the variation: coordinates of one point (metres, rad), or the draws of an orientation."""
     tolerance: float
-    """Distance from it that success allows, or angle of rotations; of a choice by sign infinite."""
+    """Distance from the goal that success allows, or the allowed angle for an orientation; infinite for a sign."""
     kind: Literal["point", "orientation", "sign"] = "point"
 
     def described(self, space: VariationSpace) -> str:
@@ -27,12 +27,12 @@ class Hidden(NamedTuple):
 
 
 class Error(NamedTuple):
-    """The distance of a state from solved in one respect."""
+    """One of the values that must be small for a state to be solved."""
 
     value: Tensor
-    """Not negative, shape (n,), in the unit of its tolerance."""
+    """Not negative, shape (n,), in the unit of the tolerance."""
     tolerance: float
-    """Solved states are below it."""
+    """Bound below which the value lies in solved states."""
 
 
 def at_least(value: Tensor, least: float, tolerance: float) -> Error:
@@ -48,10 +48,11 @@ def within(errors: list[Error]) -> Tensor:
 def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> dict[str, Tensor]:
     """Return the terms (n,) of the reward of version 2, in [0, 1]: their sum is 1 if ``solved``, otherwise at most 0.9.
 
-    ``solved`` is 1 or 0. If it is 0, the terms are ``far`` and ``near``, means over the class's errors e in units of
-    their tolerances, of 1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes
-    with ``guides``, distances d of hands to points, add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near
-    0.65; with reach 0.2, far 0.2 and near 0.5.
+    The term ``solved`` is 1 or 0. If it is 1, all other terms are 0. Otherwise they depend on the class's errors e,
+    divided by their tolerances: ``far`` is the mean of 1 - tanh(e / 16), and ``near`` is the mean of exp(-0.3 e). For
+    an egg at distance d (m) from its goal these are 1 - tanh(2 d) and exp(-10 d). In classes with ``guides``, which are
+    distances d (m) of hands from points, ``reach`` is the mean of 1 - tanh(3 d). The weights are 0.25 for far and 0.65
+    for near; in classes with reach they are 0.2 for reach, 0.2 for far and 0.5 for near.
     """
     off = torch.stack([error.value / error.tolerance for error in errors])
     far = (1.0 - torch.tanh(off / 16.0)).mean(dim=0)

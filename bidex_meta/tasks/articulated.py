@@ -1,4 +1,4 @@
-"""Articulated objects on a table: appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes."""
+"""Articulated objects on a table (appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes)."""
 
 import math
 from collections.abc import Mapping
@@ -34,8 +34,8 @@ from bidex_meta.utils.maths import (
 
 _SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.5 * math.pi))
 _PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
-"""The pivot on the left hand's half, and the right handle's point from there on the other half, metres
-(docs/figures.md, objects)."""
+"""Position of the pivot on the left hand's half of the shears, and position of the right handle's point on the right
+hand's half, relative to the pivot, metres (docs/figures.md, objects)."""
 
 
 _SHUT = 0.59
@@ -43,12 +43,12 @@ _SHUT = 0.59
 
 
 class OpenScissors(ReachTask):
-    """Open shears that lie on a table by a task's angle, each hand at its loop.
+    """Open shears that lie on a table to a task's angle, with each hand at one loop.
 
-    Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open, so a task freezes it (0
-    is 34 degrees open; -0.59 is shut, the angle at the start). The object pose is the pose of the left hand's half. The
-    goal block describes the moving half: its handle's point and its orientation at the target angle, for the present
-    pose of the other half. The rotation difference is also the moving half's and shows the missing angle.
+    Observation: Table 30 (428). Reward: equation 14. The formula does not give the target angle, so each task freezes
+    one (0 is 34 degrees open; -0.59 is shut, the angle at the start). The object pose is the pose of the left hand's
+    half. The goal block shows position and orientation that the right handle has at the target angle, for the present
+    pose of the left hand's half. The rotation difference is that of the right hand's half and shows the missing angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -76,7 +76,11 @@ class OpenScissors(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: rotation (n, 4); ``ghost``: (n, 7)."""
+        """Return the shears' shift and turn and their goal.
+
+        ``scissors``: shift and turn (n, 3); ``target``: angle (n, 1), rad, and as a quaternion ``turn`` (n, 4);
+        ``ghost``: pose of the goal in pictures of version 1 (n, 7).
+        """
         root = constant((*_SCISSORS.position, *_SCISSORS.quaternion), variation).repeat(len(variation), 1)
         place(root, variation[:, :3])
         turn = yaw_quaternion(variation[:, 3])
@@ -111,7 +115,7 @@ class OpenScissors(ReachTask):
         return within(self.errors(state))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the right handle; in version 1 with the shears at the task's start."""
+        """Return the goal of the right handle; in version 1 it is that of shears at the task's start."""
         if self.rules.wide:
             pose = self.observe(state)["goal_pose"]
         else:
@@ -138,11 +142,11 @@ _BODY_POINT = 0.07
 
 
 class OpenPenCap(ReachTask):
-    """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
+    """Pull the cap off a pen that lies on a table, with the left hand at its body and the right hand at its cap.
 
-    Observation: Table 34 (428). Reward: equation 16. Success is a cap pulled 13 cm, its own length. Goal position is
-    the cap's point at 0.3 m with the body at the task's start, and goal orientation is the pen's at the start; reward
-    and success do not read the goal.
+    Observation: Table 34 (428). Reward: equation 16. For success the cap must be pulled by 13 cm, its own length. The
+    goal position is where the cap's point is 0.3 m from the body's point, if the body is at the task's start. The goal
+    orientation is that of the pen at the start. Reward and success do not read the goal.
     """
 
     needs = Capacity(56, 0, 121)
@@ -173,7 +177,10 @@ class OpenPenCap(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        """Return ``pen``: shift and turn (n, 3); ``gap``: target distance of the points (n, 1), m; goal of the cap.
+
+        ``goal`` is the pose of the goal (n, 7), ``goal_inverse`` the inverse of its rotation (n, 4).
+        """
         pen = constant((*_PEN.position, *_PEN.quaternion), variation).repeat(len(variation), 1)
         place(pen, variation[:, :3])
         rotation = xyzw(pen[:, 3:])
@@ -222,7 +229,8 @@ class OpenPenCap(ReachTask):
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
 _TRAVEL = 0.5585
 _PRESSED = (-0.0241, -0.001, 0.0427)
-"""The button point at full travel from the base, world axes: hinge origin and point lie flush with the face there."""
+"""Position of the button's point at full travel relative to the base, along the world's axes, metres. The hinge's
+origin and the point then lie flush with the face."""
 _PRESSED_QUATERNION = quaternion_product(quaternion_from_rpy(_FACE_UP), quaternion_from_rpy((0.0, _TRAVEL, 0.0)))
 """Orientation (w, x, y, z) of the rocker at full travel."""
 
@@ -233,11 +241,12 @@ _BAR = (0.005, 0.09, 0.005)
 class Switch(ReachTask):
     """Press the buttons of two rocker switches.
 
-    Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The raised half of each rocker is
-    the button, its point 3.5 cm from the hinge on the surface, its target the same point at full travel. Switch 1 is
-    the one at -y, for the left hand. The entries of switch 1's pose and velocity are its rocker's, because the housing
-    does not move. The goal block holds switch 1's target and its rocker's orientation at full travel. A task freezes
-    the places of the housings, 3 cm around the nominal place, unturned; an episode draws nothing.
+    The table is 0.5 x 1 m and 55 cm high. Observation: Table 36 (428). Reward: equation 17. The raised half of each
+    rocker is the button. The button's point lies on the surface, 3.5 cm from the hinge; its target is its position at
+    full travel. Switch 1 is at -y, for the left hand. The entries for the pose and velocity of switch 1 show its
+    rocker, because the housing does not move. The goal block holds the target of switch 1 and the orientation of its
+    rocker at full travel. A task shifts the housings by up to 3 cm along x and y, but does not turn them; an episode
+    draws nothing.
     """
 
     needs = Capacity(36, 0, 90)
@@ -277,7 +286,11 @@ class Switch(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return base positions; ``goal1``, ``goal2``: buttons' target points, (n, 3); ``goal``: switch 1's pose."""
+        """Return ``switch1``, ``switch2``: base positions (n, 3); ``goal1``, ``goal2``: buttons' target points (n, 3).
+
+        ``goal`` is the pose of switch 1's button at full travel (n, 7), ``goal_inverse`` the inverse of its rotation
+        (n, 4). With wide variation ``angles`` are the rockers' target angles (n, 2), rad.
+        """
         frozen = {}
         for i, switch in enumerate(self.objects, start=1):
             position = constant(switch.position, variation).repeat(len(variation), 1)
@@ -321,7 +334,7 @@ class Switch(ReachTask):
         return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals of the buttons' points, with wide variation."""
+        """Return the goals of the buttons' points with wide variation, otherwise an empty list."""
         if not self.rules.wide:
             return []
         found = []

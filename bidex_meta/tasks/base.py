@@ -60,51 +60,54 @@ class Solver:
 
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
-"""For eggs, held for a second: creeping by a millimetre per second does no harm."""
+"""For eggs. They are held for only a second, so that creeping by a millimetre per second does no harm."""
 GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
-"""For an egg that is thrown across a narrow gap, so that nothing is fast."""
+"""For an egg that is thrown across a narrow gap, where nothing moves fast."""
 FIRM = Solver(100, 50)
-"""For light bodies between hands and table, which the solver would kick by stopping early at the common limits."""
+"""For light bodies between hands and table: with the common limits the solver would stop early and kick them."""
 FAST = Solver(100, 50, time_step=1.0 / 180.0)
 """For fast bases near rigid objects: in 1/120 s a hand at full speed sinks 24 mm into a table."""
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
-"""For fast bases that press objects as thin as a finger on a table."""
+"""For fast bases that press objects as thin as a finger against a table."""
 JITTER, JOINT_NOISE = 0.005, 0.1
 """Half width of a fixture's shift in jittered starts, metres, and joint noise as a share of each joint's range."""
 
 
 class TaskClass(ABC):
-    """One of the manipulation tasks, batched over environments: the first axis of all tensors, in engine precision.
+    """The base of the manipulation tasks, batched over environments.
 
-    A class has no state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+    Environments are the first axis of all tensors, which have the engine's precision. A class has no state: what a task
+    freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: the task in one line.
         formula: The printed reward; ``solved``: the condition for success in one line.
         deviations: Intended differences from the appendix, one line each.
-        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, if it takes longer.
-        right: Start pose of the right hand; ``left`` of the left one.
-        transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
+        episode_steps: Time limit, control steps; ``wide_steps``: time limit with wide variation, if that takes longer.
+        right: Start pose of the right hand; ``left``: start pose of the left hand.
+        transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale``: that of torques.
         start_draws: Number of uniform numbers that the start of an episode takes.
         variation_space: Components that a task of this class freezes; an attribute or a property. With wide variation
             these are only the hidden components: ``adopt`` divides ``wide_space``.
         episode_space: Components that every episode draws, with wide variation: those that are not hidden.
-        wide_space: Components of both spaces, in the order that ``freeze`` reads; None: a class without version 2.
-        wide_solved: ``solved`` with wide variation.
-        wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
+        wide_space: Components of both spaces, in the order in which ``freeze`` reads them; None: the class has no
+            version 2.
+        wide_solved: The condition for success with wide variation.
+        wide_blocks: Observation blocks that are appended with wide variation, in classes whose printed observation has
+            no goal block.
         jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
         rules: The suite's rules; ``adopt`` sets them.
-        chosen: Options of the constructor by name, given or by default; ``registry.get`` sets them.
-        blocks: The observation behind both hands' blocks.
-        moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
-            class says (fixed only for HandOver).
+        chosen: Options of the constructor by name, with given or default values; ``registry.get`` sets them.
+        blocks: Observation blocks that follow both hands' blocks.
+        moving_base: True if the hands' bases are driven (52 actions), False if they are fixed (40 actions). In the
+            constructor None stands for the class's default (fixed only in HandOver).
         touch: Whether the hands have touch sensors, which the observation shows; ``registry.get`` sets it.
         solver: Settings of the contact solver for this class.
-        needs: Maximum number of contacts and of constraint rows in 30,208 states under rough actions, for the fixed
-            buffers of mujoco_warp; measured with ``python -m tools.bench capacity --task NAME --steps 30000``. A class
-            that was not measured has the largest numbers of all classes.
-        camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
+        needs: Sizes for the fixed buffers of mujoco_warp: the maximum numbers of contacts and constraint rows in 30,208
+            states under rough actions. ``python -m tools.bench capacity --task NAME --steps 30000`` measures them. A
+            class that was not measured has the largest numbers of all classes.
+        camera_target: Point at which pictures look, world, metres; ``camera_distance``: the camera's distance from it.
         camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
         depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
             at ``camera_target`` from the front.
@@ -188,10 +191,11 @@ class TaskClass(ABC):
         return low + (high - low) * shares[:, : space.size]
 
     def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
-        """Return ``freeze`` of tasks' variations (n, variation_space.size), completed by ``episode_space``.
+        """Return the result of ``freeze`` for tasks' variations (n, variation_space.size) and ``episode_space``.
 
-        ``draws`` in [-1, 1], (n, at least episode_space.size), belong to the episodes and decide their starts. None
-        stands for the middle of ``episode_space``, because rewards, success and observations depend on the task only.
+        ``draws`` in [-1, 1], (n, at least episode_space.size), give the components of ``episode_space``, which only
+        affect the start of an episode. None stands for the middle of ``episode_space``: rewards, success and
+        observations do not depend on these components.
         """
         space = self.episode_space
         if not space.size:
@@ -242,7 +246,7 @@ class TaskClass(ABC):
         """Write the start of an episode, from uniform numbers in [-1, 1], (n, start_draws), and frozen numbers.
 
         ``qpos`` maps a part (``right/joints``, an object, ...) to views (n, k) of its positions that hold the nominal
-        start and are written in place; MuJoCo's quaternion order (w, x, y, z).
+        start and are written in place; quaternions are (w, x, y, z).
         """
 
     @property
@@ -284,7 +288,7 @@ class TaskClass(ABC):
         return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the layout's blocks that sensors do not give, by name, each (n, size); empty by default."""
+        """Return the layout's blocks that are not read from sensors, by name, each (n, size); empty by default."""
         return {}
 
     @abstractmethod
@@ -320,9 +324,9 @@ class TaskClass(ABC):
         return self.summary
 
     def instruction(self, variation: Sequence[float] | np.ndarray | None = None, hidden: bool = False) -> str:
-        """Return the instruction of the task with a variation (variation_space.size,), or of the class for None.
+        """Return the instruction of the task with this variation (variation_space.size,); for None that of the class.
 
-        With ``hidden`` the sentence does not tell what suites with hidden goals hide.
+        With ``hidden`` the sentence leaves out what suites with hidden goals hide.
         """
         if variation is None or hidden:
             return self.instruct(None)
@@ -340,7 +344,7 @@ class TaskClass(ABC):
         return aligned_terms(self.solved_in(state), self.errors(state), self.guides(state))
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return whether the episode ends here other than by time. Shape (n,), bool; never by default."""
+        """Return whether the episode fails and therefore ends here. Shape (n,), bool; always False by default."""
         first = next(iter(state.frozen.values()))
         return torch.zeros(len(first), dtype=torch.bool, device=first.device)
 

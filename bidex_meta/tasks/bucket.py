@@ -26,13 +26,14 @@ from bidex_meta.utils.validation import whole_number
 FLOOR, MOUTH, RIM = -0.049, 0.0345, 0.0445
 """Heights of the inner floor, the site ``mouth`` and the rim in the frame of assets/objects/bucket.xml, metres."""
 _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
-"""Inner radius at these heights, to the middle of a wall, metres."""
+"""Inner radius at the floor and at the rim, to the middle of a wall, metres."""
 
 
 def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
     """Return which points (n, k, 3) lie in a bucket, between floor and rim and within the wall. (n, k), bool.
 
-    Points and buckets' origins (n, 3) in the world, metres; the buckets' orientations (x, y, z, w), (n, 4).
+    ``bucket`` (n, 3) holds the buckets' origins, ``quaternion`` (n, 4) their orientations (x, y, z, w). Points and
+    origins are in the world frame, metres.
     """
     x, y, z = rotate(conjugate(quaternion)[:, None], points - bucket[:, None]).unbind(-1)
     share = (z - FLOOR) / (RIM - FLOOR)
@@ -41,7 +42,7 @@ def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def stands(quaternion: Tensor) -> Tensor:
-    """Return whether buckets are within 45 degrees of upright, by orientations (x, y, z, w), (n, 4). (n,), bool."""
+    """Return whether buckets with orientations (x, y, z, w), (n, 4), are within 45 degrees of upright. (n,), bool."""
     return uprightness(quaternion) > math.cos(math.radians(45.0))
 
 
@@ -49,12 +50,12 @@ _TURN = "quaternion (x, y, z, w), world frame"
 
 
 class GraspAndPlace(ReachTask):
-    """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
+    """Put a block into a bucket: the left hand takes the block, the right hand takes the bucket.
 
-    Table 1 x 1 m, 60 cm high. Observation: the original's (425; docs/figures.md, observation). Reward: its formula with
-    hand-point distances. The original's success, d < 20 cm, is met by a block next to the bucket. A task shifts and
-    turns bucket and block. Both start on the table; the original's start inside it. Bucket pose and bucket link have
-    one orientation here, so entries 401-404 and 414-417 are equal.
+    The table is 1 x 1 m and 60 cm high. Observation: as in the original (425; docs/figures.md, observation). Reward:
+    the original's formula with hand-point distances. The original's condition for success, d < 20 cm, is also met by a
+    block next to the bucket. A task shifts and turns bucket and block. Both start on the table; in the original they
+    start inside it. Bucket pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
     """
 
     needs = Capacity(35, 4, 108)
@@ -96,7 +97,7 @@ class GraspAndPlace(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``bucket``, ``block``: shifts, turns (n, 3); with wide variation ``goal``: bucket's pose (n, 7)."""
+        """Return ``bucket``, ``block``: shift, turn (n, 3); with wide variation ``goal``: bucket's target (n, 7)."""
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
 
     def hides(self) -> tuple[Hidden, ...]:
@@ -127,7 +128,10 @@ class GraspAndPlace(ReachTask):
 
 
 def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
-    """Return ``goal``: the bucket's nominal place shifted (n, 2), metres, upright; nothing without a shift (n, 0)."""
+    """Return ``goal``: the upright bucket's nominal pose, moved by ``shift`` (n, 2), metres, and the inverse rotation.
+
+    If ``shift`` is empty, (n, 0), return an empty dict.
+    """
     if not shift.shape[1]:
         return {}
     position = pad(shift, (0, 1)) + constant(bucket.position, shift)
@@ -135,7 +139,7 @@ def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
 
 
 def _bucket_error(state: TaskState) -> list[Error]:
-    """Return the bucket's distance from its goal, if it has one."""
+    """Return a list with the bucket's distance from its goal; the list is empty if the bucket has no goal."""
     goal = state.frozen.get("goal")
     if goal is None:
         return []
@@ -143,7 +147,7 @@ def _bucket_error(state: TaskState) -> list[Error]:
 
 
 def _bucket_ghosts(state: TaskState) -> list[Ghost]:
-    """Return the goal of the bucket, if it has one."""
+    """Return a list with the bucket's goal; the list is empty if the bucket has no goal."""
     goal = state.frozen.get("goal")
     if goal is None:
         return []
@@ -151,7 +155,7 @@ def _bucket_ghosts(state: TaskState) -> list[Ghost]:
 
 
 def _bucket_words(goal: Mapping[str, float] | None, bucket: SceneObject, wide: bool) -> str:
-    """Return the end of an instruction that gives the bucket's goal; empty if it has none."""
+    """Return the end of an instruction, which gives the bucket's goal; it is empty if the bucket has no goal."""
     if not wide:
         return ""
     if goal is None:
@@ -163,8 +167,8 @@ def _bucket_words(goal: Mapping[str, float] | None, bucket: SceneObject, wide: b
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _SINK, _DEEPEST = 5.0, 0.2
-"""Metres that the goal sinks for each metre that the bucket is lifted, and its largest depth below the mouth of a
-standing bucket, metres."""
+"""Metres by which the goal sinks for each metre by which the bucket is lifted, and the goal's largest depth below the
+mouth of a standing bucket, metres."""
 _TROUGH_TILT = 0.541
 _TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
 """The box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
@@ -175,19 +179,21 @@ _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 class PourWater(ReachTask):
     """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
 
-    Table 0.5 x 1 m, 40 cm high. Observation: Table 40 (428). Reward: equation 19; the kettle's point is its handle, the
-    bucket's its origin.
+    The table is 0.5 x 1 m and 40 cm high. Observation: Table 40 (428). Reward: equation 19. The kettle's point is its
+    handle, and the bucket's point is its origin.
 
-    The goal of a bucket that stands on the table is the point on its axis 1 cm below the rim. It moves with the bucket,
-    but sinks by 5 cm per cm that the bucket's floor is lifted, to at most 20 cm below its height on the table. With a
-    goal fixed to the bucket, spout and goal would also meet if the bucket were lifted and tipped under an upright
-    kettle. So the spout only gets near the goal if the kettle is tilted over the rim: below 30 degrees no water leaves
-    and the spout stays 3 cm away, at 40 degrees 2 cm, and from 60 degrees on it reaches the goal. The goal's
-    orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
+    The spout's goal is on the bucket's axis, 1 cm below the rim if the bucket stands on the table. The goal moves with
+    the bucket, but sinks by 5 cm for each cm by which the bucket's floor is lifted, to at most 20 cm below its height
+    on the table. If the goal were fixed to the bucket, spout and goal would also meet if the bucket were lifted and
+    tipped under an upright kettle. With the sinking goal, the spout only gets near it if the kettle is tilted over the
+    rim. At less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away,
+    and from 60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start,
+    tilted by 40 degrees towards the spout.
 
-    A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
-    friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
-    times. The kettle has about the original's outline and weighs 1.5 kg; the original's 2.46 kg are of the full body.
+    A task shifts and turns the bucket, and the kettle with the water. The water consists of drops of 5 mm radius
+    without friction, which no observation shows. With twelve drops, the default, physics takes 1.4 times as long as in
+    HandOver; with the paper's 30 drops it takes 2.4 times as long. The kettle has about the original's outline and
+    weighs 1.5 kg; the original's 2.46 kg are the mass of the full body.
     """
 
     name = "PourWater"
@@ -241,7 +247,11 @@ class PourWater(ReachTask):
             SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``kettle``, ``bucket``: shifts, turns (n, 3); ``goal_rotation``: (x, y, z, w), and inverse (n, 4)."""
+        """Return ``kettle`` and ``bucket``: shift and turn (n, 3) each; ``goal_rotation``: (x, y, z, w), (n, 4).
+
+        ``goal_rotation_inverse`` (n, 4) is the inverse rotation. With wide variation ``goal`` (n, 7) is the bucket's
+        target pose.
+        """
         nominal = xyzw(constant(_KETTLE.quaternion, variation))
         tilt = xyzw(constant(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0)), variation))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)

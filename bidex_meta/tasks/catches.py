@@ -1,4 +1,4 @@
-"""The throwing classes as numbers: appendix A.2.1 to A.2.5; docs/figures.md, classes."""
+"""The throwing classes, which differ in numbers only (appendix A.2.1 to A.2.5; docs/figures.md, classes)."""
 
 import math
 from typing import ClassVar
@@ -34,8 +34,9 @@ class CatchUnderarm(EggTask):
 class HandOver(CatchUnderarm):
     """Pass an egg from one upturned palm to the other across a gap of 4 cm.
 
-    Observation: Table 8 (398) with the fixed base, 422 with the moving one that the suites use. Reward: equation 1.
-    With a moving base the scales of CatchUnderarm hold (docs/figures.md, decisions); the original gives none.
+    Observation: Table 8 (398) with fixed bases, and 422 entries with the moving bases that suites use. Reward:
+    equation 1. With moving bases the class has the scales of CatchUnderarm, because the original gives none
+    (docs/figures.md, decisions).
     """
 
     needs = Capacity(28, 8, 51)
@@ -52,8 +53,8 @@ class HandOver(CatchUnderarm):
 class TwoCatchUnderarm(CatchUnderarm):
     """Throw two eggs at once, each to the other hand.
 
-    Observation: Table 14 (446). Reward: equation 4. Both goals share one orientation, both eggs one start noise and
-    orientation (docs/figures.md, start noise).
+    Observation: Table 14 (446). Reward: equation 4. Both goals have the same orientation. Both eggs start with the same
+    noise and the same orientation (docs/figures.md, start noise).
     """
 
     needs = Capacity(42, 8, 57)
@@ -102,7 +103,7 @@ class CatchOver2Underarm(EggTask):
 
 
 class CatchAbreast(EggTask):
-    """Throw an egg sideways between two palms that lie side by side, tilted to each other.
+    """Throw an egg sideways between two palms that lie side by side, tilted towards each other.
 
     Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m off its anchor.
     """

@@ -1,4 +1,4 @@
-"""Classes of two cubes: appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes."""
+"""Classes with two cubes (appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes)."""
 
 import math
 from collections.abc import Mapping
@@ -44,9 +44,10 @@ def _cubes(name: str, first: Point, second: Point) -> tuple[SceneObject, SceneOb
 
 
 class _TwoBlocks(ReachTask):
-    """Blocks on a table to be brought to the frozen positions ``goal1`` and ``goal2``, each (n, 3).
+    """Two blocks on a table that must be brought to the frozen positions ``goal1`` and ``goal2``, each (n, 3).
 
-    The target term is ``weight`` (``widest`` - d), d the sum of both distances. Block 1 is the left hand's, at -y.
+    The target term of the reward is ``weight`` times (``widest`` - d), with d the sum of both distances. Block 1 starts
+    at -y and belongs to the left hand.
     """
 
     weight: ClassVar[float]
@@ -90,9 +91,9 @@ _PUSHED = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
 class PushBlock(_TwoBlocks):
     """Push two blocks on a table, one with each hand, 20 cm away to their goals.
 
-    Table 1 x 1 m, 60 cm high, its friction the mean of the original's 0.5 and of 1 for hands and blocks. Observation:
-    Table 26 (417), without the goals; so goals are fixed and starts vary: a task shifts and turns each block.
-    Reward: equation 12.
+    The table is 1 x 1 m and 60 cm high. Its friction is the mean of the original's 0.5 and of 1, the friction of hands
+    and blocks. Observation: Table 26 (417). It does not show the goals. Goals are therefore fixed and starts vary: a
+    task shifts and turns each block. Reward: equation 12.
     """
 
     needs = Capacity(38, 0, 103)
@@ -163,11 +164,12 @@ class PushBlock(_TwoBlocks):
 class StackBlock(_TwoBlocks):
     """Stack two blocks: the left hand's block 1 on the right hand's block 2.
 
-    Table 0.5 x 1 m, 60 cm high. Observation: Table 38 (428); its goal is the top block's: target 1, upright and
-    unturned (the reward asks for no turn). Reward: equation 18. Success: each block within 3 cm of its target and block
-    1 on block 2: one edge higher within 1 cm, and within 3 cm above its middle. A task shifts and turns both blocks and
-    shifts the targets by up to 3 cm along x and y. Frictions are the means of the original's figures: 0.25 for blocks,
-    0.5 for hands and 0.2 for the table (docs/figures.md, friction).
+    The table is 0.5 x 1 m and 60 cm high. Observation: Table 38 (428). Its goal is that of the top block: target 1,
+    upright and unturned (the reward does not depend on turns). Reward: equation 18. For success each block must be
+    within 3 cm of its target, and block 1 must be on block 2: one edge higher, within 1 cm, and within 3 cm of the
+    vertical through its centre. A task shifts and turns both blocks, and shifts the targets by up to 3 cm along x and
+    y. The friction of a pair is the mean of the original's figures: 0.25 for blocks, 0.5 for hands and 0.2 for the
+    table (docs/figures.md, friction).
     """
 
     needs = Capacity(43, 0, 115)
@@ -212,7 +214,11 @@ class StackBlock(_TwoBlocks):
             cube.priority = 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``block1``, ``block2``: shifts, turns (n, 3); targets (n, 3); ``goal``: top block's pose (n, 7)."""
+        """Return ``block1`` and ``block2``: shift and turn; ``goal1`` and ``goal2``: target positions; (n, 3) each.
+
+        In version 1 ``goal`` is the top block's target pose (n, 7). With wide variation ``upper`` (n, 1) is 1 if block
+        1 must be on top, and -1 if block 2 must be.
+        """
         shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
         bottom = shift + constant((0.0, 0.0, 0.625), shift)
         top = bottom + constant((0.0, 0.0, _EDGE), shift)
@@ -262,11 +268,11 @@ class StackBlock(_TwoBlocks):
 class ReOrientation(TaskClass):
     """Turn the two cubes that lie on the hands to one common orientation.
 
-    No table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing requires; in
-    the original it lies on the right. Bases move as the appendix says (52 actions), with the scales of CatchUnderarm.
-    No episode ends early, since the reward is negative.
+    There is no table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing
+    requires; in the original it lies on the right hand. Bases move as the appendix says (52 actions), with the scales
+    of CatchUnderarm. No episode ends early: the reward is negative, so that an early end would increase the return.
 
-    Both cubes start with the same random orientation 10 cm above the mounts and drop onto the palms; fingers that the
+    Both cubes start with the same random orientation 10 cm above the mounts and drop onto the palms. Fingers that the
     start noise would push into a cube's bounding sphere are opened.
     """
 
@@ -344,7 +350,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals, with wide variation as red x, green y and blue z axes, because a ball shows no turn."""
+        """Return the goals; with wide variation as rods along x (red), y (green) and z (blue), which show turns."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]

@@ -1,4 +1,4 @@
-"""The four door classes: appendix A.2.7 and A.2.8; docs/figures.md, classes."""
+"""The four door classes (appendix A.2.7 and A.2.8; docs/figures.md, classes)."""
 
 import math
 from abc import abstractmethod
@@ -26,16 +26,16 @@ from bidex_meta.utils.maths import constant, multiply, quaternion_from_rpy, rota
 
 _BASE = (0.0, 0.0, 0.7)
 _HINGES = ((-0.00846, 0.42653, 0.48329), (-0.0056, -0.42041, 0.48329))
-"""Hinges of the right and the left leaf in the door's frame, metres; leaf 1 turns about -z and leaf 2 about z."""
+"""Hinges of the right leaf (1) and left leaf (2) in the door's frame, metres. Leaf 1 turns about -z, leaf 2 about z."""
 _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)), (0.0088, 0.22, 0.4625)
 """Centres of the panels in the leaves' frames, and their half sizes, metres."""
 _HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
-"""The hands' points in the leaves' frames, metres; at -x for an Inward door."""
+"""Points that the hands must reach, in the leaves' frames, metres; x is negative for an Inward door."""
 _POLE = (0.025, 0.025, 0.65)
 """Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
 _LEAST_SHARE = 0.1
-"""Least distance of each handle from the door's middle along y, metres. One leaf of an Inward door gives 0.497 m, and
-more than 0.5 m if it is pushed against its stop, which yields."""
+"""Distance of each handle from the door's middle along y that success requires, metres. If only one leaf of an Inward
+door opens, the handles are 0.497 m apart, and more than 0.5 m if the leaf is pushed against its stop, which yields."""
 _SHUT_ANGLE = 0.1 * (0.5 * math.pi)
 _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
 
@@ -43,14 +43,14 @@ _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door
 class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
-    With wide variation a task also freezes each leaf's target angle, hinge 1 (right) and 2; the goal block then holds
-    both target angles and both remaining angles, instead of the base pose.
+    Leaf and handle at +y belong to the right hand. A task freezes the door's position along y and one start angle for
+    both leaves; an episode draws nothing. The goal block holds the pose of the door's base, which is also the object's
+    pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left leaf (hinge
+    2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is from its angle.
 
-    Leaf and handle at +y are the right hand's. Success of the opening classes is measured along y, because a single
-    leaf gives a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
-    for both leaves; an episode draws nothing. The goal block holds the base pose, also the object's. The Inward classes
-    have the same door upside down, so that it swings towards the hands; their handle points lie behind the pulls that
-    then face the hands.
+    The opening classes measure success along y: a single leaf that is open by 1.26 rad already brings the handles 0.5 m
+    apart. The Inward classes have the same door upside down, so that it swings towards the hands. Their handle points
+    lie behind the pulls that then face the hands.
     """
 
     inward: ClassVar[bool]
@@ -91,7 +91,10 @@ class _Door(ReachTask):
         return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: of leaves (n, 1)."""
+        """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); the leaves' angles, rad.
+
+        ``angle`` (n, 1) is the start angle of both leaves. With wide variation ``leaves`` (n, 2) are the target angles.
+        """
         position = constant(_BASE, variation).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
         turn = xyzw(constant(quaternion_from_rpy(self.objects[0].rpy), variation)).expand(len(variation), 4)
@@ -121,7 +124,7 @@ class _Door(ReachTask):
         return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals of the handles, with wide variation."""
+        """Return the goals of the handles with wide variation, otherwise an empty list."""
         if not self.rules.wide:
             return []
         base = posed(state["object/position"], state.quaternion("object/quaternion"))
@@ -229,7 +232,7 @@ class DoorOpenOutward(_Open):
 
 
 class DoorCloseInward(_Close):
-    """Push a double door shut that stands open towards the hands. Observation: Table 20 (428). Reward: equation 8.
+    """Push shut a double door that is open towards the hands. Observation: Table 20 (428). Reward: equation 8.
 
     The hands start farther out than in the other door classes, next to the open leaves.
     """
@@ -266,7 +269,10 @@ class DoorOpenInward(_Open):
 
 
 class DoorCloseOutward(_Close):
-    """Pull a door shut by its handles that stands open away from the hands. Table 22 (428), equation 10."""
+    """Pull shut, by its handles, a double door that is open away from the hands.
+
+    Observation: Table 22 (428). Reward: equation 10.
+    """
 
     needs = Capacity(37, 0, 98)
     name = "DoorCloseOutward"

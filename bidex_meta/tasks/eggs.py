@@ -54,7 +54,10 @@ def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
 
 
 def start_hands(draws: Tensor, noise: float, qpos: dict[str, Tensor]) -> None:
-    """Give both hands the same noisy joint angles (docs/figures.md, start noise). Draws in [-1, 1], shape (n, 24)."""
+    """Give both hands the same noisy joint angles (docs/figures.md, start noise).
+
+    ``draws`` are in [-1, 1], shape (n, 24); ``noise`` is a share of each joint's range.
+    """
     joints = noisy_joints(draws, noise)
     qpos["right/joints"].copy_(joints)
     qpos["left/joints"].copy_(joints)
@@ -89,11 +92,11 @@ def lay_egg_on_hand(
 def put_down(
     place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
 ) -> None:
-    """Write the start of an egg in any orientation, or of another object on a broad side, clear of the hand.
+    """Write the start pose of an egg (``held`` is None) or of another object, so that it does not penetrate the hand.
 
-    The positions (n, 7) and the joint angles (n, 24) of the hand below are written in place. If no joints are given, no
-    hand is below; then an object that extends further down than an egg starts higher by the difference. Draws and noise
-    are those of ``start_egg``.
+    An egg gets any orientation; another object lies on a broad side. The poses (n, 7) and the joint angles (n, 24) of
+    the hand below are written in place. If no joints are given, there is no hand below: then an object that extends
+    further down than an egg starts higher by the difference. Draws and noise are those of ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -124,11 +127,11 @@ class EggTask(TaskClass):
     Attributes:
         starts: Nominal start of each egg, world, metres: first an egg on the right hand, then one on the left.
         goals: Centre of the box of each egg's goals, world, metres.
-        position_noise: Half width of the noise in the eggs' start positions, m; ``joint_noise``: that of the joint
-            angles, as a share of each joint's range.
+        position_noise: Half width of the noise in the eggs' start positions, m; ``joint_noise``: half width of the
+            noise in joint angles, as a share of each joint's range.
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
-        floor: The episode fails when an egg's height falls to this, metres.
+        floor: Height of an egg at which the episode fails, metres.
         anchors: Anchor of each point (world, metres), by the name of the point's sensor. The episode fails when a point
             is 0.1 m or more from its anchor.
         numbers: Suffixes of the names of eggs and goals.
@@ -150,9 +153,10 @@ class EggTask(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Choose the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
+        """Choose the base and the object: ``"egg"``, the name of an object in the package, or an MJCF file.
 
-        Raises BidexError if there is no such object, or its file holds no object for a hand.
+        Raises BidexError if there is no such object, or if its file describes none that a hand can hold. See
+        docs/objects.md.
         """
         super().__init__(moving_base)
         self.variation_space = self._goals_within(0.03)
@@ -201,7 +205,7 @@ class EggTask(TaskClass):
         return observe_goals(state, self.numbers)
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Return ``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d_t + d_r))."""
+        """Return ``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d + r)), with distance d (m) and angle r."""
         terms = {}
         for i in self.numbers:
             translation, rotation = distances(state, f"object{i}", f"goal{i}")

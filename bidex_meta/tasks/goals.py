@@ -29,7 +29,7 @@ def posed(position: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
-    """Return a goal pose (n, 7), position and quaternion (x, y, z, w), and its inverse rotation, as frozen numbers."""
+    """Return a goal pose (n, 7), position and quaternion (x, y, z, w), and the inverse rotation (n, 4), by name."""
     return {goal: pose, f"{goal}_inverse": conjugate(pose[:, 3:])}
 
 

@@ -11,7 +11,8 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Finite, Text
 
 VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
-"""Scales of joint and objects' angular velocities, and of forces and torques (docs/figures.md, observation)."""
+"""Scale of joint velocities and of objects' angular velocities, and scale of forces and torques (docs/figures.md,
+observation)."""
 CLIP = 5.0
 """Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
 TOUCH_FORCE = 5.0
@@ -92,10 +93,10 @@ class Layout:
 
 
 def hand_blocks(side: str, moving: bool, touch: bool = False) -> tuple[Block, ...]:
-    """Return one hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions).
+    """Return one hand's blocks of Table 7: 199 entries, or 187 with a fixed base (no base entries, 20 actions).
 
-    With ``touch`` 7 entries follow, those of ``hand.TOUCHED``: the sum f of the normal forces (N) of a body's contacts,
-    shown as f / (f + TOUCH_FORCE), in [0, 1).
+    With ``touch`` 7 entries follow, one per body in ``hand.TOUCHED``. If f is the sum of the normal forces (N) of the
+    body's contacts, the entry is f / (f + TOUCH_FORCE), in [0, 1).
     """
 
     def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
@@ -153,12 +154,15 @@ def point_block(name: Text, sensor: Text, description: str) -> Block:
 
 
 def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
-    """Return the points ``<sensors>/<side>_handle_position`` with their descriptions (6 entries)."""
+    """Return the blocks of both handles' points (6 entries), read from ``<sensors>/<side>_handle_position``.
+
+    ``right`` and ``left`` describe the points.
+    """
     first, second = (f"{side}_handle_position" for side in SIDES)
     return point_block(first, f"{sensors}/{first}", right), point_block(second, f"{sensors}/{second}", left)
 
 
 @cache
 def both_hands(moving: bool, touch: bool = False) -> tuple[Block, ...]:
-    """Return Table 7: 398 entries with moving bases, 374 with fixed bases; 14 more with ``touch``."""
+    """Return the blocks of Table 7: 398 entries with moving bases, 374 with fixed bases; 14 more with ``touch``."""
     return tuple(chain.from_iterable(hand_blocks(side, moving, touch) for side in SIDES))

@@ -1,6 +1,6 @@
-"""Start places of objects: a task freezes shifts from the nominal place, an episode adds a small jitter.
+"""Start poses of objects: a task freezes shift and turn from the nominal pose, an episode adds a small jitter.
 
-Turns are about the world's vertical through the object's own origin.
+Turns are about the vertical axis through the object's origin.
 """
 
 from collections.abc import Iterable
@@ -18,12 +18,12 @@ SHIFT, TURN = 0.03, 0.2617993877991494
 JITTER, JITTER_TURN = 0.005, 0.05
 """Half widths of an episode's additional shift, metres, and turn, radians."""
 DRAWS = 3
-"""Uniform numbers that an episode draws for each jittered object: x, y, turn."""
+"""Number of uniform numbers that an episode draws for each jittered object: x, y, turn."""
 
 
 @checked_arguments
 def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> VariationSpace:
-    """Return the shift and turn as components ``<name>_x``, ``<name>_y`` (metres), ``<name>_yaw`` (radians)."""
+    """Return the space of an object's shift, ``<name>_x`` and ``<name>_y`` (m), and turn, ``<name>_yaw`` (rad)."""
     half = (shift, shift, turn)
     return VariationSpace((f"{name}_x", f"{name}_y", f"{name}_yaw"), tuple(-h for h in half), half)
 
@@ -53,6 +53,6 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
 
 def place_all(names: Iterable[str], qpos: dict[str, Tensor], frozen: dict[str, Tensor], draws: Tensor) -> None:
-    """Place several objects; each uses the frozen numbers under its name and ``DRAWS`` of the draws."""
+    """Place several objects; each uses the frozen numbers under its name and ``DRAWS`` columns of the draws."""
     for name, jitter in zip(names, draws.split(DRAWS, dim=1), strict=True):
         place(qpos[name], frozen[name], jitter)

@@ -17,7 +17,7 @@ from bidex_meta.utils.maths import norm
 
 
 def reach(state: TaskState, side: str, point: str) -> Tensor:
-    """Return the distance (m) from the hand of a side to a point, given by its position sensor. Shape (n,).
+    """Return the distance (m) from the hand on ``side`` to the point that the sensor ``point`` gives. Shape (n,).
 
     The hand's point is the palm's origin + 8 cm along the fingers + 2 cm out of the palm (docs/figures.md, hand point).
     """
@@ -30,7 +30,9 @@ def apart(state: TaskState, a: str, b: str) -> Tensor:
 
 
 class ReachTask(TaskClass):
-    """A class with the reward ``left`` -d_left + ``right`` -d_right + ``target`` + ``constant``.
+    """A class whose reward is the sum of the terms ``left``, ``right``, ``target`` and ``constant``.
+
+    ``left`` is -d_left and ``right`` is -d_right, with d the distance (m) of the hand from the point it must reach.
 
     Attributes:
         table: The table of the class.
@@ -39,7 +41,7 @@ class ReachTask(TaskClass):
         constant: Constant of the reward.
         exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
         terms: Order in which the reward's terms are summed.
-        ghost: Semi-axes of the ellipsoid that is the goal in pictures, metres; None: no goal is drawn.
+        ghost: Semi-axes of the ellipsoid that shows the goal in pictures, metres; None: no goal is drawn.
     """
 
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
@@ -61,7 +63,7 @@ class ReachTask(TaskClass):
             each.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return each object's shift and turn by its name, (n, 3)."""
+        """Return the shift and turn of each object, (n, 3), by the object's name."""
         return {each.name: variation[:, 3 * i : 3 * i + 3] for i, each in enumerate(self.objects)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:

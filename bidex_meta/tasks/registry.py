@@ -37,7 +37,7 @@ def module_of(name: str) -> str:
 
 
 def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
-    """Return a class's name in a suite: ``Switch-v2`` is ``Switch`` in a suite of version 2."""
+    """Return the name of a class among a suite's ``classes``: in suites of version 2 ``Switch-v2`` means ``Switch``."""
     plain = plain_name(name)
     written = list(classes)
     if name not in written and plain in written and classes[plain].rules == V2:
@@ -46,11 +46,11 @@ def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """Return the name by which ``get`` knows a class, given in any case; ``package.module:Class`` keeps its case.
+    """Return the name by which ``get`` knows a class, for a name in any case; ``package.module:Class`` keeps its case.
 
-    A name may end in ``-v2``.
+    The name may end in ``-v2``.
 
-    Raises BidexError if there is no such class; the message names it a ``kind``.
+    Raises BidexError if there is no such class; the message calls it a ``kind``.
     """
     plain = plain_name(str(name))
     has_version = plain != str(name)
@@ -64,7 +64,7 @@ def resolve(name: str, kind: str = "task class") -> str:
 
 
 def with_object(name: str | None) -> dict[str, str]:
-    """Return the option of ``get`` that chooses an object; no option for None."""
+    """Return the option of ``get`` that chooses an object, as a dict; the dict is empty for None."""
     return {} if name is None else {"object": name}
 
 
@@ -78,8 +78,8 @@ def get(name: str, moving_base: bool | None = None, touch: bool = False, **optio
     """Return a task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
 
     ``CatchUnderarm-v2`` has the rules of version 2. ``moving_base`` drives the hands' bases (52 actions) or fixes them
-    (40); None takes the class's own. With ``touch`` observations show touch sensors. Options are those of the class,
-    e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
+    (40); None takes the class's default. With ``touch`` observations show touch sensors. Options are those of the
+    class, e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
 
     Raises BidexError if there is no such class or option; the message gives the nearest name and the list.
     """

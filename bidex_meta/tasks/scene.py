@@ -31,11 +31,12 @@ class SceneObject:
     """An object of a scene: a free body, or a fixture whose place differs from task to task (a mocap body).
 
     Attributes:
-        name: Prefix of its sensors and joints in the scene.
-        asset: File under assets/objects/, or an absolute path, without its ending. Its body is called ``object``; the
-            joint of a free one is called ``free``.
-        position: Nominal start in the world, metres, with ``rpy``, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
-        colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
+        name: Prefix of the object's sensors and joints in the scene.
+        asset: Name of a file under assets/objects/, or an absolute path, without the ending. The file's body is called
+            ``object``; if the body is free, its joint is called ``free``.
+        position: Nominal start position in the world, metres.
+        rpy: Nominal roll, pitch and yaw, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
+        colour: Red, green, blue and alpha of the object's materials, or None to keep the colours in the file.
     """
 
     name: Text
@@ -54,7 +55,7 @@ class SceneObject:
         self.attach(scene, mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml")))
 
     def attach(self, scene: mujoco.MjSpec, part: mujoco.MjSpec) -> None:
-        """Add a part with a body called ``object`` to a scene, instead of the asset."""
+        """Add ``part``, which has a body called ``object``, to a scene at the nominal start."""
         set_contact_bits(part.geoms, OBJECT)
         if self.colour is not None:
             for material in part.materials:
@@ -71,7 +72,7 @@ class Table(NamedTuple):
         size: Full edge lengths, metres.
         centre: The table's centre in the world, metres.
         friction: Sliding friction.
-        priority: Above 0 the table's friction applies to its contacts; else the larger friction of a pair applies.
+        priority: If above 0, the table's friction applies to its contacts; otherwise the larger friction of the pair.
     """
 
     size: Point
@@ -104,10 +105,10 @@ class Scene:
     Attributes:
         task: The class of the scene.
         model: The compiled model.
-        sensors: Sensor name to its slice of ``sensordata``.
-        qpos: Name of a part to its slice of a start (``qpos``, then the poses of movable fixtures): ``right/base`` (7,
-            moving only), ``right/joints`` (24), ``left/...``, each free object or movable fixture (7) by its name, and
-            each joint of an object (1) by its full name, e.g. ``bottle/slide``.
+        sensors: Slice of each sensor in ``sensordata``, by the sensor's name.
+        qpos: Slice of each part in a start position (``qpos``, then the poses of movable fixtures), by the part's name.
+            Parts are ``right/base`` (7 numbers, moving bases only), ``right/joints`` (24), ``left/...``, each free
+            object or movable fixture (7), and each joint of an object (1), e.g. ``bottle/slide``.
         base_bodies: Body ids of the two bases, right and left.
     """
 
@@ -167,7 +168,7 @@ class Scene:
 
     @cached_property
     def start_qpos(self) -> np.ndarray:
-        """Return the nominal start, all hand joints zero. Shape (nq + 7 nmocap,)."""
+        """Return the nominal start, with all hand joints at zero. Shape (nq + 7 nmocap,)."""
         fixtures = [np.concatenate((self.model.body_pos[i], self.model.body_quat[i])) for i in self._mocap_bodies]
         return np.concatenate((self.model.qpos0, *fixtures))
 

@@ -1,4 +1,4 @@
-"""The state that a task class reads: one transition of its environments."""
+"""The state that a task class reads: sensor values and frozen values of the class's environments."""
 
 from collections.abc import Callable, Iterable
 
@@ -19,8 +19,8 @@ class TaskState:
 
     Args:
         sensors: Sensor values, shape (n, nsensordata), in the engine's precision; not copied.
-        addresses: Sensor name to its slice.
-        frozen: What ``TaskClass.freeze`` computed from each environment's variation, each (n, k).
+        addresses: Slice of each sensor, by the sensor's name.
+        frozen: Values that ``TaskClass.freeze`` computed from the environments' variations, each (n, k).
     """
 
     def __init__(self, sensors: Tensor, addresses: dict[str, slice], frozen: dict[str, Tensor]) -> None:
@@ -41,7 +41,7 @@ class TaskState:
         return self.once(("quaternion", name), lambda: xyzw(self[name]))
 
     def once(self, key: object, compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value that reward, success and observation share, computed at its first use."""
+        """Return a value that reward, success and observation share; it is computed at the first use of ``key``."""
         if key not in self._known:
             self._known[key] = compute()
         return self._known[key]

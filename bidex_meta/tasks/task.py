@@ -30,8 +30,8 @@ class Task(NamedTuple):
     data: bytes
     """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
     instruction: str = ""
-    """A sentence that says what to do, without what the suite hides. A task that was made without a
-    benchmark has none."""
+    """A sentence that says what to do; it leaves out what the suite hides. A task that was made without a benchmark has
+    no sentence."""
 
     @classmethod
     @checked_arguments

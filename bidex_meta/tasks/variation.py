@@ -15,7 +15,8 @@ from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole
 class VariationSpace:
     """The box from which a class's variations are drawn uniformly.
 
-    It has component names, e.g. ``goal_x``, with lower and upper ends, in metres, radians, or a draw in [-1, 1].
+    ``names`` are the components, e.g. ``goal_x``; ``low`` and ``high`` are their lower and upper ends. Components are
+    in metres or radians, or are draws in [-1, 1].
     """
 
     names: tuple[Text, ...]
@@ -88,5 +89,8 @@ def box(prefix: Text, centre: tuple[Finite, Finite, Finite], half: NonNegative) 
 
 @checked_arguments
 def orientation(prefix: Text) -> VariationSpace:
-    """Return two draws of a random orientation (docs/figures.md, start noise): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
+    """Return the space of the two draws that give a random orientation: ``<prefix>_u0`` and ``_u1``, in [-1, 1].
+
+    See docs/figures.md, start noise.
+    """
     return VariationSpace((f"{prefix}_u0", f"{prefix}_u1"), (-1.0, -1.0), (1.0, 1.0))

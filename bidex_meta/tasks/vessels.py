@@ -1,4 +1,4 @@
-"""A pot, a bottle and a cup: appendix A.2.6, A.2.9 and A.2.11; docs/figures.md, classes."""
+"""Classes with a pot, a bottle and a cup (appendix A.2.6, A.2.9 and A.2.11; docs/figures.md, classes)."""
 
 import math
 from collections.abc import Mapping
@@ -29,10 +29,10 @@ _START = (0.0, -0.6, 0.465)
 class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
-    Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's own start and up to 5 cm
-    to its sides, and has the start's orientation, yaw included; in version 2 it lies relative to the nominal start. The
-    pot starts at rest on the table; at the original's height it would start 1.5 cm inside. Friction: 3 on the table, 2
-    between wall and hand.
+    Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's start pose and up to 5
+    cm to its sides, and has the start's orientation, including yaw. In version 2 the goal is relative to the nominal
+    start instead. The pot starts at rest on the table; at the original's height it would start 1.5 cm inside the table.
+    The friction is 3 between pot and table, and 2 between the pot's wall and a hand.
     """
 
     needs = Capacity(36, 4, 82)
@@ -73,7 +73,7 @@ class LiftUnderarm(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``object``: pot's place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return ``object``: shift, turn (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
         if self.rules.wide:
             placement = torch.zeros_like(placement)  # episodes draw it, so a goal may not depend on it
@@ -112,7 +112,7 @@ _LIFT, _AHEAD = 0.006, 0.015
 """Shift of the bottle's start from the original's place, metres: along the palm's normal, because the original's place
 lies inside the hand, and along the fingers, so that the bottle can be turned without touching the thumb."""
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
-"""Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
+"""Start angles of the joints that do not start at 0, rad (docs/figures.md, start noise)."""
 _DISC = (0.1, 0.1, 0.003)
 """Semi-axes of the goal in pictures, metres: a disc about the cap, wider than the hand."""
 _DROPPED = 0.25
@@ -120,12 +120,13 @@ _DROPPED = 0.25
 
 
 class BottleCap(OwnObjectClass):
-    """Pull the cap off a bottle that lies in the right hand, with the left.
+    """Pull the cap off a bottle with the left hand, while the bottle lies in the right hand.
 
-    Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed. The cap's
-    point is its centre; the original measures from a link frame near the bottle's origin. Tasks shift the bottle in the
-    palm's plane: 3 cm either way along its axis (``bottle_x``), and 1 cm to the fingers only (``bottle_y``), since the
-    thumb is behind it.
+    Observation: Table 24 (414). Reward: equation 11, with the distances from the left hand to the cap and from the
+    right hand to the bottle, as printed. The cap's point is its centre; the original measures from a link frame near
+    the bottle's origin. Tasks shift the bottle in the palm's plane: by up to 3 cm in both directions along its axis
+    (``bottle_x``), and by up to 1 cm towards the fingers (``bottle_y``), but not the other way, because the thumb is
+    there.
     """
 
     needs = Capacity(47, 4, 65)
@@ -164,7 +165,7 @@ class BottleCap(OwnObjectClass):
         return super().freeze(variation) | ({"slide": variation[:, 3:]} if self.rules.wide else {})
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return, with wide variation, the cap's target travel and its distance from the target."""
+        """Return the cap's target travel and the difference from it with wide variation, otherwise an empty dict."""
         if not self.rules.wide:
             return {}
         slide = state.frozen["slide"]
@@ -191,7 +192,7 @@ class BottleCap(OwnObjectClass):
         return [at_least(slide, 0.03, 0.005)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the cap on the bottle, with wide variation."""
+        """Return the goal of the cap on the bottle with wide variation, otherwise an empty list."""
         if not self.rules.wide:
             return []
         turn = state.quaternion("bottle/quaternion")
@@ -217,7 +218,7 @@ class BottleCap(OwnObjectClass):
         return state["bottle/slide"][:, 0] > 0.03
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return, with wide variation, whether the bottle fell; on the table a fast spin may add energy to it."""
+        """Return whether the bottle fell, with wide variation only: on the table a fast spin may add energy to it."""
         dropped = state["bottle/position"][:, 2] < _DROPPED
         return dropped & self.rules.wide
 
@@ -229,7 +230,7 @@ class SwingCup(OwnObjectClass):
     """Turn a two-handled cup about the vertical axis, with one hand at each handle.
 
     Observation: Table 28 (428). Reward: equation 13. The goal's yaw is measured from the nominal start (yaw 90
-    degrees), not from the task's own start yaw. The goal is at least 72 degrees away, so no start is a success. The
+    degrees), not from the task's start yaw. The goal is at least 72 degrees away, so no start is a success. The
     original's goal, half a turn away, is one end of the range. The goal position is the task's start position; the
     reward does not read it.
     """
@@ -267,7 +268,7 @@ class SwingCup(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        """Return ``cup``: shift and turn (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         position = constant(_CUP.position, variation).repeat(len(variation), 1)
         if not self.rules.wide:
             position[:, :2] += variation[:, :2]

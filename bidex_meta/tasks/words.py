@@ -1,10 +1,10 @@
-"""Numbers of goals in the words of an instruction, rounded to much less than any tolerance."""
+"""The numbers of goals in instructions, as words; the errors of rounding are much smaller than any tolerance."""
 
 import math
 
 
 def centimetres(*metres: float) -> str:
-    """Return a length, or a point in the world as ``(1.0, -79.0, 54.0) cm``."""
+    """Return a length, e.g. ``7.0 cm``, or a point in the world, e.g. ``(1.0, -79.0, 54.0) cm``."""
     numbers = ", ".join(f"{round(100.0 * each, 1) + 0.0:.1f}" for each in metres)  # + 0.0: no -0.0
     if len(metres) > 1:
         return f"({numbers}) cm"

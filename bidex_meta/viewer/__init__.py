@@ -1,1 +1,1 @@
-"""A policy live: in MuJoCo's viewer on a screen, in the browser without one."""
+"""Live views of a policy: in MuJoCo's viewer on a screen, or in a browser if there is no screen."""

@@ -26,7 +26,7 @@ def visible(model: mujoco.MjModel) -> list[int]:
 
 
 def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
-    """Return red, green, blue, alpha in [0, 1] of a geom, or of its material."""
+    """Return red, green, blue and alpha in [0, 1] of a geom's material, or of the geom if it has no material."""
     material = int(model.geom_matid[geom])
     red, green, blue, alpha = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).tolist()
     return red, green, blue, alpha

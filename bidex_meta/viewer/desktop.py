@@ -21,7 +21,7 @@ class Desktop:
     """A ``Screen`` as a window; its keys are ``KEYS``."""
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
-        """Open the window, or raise BidexError."""
+        """Open the window; raise BidexError if this is not possible."""
         self.paused = False
         self.speed = speed
         self._asked: list[int] = []

@@ -16,7 +16,8 @@ from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 class Stage:
     """Episodes in all environments of a world in mode DISABLED, one environment per slot.
 
-    The environment ``row`` is shown; it may be set. On a ``tour`` the next environment follows after each episode.
+    ``row`` is the environment that is shown, and may be set. On a ``tour`` the next environment is shown after each
+    episode.
     """
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0, tour: bool = False) -> None:
@@ -45,7 +46,7 @@ class Stage:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Take one control step in all environments; those whose episodes ended begin the next."""
+        """Take one control step in all environments; an environment whose episode ended begins the next one."""
         self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
@@ -78,18 +79,18 @@ class Stage:
         self._begin()
 
     def model(self) -> mujoco.MjModel:
-        """Return the model that shows the environment: its bodies and joints, hands with their looks."""
+        """Return the model that draws the shown environment, with hands that look as in pictures."""
         return simulation(self._world, self.row)[2].dressed
 
     def data(self) -> mujoco.MjData:
-        """Return the environment's present pose in that model."""
+        """Return the shown environment's present pose, for ``model``."""
         engine, row, scene = simulation(self._world, self.row)
         data = mujoco.MjData(scene.dressed)
         pose(scene.dressed, data, engine.placement()[row])
         return data
 
     def ghosts(self) -> list[DrawnGhost]:
-        """Return the environment's goals; none in a world that hides them."""
+        """Return the goals of the shown environment; the list is empty in a world that hides goals."""
         return ghosts(self._world, self.row)
 
     def camera(self) -> tuple[tuple[float, float, float], float, tuple[float, float]]:
@@ -98,7 +99,7 @@ class Stage:
         return task.camera_target, task.camera_distance, task.camera_angle
 
     def status(self) -> dict[str, str]:
-        """Return labels and values to show beside the environment."""
+        """Return labels and values to show next to the environment."""
         row = self.row
         most = int(self._world.max_episode_steps[row])
         return {
@@ -111,11 +112,11 @@ class Stage:
         }
 
 
-_PICTURES = 30  # pictures a second at most: more would only delay the browser
+_PICTURES = 30  # maximum number of pictures per second: more would only delay the browser
 
 
 class Screen(Protocol):
-    """A viewer; ``speed`` of the clock is 1 in real time."""
+    """A viewer; ``speed`` is 1 for real time and below 1 for slow motion."""
 
     paused: bool
     speed: float
@@ -135,7 +136,7 @@ class Screen(Protocol):
 
 
 def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
-    """Play until the viewer is closed, or for ``seconds``, in real time or slower."""
+    """Play until the viewer is closed, or for ``seconds``, at the viewer's speed or slower."""
     began = shown = due = time.monotonic()
     screen.show(stage)
     try:

@@ -18,7 +18,7 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, quaternion_product, rotate, xyzw
 from bidex_meta.witness.store import quantised
 
-GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
+GAIN = 8.0  # speed of a hand divided by its distance from its target; the same for turns and angles, 1/s
 _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2")
 _MIDDLES = ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
@@ -27,20 +27,20 @@ _Quaternion = tuple[float, float, float, float]  # (w, x, y, z)
 
 
 class Lead(NamedTuple):
-    """Targets of a script in a control step; pairs are of the right and the left hand."""
+    """A script's targets for one control step; pairs hold the values of the right and the left hand."""
 
-    points: tuple[Point, Point]  # where the hands' points shall go, world, metres
-    speed: float  # at most, m/s
+    points: tuple[Point, Point]  # target positions of the hands' points, world, metres
+    speed: float  # largest speed of the hands' points, m/s
     fingers: tuple[np.ndarray, np.ndarray]  # actions of the joints, (20,) each
-    held: tuple[_Quaternion, _Quaternion]  # orientations, world; zeros for a hand that may turn
+    held: tuple[_Quaternion, _Quaternion]  # target orientations, world; zeros for a hand that may turn freely
 
 
 Actions = Iterator[Lead]
-"""Of a script or a part of one."""
+"""The targets that a script, or a part of a script, yields step by step."""
 
 
 def beside(point: Tensor, x: float, y: float, height: float) -> Point:
-    """Return a point beside another one, at a height above the floor, metres."""
+    """Return a point that is shifted from another one by ``x`` and ``y``, at a height above the floor, metres."""
     return float(point[0]) + x, float(point[1]) + y, height
 
 
@@ -51,7 +51,7 @@ def point(position: Tensor) -> Point:
 
 
 def rest_action(size: int) -> Tensor:
-    """Return the action (size,) of zero joint angles and no force on the bases."""
+    """Return the action (size,) that asks for zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
     one = torch.zeros(size // 2)
     one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
@@ -59,10 +59,10 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Leads both hands of an environment of a class to points, from the state that it reads.
+    """Leads both hands of one environment to points, based on the environment's present state.
 
-    ``sensor`` returns a sensor's present values by its name, (k,) in double precision. ``frozen`` returns a frozen
-    number of the task, (k,).
+    ``sensor`` returns a sensor's present values, (k,) in double precision, by the sensor's name. ``frozen`` returns a
+    frozen value of the task, (k,), by the value's name.
     """
 
     def __init__(self, task: TaskClass, sensor: Callable[[str], Tensor], frozen: Callable[[str], Tensor]):
@@ -70,7 +70,7 @@ class HandController:
         self.frozen = frozen
         self.episode_steps = task.episode_steps
         self.taken = 0
-        self.wide = task.rules.wide  # whether a task asks for more than version 1's
+        self.wide = task.rules.wide  # with wide variation tasks ask for more than in version 1
         self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
         self._first = {side: _numbers(self.where(f"{side}/mount_quaternion")) for side in SIDES}
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
@@ -82,7 +82,7 @@ class HandController:
 
     @property
     def steps_left(self) -> int:
-        """Return the control steps to the end of the episode."""
+        """Return the number of control steps until the end of the episode."""
         return self.episode_steps - self.taken
 
     def at(self, side: str) -> Tensor:
@@ -90,14 +90,14 @@ class HandController:
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
-        """Bend the four fingers of a hand, and set other joints by their names (the rest to 0), rad."""
+        """Bend the four fingers of a hand and set the other named joints; the rest of the joints go to 0. In rad."""
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
     def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
-        """Hold a hand's start orientation, turned about the world's axes, rad, from now on.
+        """Hold a hand's start orientation, turned by ``roll`` and ``yaw`` about the world's axes, rad, from now on.
 
-        A hand that no script holds may turn.
+        A hand may turn freely until a script calls this method or ``turn``.
         """
         self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
@@ -126,7 +126,7 @@ class HandController:
 
 
 class HandActions:
-    """Computes the actions that move the hands of a class's environments as scripts ask."""
+    """Computes the actions that move the hands in a class's environments to the targets of scripts."""
 
     def __init__(self, task: TaskClass):
         self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
@@ -146,9 +146,9 @@ class HandActions:
         return quantised(torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1))
 
     def _torque(self, held: Tensor, now: Tensor) -> Tensor:
-        """Return the actions (n, 2, 3) that turn hands to the orientations ``held``, zeros for a free hand.
+        """Return the actions (n, 2, 3) that turn hands to the orientations ``held``; zeros for a hand that is free.
 
-        ``now`` are their present orientations, (w, x, y, z).
+        ``now`` are the present orientations of the hands, (w, x, y, z).
         """
         now = xyzw(now / now.norm(dim=-1, keepdim=True))
         error = multiply(held, conjugate(now))
@@ -164,13 +164,13 @@ def _numbers(quaternion: Tensor) -> _Quaternion:
 
 @cache
 def _joints() -> tuple[dict[str, int], np.ndarray, np.ndarray]:
-    """Return the index of each actuated joint by its name, and the bounds of their targets, rad, float32."""
+    """Return the index of each actuated joint by the joint's name, and the bounds of the targets, rad, float32."""
     low, high = (np.asarray(x, np.float32) for x in (hand().control_low, hand().control_high))
     return {hand().joints[joint]: i for i, joint in enumerate(hand().actuated)}, low, high
 
 
 def _joint_actions(angles: Iterable[tuple[str, float]]) -> np.ndarray:
-    """Return the actions (20,) of joint angles by name, rad, the others 0."""
+    """Return the actions (20,) for joint angles given by name, rad; the angles of all other joints are 0."""
     places, low, high = _joints()
     all_angles = np.zeros_like(low)
     for joint, angle in angles:

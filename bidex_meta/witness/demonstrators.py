@@ -18,10 +18,10 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class OpenLoopReplay:
-    """Plays the witness of each environment's class, without observations; a class without one gets zero actions.
+    """Plays the witness of each environment's class without observations; classes without a witness get zero actions.
 
-    ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, ``actions`` the size
-    of the world's actions, which may be padded; ``noise`` is a standard deviation.
+    ``task_names`` are the classes of the world's slots, and ``task_id`` is the slot of each environment. ``actions`` is
+    the size of the world's actions, which may be padded. ``noise`` is the standard deviation of noise on actions.
     """
 
     def __init__(
@@ -55,12 +55,13 @@ class OpenLoopReplay:
 
 
 class Scripted:
-    """Plays the scripts of a world's classes, in each environment from its present state.
+    """Plays the scripts of a world's classes; each script acts on the present state of its environment.
 
-    ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots that play (None: all); other slots get zero
-    actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise`` (a
-    standard deviation) or another policy's actions. After its end it repeats its last action. With ``misled`` each
-    script is given the next task of its pool, as if it had to guess. Raises BidexError for a class without a script.
+    ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots whose scripts play (None: all); other slots
+    get zero actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise``
+    (a standard deviation) or another policy's actions. When a script has ended, its last action is repeated. With
+    ``misled`` each script is given the next task of the pool instead of its own task, as if it had to guess the goal.
+    Raises BidexError for a class without a script.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class _Class:
         self._task = task
         self._script = script_of(task)
         self._hand_actions = HandActions(task)
-        self._playing: dict[int, Actions] = {}  # by row among the class's
+        self._playing: dict[int, Actions] = {}  # by row among the class's environments
         self._sensors = part.group.engine.sensordata[member.engine_rows]
 
     def write(self, actions: Tensor) -> None:
@@ -121,7 +122,7 @@ class _Class:
             actions[self._member.env_ids][rows, : found.shape[1]] = found
 
     def begin(self, env_mask: Tensor) -> None:
-        """Begin a new script in the class's environments among a mask (N,)."""
+        """Begin a new script in those environments of the class that are in a mask (N,)."""
         for row in env_mask[self._member.env_ids].nonzero().flatten().tolist():
             self._playing[row] = self._begin(row)
 
@@ -137,7 +138,10 @@ class _Class:
 
 
 class ShiftedStarts(PooledWorldWrapper):
-    """A class's task 0 from its witness's start, objects and fixtures shifted over a disc of ``shift`` metres."""
+    """Environments of a class's task 0, which start near the start of the class's witness.
+
+    Objects and fixtures are shifted at random within a disc of radius ``shift``, metres.
+    """
 
     world: World
 
@@ -148,7 +152,7 @@ class ShiftedStarts(PooledWorldWrapper):
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Start episodes of all environments, shifted by the seed; raises BidexError for options."""
+        """Start episodes in all environments; the seed determines the shifts. Raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)

@@ -1,4 +1,4 @@
-"""Replays of witnesses: from their start, and from starts shifted by a tenth of a millimetre."""
+"""Replays of witnesses from the start at which they were found, and from starts shifted by a tenth of a millimetre."""
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from bidex_meta.world.part import judge
 SUITE = "MT20"
 SEED = 0
 SHIFT = 1e-4  # how far the objects' start is shifted to see whether a witness succeeds by more than luck, metres
-SHIFTED = 10  # shifted starts of a replay
+SHIFTED = 10  # number of shifted starts in a replay
 
 State = dict[str, Tensor]
 
@@ -28,16 +28,16 @@ State = dict[str, Tensor]
 class Trace:
     """Results of T steps of N environments."""
 
-    rewards: Tensor  # unscaled, (T, N), float64; 0 from the step after an end on
-    least: Tensor  # the least of the reward's terms, times their number; else as ``rewards``
-    success: Tensor  # bool (T, N), until the end of the episode
-    alive: Tensor  # bool (N,): the episode has not failed nor its physics broken
+    rewards: Tensor  # unscaled rewards, (T, N), float64; 0 after an episode has ended
+    least: Tensor  # smallest of the reward's terms, times the number of terms; shape and zeros as in ``rewards``
+    success: Tensor  # bool (T, N); false after an episode has ended
+    alive: Tensor  # bool (N,): the episode has not failed, and its physics has not broken
 
 
 def task_slot(name: str) -> Slot:
-    """Return the slot of a class with the one task of the witnesses; raises BidexError for an unknown class.
+    """Return the slot of a class with the witness's task as its only task; raises BidexError for an unknown class.
 
-    ``DoorOpenInward-v2`` has the rules of version 2, and a task drawn by them.
+    ``DoorOpenInward-v2`` has the rules of version 2, and a task drawn by these rules.
     """
     plain = plain_name(name)
     benchmark = Benchmark(SUITE if plain == name else f"{SUITE}-v2", seed=SEED)
@@ -48,7 +48,10 @@ def task_slot(name: str) -> Slot:
 
 
 class Simulator:
-    """``num`` environments in a class's task 0, all at the same start: the world's physics and reward, no episodes."""
+    """``num`` environments of a class's task 0, all at the same start.
+
+    They have the physics and the rewards of the world, but no episodes.
+    """
 
     def __init__(self, name: str, num: int, threads: int | None = None):
         slot = task_slot(name)
@@ -83,11 +86,14 @@ class Simulator:
         return states
 
     def save(self, row: int) -> State:
-        """Return the state of an environment, copied."""
+        """Return a copy of the state of an environment."""
         return {name: value[row].clone() for name, value in self._engine.state_dict().items()}
 
     def load(self, states: list[State]) -> None:
-        """Set equal consecutive shares of the environments to these states; their number must divide ``num``."""
+        """Set the environments to these states; each state is used for an equal number of consecutive environments.
+
+        The number of states must divide ``num``.
+        """
         stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
         share = self.num // len(states)
         self._engine.load_state_dict({name: each.repeat_interleave(share, dim=0) for name, each in stacked.items()})
@@ -113,7 +119,7 @@ class Simulator:
         return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
 
     def led(self, script: Callable[[HandController], Actions]) -> Iterator[tuple[Tensor, Trace]]:
-        """Play a script on the mean sensor values over all environments.
+        """Play a script in all environments; the script reads the means of the sensors over all environments.
 
         Yields the actions (action_size,) and the trace of each step.
         """
@@ -124,11 +130,11 @@ class Simulator:
             yield action, self.play(action.expand(1, self.num, -1))
 
     def sensor(self, name: str) -> Tensor:
-        """Return a sensor's values, (N, k), a copy."""
+        """Return a copy of a sensor's values, (N, k)."""
         return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
 
     def frozen(self, name: str) -> Tensor:
-        """Return a frozen number of the task, (N, k)."""
+        """Return a frozen value of the task, (N, k), by name."""
         return self._part.frozen(0, self._world.task_index)[name]
 
     def contact_depth(self, row: int) -> float:
@@ -149,27 +155,27 @@ class Replay:
     """Result of a replay."""
 
     total: float  # return from the unshifted start
-    first_success: int | None  # index of its first successful step
-    succeeded: int  # shifted starts that succeed
+    first_success: int | None  # index of the first successful step from the unshifted start
+    succeeded: int  # number of shifted starts from which the replay succeeds
     depths: Tensor  # deepest contact after each step from each start, metres, (steps, 1 + shifted starts)
 
     @property
     def deepest(self) -> float:
-        """Return the deepest contact from the unshifted start, metres: small unless something was passed through."""
+        """Return the deepest contact from the unshifted start, metres: large if one body passed through another."""
         return float(self.depths[:, 0].max())
 
     @property
     def found(self) -> bool:
-        """Return whether this counts as a witness: it succeeds, and so do eight of ten shifted starts."""
+        """Return whether this counts as a witness: it succeeds from the start and from eight of ten shifted starts."""
         return self.first_success is not None and self.succeeded >= 8
 
 
 def frames(
     name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
 ) -> Iterator[np.ndarray]:
-    """Yield pictures (height, width, 3) uint8 of a witness.
+    """Yield pictures (height, width, 3) uint8 of a witness's replay.
 
-    ``at`` lists the step numbers (0, 1, ...) after which a picture is drawn; None stands for every step.
+    ``at`` lists the numbers of played steps (0, 1, ...) after which a picture is drawn; None draws after every step.
     """
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):

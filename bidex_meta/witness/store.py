@@ -27,7 +27,7 @@ _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "ri
 
 @dataclass(frozen=True)
 class Witness:
-    """Recorded actions that solve a task, and their record."""
+    """Recorded actions that solve a task, and how they were made."""
 
     actions: np.ndarray  # actions (T, action_size), float32, multiples of 1/127
     made: (
@@ -41,14 +41,14 @@ def quantised(actions: "Tensor") -> "Tensor":
 
 
 def witness_path(name: str) -> Path:
-    """Return the path of the installation's witness of a class; nothing is written there by default."""
+    """Return the path of a class's witness in this installation; nothing is written there by default."""
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
 def load_witness(name: str, path: Path | None = None) -> Witness:
-    """Load a class's witness, or one in a file.
+    """Load a class's witness from this installation, or from the file ``path``.
 
-    Raises BidexError if it is missing or damaged, or if its actions have another size.
+    Raises BidexError if the witness is missing or damaged, or if its actions do not have the class's size.
     """
     if path is None:
         path = witness_path(name)

@@ -1,4 +1,4 @@
-"""Teachers: policies and scripts that label the states of a world, whoever acts there."""
+"""Teachers: policies and scripts that label the states of a world with actions, whichever policy acts there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 
 @dataclass(frozen=True)
 class Tutor:
-    """A policy, the environments that it labels, int64 (k,), and how many entries of an observation it reads.
+    """A policy, the environments that it labels, int64 (k,), and the number of observation entries that it reads.
 
-    A policy of one class reads the first entries of a suite's observation: what follows is padding and the task id.
+    A policy of one class reads the first entries of a suite's observation; padding and the task id follow.
     """
 
     policy: Agent
@@ -24,10 +24,11 @@ class Tutor:
 
 
 class Teachers:
-    """Labels actions of a world's environments; an agent that acts in every step and is reset when episodes begin.
+    """Labels the states of a world's environments with actions.
 
-    ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays in those of ``scripted_rows``, bool
-    (N,); each of the ``tutors`` has its own. ``privileged`` shows the goals of a world that hides them to the tutors.
+    It is an agent that acts in every step and is reset when episodes begin. ``known``: the environments that have a
+    teacher, bool (N,). ``scripted`` labels the environments in ``scripted_rows``, bool (N,); each of the ``tutors``
+    labels its own environments. ``privileged`` shows the tutors the goals that the world hides.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Teachers:
 
     @property
     def follow(self) -> bool:
-        """Return whether a teacher knows more than the state: a script follows each episode from its start."""
+        """Return whether a teacher depends on more than the state: a script must follow each episode from its start."""
         return self._scripted is not None
 
     def eval_action(self, obs: Tensor) -> Tensor:

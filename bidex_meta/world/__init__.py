@@ -1,4 +1,4 @@
-"""The batched world: groups of equal structure, actions, observations, resets, episodes, random numbers."""
+"""The batched world: groups of models with equal structure, actions, observations, resets, episodes, random numbers."""
 
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot

@@ -1,7 +1,8 @@
 """Views of several agents on a world: the observation entries and the actions of each agent (appendix A.2).
 
-The smallest agents are a hand's fingers and its palm (with wrist and base). An agent observes the whole block of each
-hand of which it has a unit, and all entries that belong to no hand: object, goal, task id. All agents share the reward.
+Each hand has six units: five fingers, and the palm with wrist and base. An agent controls one or more units. It
+observes all entries of each hand in which it controls a unit, and all entries that belong to no hand: object, goal,
+task id. All agents share the reward.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,9 +22,9 @@ class AgentView:
 
     name: str
     groups: tuple[ObservationGroup, ...]
-    """The groups of the world's observation that it sees, as they stand there."""
+    """The observation groups that the agent sees, with index ranges in the world's observation."""
     actions: tuple[int, ...]
-    """Its entries of the world's action, ascending, whatever the order of its units."""
+    """Indices of the agent's entries in the world's action, ascending."""
 
     @property
     def columns(self) -> tuple[int, ...]:
@@ -35,7 +36,7 @@ class AgentView:
         return tuple(sorted(columns))
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
-        """Return the observation groups by their places in the agent's own observation (:attr:`columns`)."""
+        """Return the agent's observation groups, with index ranges in the agent's observation (:attr:`columns`)."""
         index = {column: i for i, column in enumerate(self.columns)}
         parts = [(slice(index[part.start], index[part.stop - 1] + 1) for part in group.where) for group in self.groups]
         return tuple(ObservationGroup(g.name, _joined(where)) for g, where in zip(self.groups, parts, strict=True))
@@ -44,9 +45,9 @@ class AgentView:
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
     """Return the agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
 
-    ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or units by agent; a world without hands has the
-    units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError if a unit is unknown,
-    missing or named twice, or if only some bases move.
+    ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or a dict from each agent's name to its units. In a
+    world without hands the units are ``action/0``, ``action/1``, ..., and every agent observes everything. Raises
+    BidexError if a unit is unknown, missing or named twice, or if the hands' bases move in only some of the classes.
     """
     units = _units(groups, num_actions)
     views = []

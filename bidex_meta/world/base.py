@@ -30,7 +30,7 @@ Outcome = tuple[Tensor, Tensor, Tensor, Info]
 
 
 class Slots(NamedTuple):
-    """The slots of a world, one list entry per slot."""
+    """Settings of a world's slots (task classes); each list has one entry per slot."""
 
     names: list[str]
     episode_steps: list[int]
@@ -49,18 +49,18 @@ class Transition(NamedTuple):
     reward: Tensor
     success: Tensor
     failed: Tensor
-    """The episode came to a true end."""
+    """True if a rule of the class ends the episode (Gymnasium's ``terminated``)."""
     unstable: Tensor
-    """The physics broke."""
+    """True if the physics broke."""
     terms: dict[str, Tensor]
     """Reward terms by name, each (n,), 0 in environments of classes without the term."""
 
 
 class BatchedWorld(VectorEnv, ABC):
-    """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
+    """A ``contract.TaskWorld``: environments that are split evenly over slots, those of a slot next to each other.
 
-    Worlds pickle and copy: a copy is built again and continues bit for bit. ``stagger`` is the only attribute set from
-    outside that is copied.
+    Worlds can be pickled and copied. A copy is built from the same arguments and continues bit for bit. Of the
+    attributes that a user may set, only ``stagger`` is copied.
     """
 
     single_observation_space: Box
@@ -71,7 +71,8 @@ class BatchedWorld(VectorEnv, ABC):
     observation_groups: tuple[ObservationGroup, ...]
     success_at_end = False
     _masked = False
-    """True if the host may read no number within a step, because it would wait for the accelerator."""
+    """True if no value of a tensor may be read on the host in a step, because the host would wait for the accelerator.
+    """
     _stepper: Stepper = EagerStepper()
     _arguments: tuple[tuple[object, ...], dict[str, object]]
 
@@ -131,7 +132,7 @@ class BatchedWorld(VectorEnv, ABC):
         self._action = torch.zeros(self.num_envs, action_size, device=self.device)
 
     def _set_pool_sizes(self, sizes: list[int]) -> None:
-        """Take the number of tasks of each slot; the next reset must be of all environments."""
+        """Set the number of tasks of each slot; the next reset must start all environments."""
         self.num_slot_tasks = sizes
         self._pool_size = self._by_slot(sizes)
         self.task_index = self._index_in_slot % self._pool_size
@@ -146,14 +147,14 @@ class BatchedWorld(VectorEnv, ABC):
         """Renew numbers that were drawn in advance; called after the seed or the pools of tasks have changed."""
 
     def _random_keys(self, purpose: str = "") -> Tensor:
-        """Return the environments' keys, (n, 2), of the random numbers for one purpose."""
+        """Return one key per environment, (n, 2), for the random numbers that serve ``purpose``."""
         keys = []
         for name, env_ids in zip(self.task_names, self.slot_env_ids, strict=True):
             keys.append(env_keys(self.seed, name + purpose, env_ids.stop - env_ids.start, self.device))
         return torch.cat(keys)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Start episodes of all environments, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
+        """Start episodes in all environments, or in those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
             self._set_seed(checked_seed(seed, mask))
@@ -211,7 +212,7 @@ class BatchedWorld(VectorEnv, ABC):
         self.episodes.begin(mask, elapsed)
 
     def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply actions; return which environments are active, and which of them got a non-finite number."""
+        """Apply actions; return which environments are active, and which active ones got a non-finite action."""
         action, broken = checked.clean(action)
         active = ~self.episodes.finished
         self._write_action(action, active)
@@ -222,9 +223,9 @@ class BatchedWorld(VectorEnv, ABC):
 
     @abstractmethod
     def _move(self, active: Tensor, broken: Tensor) -> Outcome:
-        """Step the ``active`` environments under ``_action`` and ``_finish``, before new episodes start.
+        """Step the ``active`` environments with the actions in ``_action``, and return the result of ``_finish``.
 
-        ``broken`` are the active environments whose action was not finite.
+        New episodes start only afterwards. ``broken`` are the active environments whose action was not finite.
         """
 
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> Outcome:
@@ -270,11 +271,11 @@ class BatchedWorld(VectorEnv, ABC):
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     def _made(self) -> dict[str, str]:
-        """Return the settings that decide the world's future besides its state, as texts by name.
+        """Return, as texts by name, the settings that together with the state determine the world's future.
 
         A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out,
-        because a run may continue with others. Modes are left out, because an evaluation may finish episodes of
-        training.
+        because a run may continue with others. Autoreset modes are left out, because an evaluation may finish episodes
+        that began in training.
         """
         made = {"slots": ", ".join(self.task_names)}
         for name, steps, scale in zip(*self._slots[:3], strict=True):
@@ -305,7 +306,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment: its entry if there is one per environment, or the world's value."""
+        """Return an attribute for each environment: the environment's entry if there is one, or the world's value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:

@@ -1,4 +1,4 @@
-"""Checks of everything that a world is given, before anything changes: arguments, actions, states, formulas."""
+"""Checks of all arguments, actions, states and formulas that a world is given; they run before anything changes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
@@ -21,17 +21,18 @@ from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 
 _MOST_ENVIRONMENTS = 10_000_000
-"""Beyond any memory; less than what an engine's library could not count."""
+"""More environments than any memory holds, but few enough for the engines' libraries to count."""
 _LARGEST_SEED = 2**128
 _LEAST = {"episodes/number": -1}
-"""Of whole numbers in a state; the number of an environment's episode before its first is -1."""
+"""Smallest whole numbers in a state, if not 0. Before an environment's first episode, the number of its episode is -1.
+"""
 _AGAIN = "build the world with the same suite, split and num_envs."
 MOST_EPISODES = 1000
-"""Of a task before another one is drawn, or of a trial."""
+"""Maximum number of episodes that play one task before another is drawn, and maximum number of episodes in a trial."""
 _TOLD, _LONGEST = 5, 100
-"""Differences that a message names, and the most letters of one."""
+"""Maximum number of differences that a message names, and maximum number of letters for each."""
 _ROWS = 11
-"""Rows that formulas are tried with: as many as no sensor and no block has numbers."""
+"""Number of rows on which formulas are tried. No sensor and no block has this size, so that rows can be recognised."""
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
@@ -48,7 +49,7 @@ def seed(given: object) -> int:
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:
-    """Raise BidexError for unknown names, and for points that are neither a ``PointsRule`` nor None."""
+    """Raise BidexError if a name is unknown, or if ``points`` is neither a ``PointsRule`` nor None."""
     for name, given, known in (
         ("task_sampling", task_sampling, ("uniform", "fixed", "fresh")),
         ("observation", observation, get_args(Rule)),
@@ -128,9 +129,10 @@ def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> l
 
 
 def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
-    """Raise BidexError if a saved state has other names, types or shapes than the own one, or non-finite numbers.
+    """Raise BidexError if a saved state has other names, types or shapes than ``own``, or non-finite numbers.
 
-    The entry ``made`` of a world's state must be equal. ``inside`` is the path of both states in a larger state.
+    ``own`` is the state of the world that loads. Its entry ``made`` must be equal in both states. ``inside`` is the
+    path of both states in the states that contain them.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         if isinstance(given, Mapping):

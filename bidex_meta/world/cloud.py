@@ -10,17 +10,19 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.world.surfaces import FIXTURE, HAND, OBJECT, Surfaces
 
 _DIRECTION = (0.49, 0.0, 0.75)
-"""From the target to the camera, of HandOver in the original code."""
+"""Direction from the target to the camera, taken from HandOver in the original code."""
 FIELD_OF_VIEW = 60.0
 
 
 @dataclass(frozen=True)
 class Camera:
-    """An upright pinhole camera with a square image that shows distances from ``near`` to ``far``; world, metres.
+    """An upright pinhole camera with a square image; positions in the world frame, metres.
 
-    Attributes: eye: Position of the camera.
-        target: Point in the middle of its image.
+    Attributes:
+        eye: Position of the camera.
+        target: Point that appears in the middle of the image.
         field_of_view: Full angle of the image, degrees.
+        near: Smallest distance that the camera sees; ``far``: largest distance.
     """
 
     eye: tuple[float, float, float]
@@ -45,7 +47,7 @@ class Camera:
 
 
 def camera_of(task: TaskClass) -> Camera:
-    """Return the depth camera of a class: its own camera, or one that looks down at the target of its pictures."""
+    """Return the depth camera of a class: ``depth_camera``, or by default one that looks down at ``camera_target``."""
     if task.depth_camera is not None:
         return Camera(*task.depth_camera)
     away = np.array(_DIRECTION) / np.linalg.norm(_DIRECTION)
@@ -54,7 +56,7 @@ def camera_of(task: TaskClass) -> Camera:
 
 
 _CHUNK = 32
-"""Environments that a CPU computes at once: their numbers fit its cache."""
+"""Number of environments that a CPU computes at once, chosen so that their numbers fit into its cache."""
 
 
 _PIXELS = 128
@@ -62,17 +64,18 @@ _PIXELS = 128
 _DEPTH = 0.004
 _SLOPE = 1.5
 _MOST_SLOPE = 0.05
-"""A visible point may lie ``_DEPTH`` (m) behind the nearest one around its pixel, on slanted surfaces further by a
-share ``_SLOPE`` of the change of depth across a pixel, at most ``_MOST_SLOPE`` (m)."""
+"""A visible point may lie up to ``_DEPTH`` (m) behind the nearest point around its pixel. On slanted surfaces it may
+lie further behind, by ``_SLOPE`` times the change of depth across a pixel, but at most by ``_MOST_SLOPE`` (m)."""
 
 
 class Cloud:
-    """Clouds of environments of one model.
+    """Computes the point clouds of environments that share one model.
 
-    A candidate is visible if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of
-    a coarse depth buffer. Shapes do not depend on values, so that CUDA graphs can record the computation.
+    The candidates are the points of ``surfaces``. A candidate is visible if it faces the camera, lies in the camera's
+    frustum, and nothing nearer was drawn around its pixel in a coarse depth buffer. Shapes do not depend on values, so
+    that CUDA graphs can record the computation.
 
-    A cloud has ``count`` points; with ``kinds`` each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
+    A cloud has ``count`` points. With ``kinds`` each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
     """
 
     def __init__(
@@ -133,9 +136,10 @@ class Cloud:
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return right, down and forward of the candidates from the camera, and distances to their tangent planes.
+        """Return the candidates' positions relative to the camera, and the camera's distances from the surfaces.
 
-        Metres, (n, P) each.
+        The positions are three tensors: to the right, down and forward. A distance is measured to the candidate's
+        tangent plane and is positive if the surface faces the camera. All are in metres, (n, P) each.
         """
         turn = rotation.index_select(1, self._bodies).float()
         offset = position.index_select(1, self._bodies).float() - self._eye
@@ -190,16 +194,17 @@ _DOT = 0.0035
 
 
 def beside(camera: Camera) -> Camera:
-    """Return a camera at the same distance from the same target, from the side."""
+    """Return a camera that looks at the same target from the side, at the same distance."""
     far = float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
     x, y, z = camera.target
     return Camera((x, y - 0.94 * far, z + 0.34 * far), camera.target, camera.field_of_view)
 
 
 def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
-    """Draw points (n, 4), world, metres, and kinds (``surfaces.FIXTURE``, ...), as (height, width, 3), uint8.
+    """Draw a cloud, (n, 4), and return the picture, (height, width, 3), uint8.
 
-    The camera's field of view fits the smaller side of the picture.
+    The cloud's rows hold a position (world frame, metres) and a kind (``surfaces.FIXTURE``, ...). The camera's field of
+    view fits the smaller side of the picture.
     """
     picture = np.full((height, width, 3), _BACK, np.uint8)
     seen = (cloud[:, :3] - camera.eye) @ camera.axes.T

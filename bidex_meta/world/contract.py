@@ -1,49 +1,53 @@
 """The contract of batched worlds: learners, evaluation and clients may rely on this page and on nothing else.
 
-``tests/test_contract.py`` checks every world against it. A world has N environments, each of one slot (a task class of
-the suite; MT1: a task of its class). All tensors are on ``device``. A reset or step returns tensors that the caller
-owns: no later step changes them. Changes to them or to the given action do not affect the world.
+``tests/test_contract.py`` checks every world against this page. A world has N environments. Each belongs to one slot: a
+task class of the suite, or in MT1 a task of the class. All tensors are on ``device``. A reset or step returns tensors
+that the caller owns: no later step changes them, and changes to them or to the given action do not affect the world.
 
-Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) an environment that ends starts its next episode within
-the step; the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In
-DISABLED (evaluation, meta-learning) an ended environment is frozen: it may be stepped, keeps its observation and its
-flags and gets reward 0, until a ``reset`` whose ``reset_mask`` names it. NEXT_STEP, which Gymnasium's tools expect and
-none of our learners uses, lies between them: the step after its end starts an environment's next episode, whatever the
-action, with reward 0.
+There are three modes (``metadata["autoreset_mode"]``). In SAME_STEP (training) an environment whose episode ends starts
+its next episode within the step: the returned observation is the first of the new episode, and ``info["final_obs"]``
+has the last one of the old episode. In DISABLED (evaluation, meta-learning) an environment whose episode has ended is
+frozen: it may be stepped, but it keeps its observation and flags and gets reward 0, until a ``reset`` whose
+``reset_mask`` includes it. Gymnasium's tools expect NEXT_STEP, which none of our learners uses: the step after the end
+of an episode ignores the environment's action, starts its next episode and returns reward 0.
 
 ``info`` of a reset is empty (except ``pixels``); ``info`` of a step describes the transition just made:
 
 =====================  ====================  ===========================================================================
 key                    shape, type           meaning
 =====================  ====================  ===========================================================================
-success                (N,), bool            the goal is met in this state; where success counts at the end, for the
-                                             last 15 steps
-unstable               (N,), bool            physics broke, or the action was not finite: reward 0, truncated, the
-                                             transition teaches nothing; never in a frozen environment
+success                (N,), bool            the goal is met in this state; if success counts at the end: the goal has
+                                             been met for the last 15 steps
+unstable               (N,), bool            physics broke, or the action was not finite: the reward is 0, the episode
+                                             is truncated, and learners must not learn from the transition; never true
+                                             in a frozen environment
 reward_unscaled        (N,), float32         reward before the suite's scale of the class; 0 in a frozen environment
-final_obs              (N, d), float32       the observation that the transition led to; of an unstable one the last
-                                             before it
-_final_obs             (N,), bool            environments that ended in this step: there ``final_obs`` is the last of
-                                             the episode; elsewhere it is the observation that the step returns
-running                dict of (N,)          r (return, float32), l (length, int64), success (by the suite's
-                                             rule, bool), unscaled (return, float32), of the episode so far
-episode_mask           (N,), bool            environments whose episode ended and counts (shortened first ones do
-                                             not)
+final_obs              (N, d), float32       the observation to which the transition led; after an unstable transition
+                                             the last observation before it
+_final_obs             (N,), bool            environments whose episode ended in this step: their ``final_obs`` is the
+                                             last observation of the episode; in all others ``final_obs`` is the
+                                             observation that the step returns
+running                dict of (N,)          the episode so far: r (return, float32), l (length, int64), success (by the
+                                             suite's rule, bool), unscaled (return of unscaled rewards, float32)
+episode_mask           (N,), bool            environments whose episode ended and counts (shortened first episodes do
+                                             not count)
 =====================  ====================  ===========================================================================
 
-The world decides what a successful episode is, by the suite's rule, and reports it in ``running["success"]``: the entry
-of an episode's last step is the success of the episode, and the entry of any other step is its success if it is cut
-there. Nothing else decides: success at several steps must not be combined, because where success counts at the end an
+The world decides by the suite's rule whether an episode is a success, and reports it in ``running["success"]``. The
+entry of an episode's last step is the success of the episode; the entry of any other step is the success that the
+episode would have if it were cut there. Do not combine the success of several steps: if success counts at the end, an
 episode can lose it again.
 
-For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
-(``episodes.py``) when an environment ended, and on the warp engine, which would have to wait for the answer, in every
-step: zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may
-add keys like these, ``reward_terms`` and ``pixels``; learners may not rely on them.
+For users of Gymnasium our worlds add the keys ``episode``, ``_episode``, ``final_info`` and ``_final_info``
+(``episodes.py``) to steps in which an episode ended. The warp engine adds them to every step, because checking for an
+end would make the host wait. Their values are zero outside their masks. ``solved`` says whether the goal is met in this
+state, whatever the suite's rule is. A world may add keys like these, ``reward_terms`` and ``pixels``; learners may not
+rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each environment, after the first reset and after each
-reset with a seed, may begin at a random elapsed step, so that environments do not end together; the time limit counts
-from there. A world that does so has an attribute ``stagger``, which may be set: it decides about the next such reset.
+reset with a seed, may begin at a random elapsed step, so that not all episodes end together. These elapsed steps count
+towards the time limit. A world with shortened episodes has an attribute ``stagger``; setting it affects the next such
+reset.
 """
 
 from dataclasses import dataclass
@@ -55,7 +59,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 Info = dict[str, Any]
-"""Report of a step; the keys are above."""
+"""Report of a step; the module's docstring explains the keys."""
 Options = dict[str, Any]
 """Options of a reset."""
 State = dict[str, Any]
@@ -69,12 +73,13 @@ class ObservationGroup:
     """Entries of an observation that have the same kind in every environment of a world."""
 
     name: str
-    """``right_hand``, ``left_hand``, ``object`` (the rest), ``goal`` (zeros where a suite hides it), ``padding``,
-    ``task`` where slots differ (in MT4: padding to three classes, the second egg to one), ``task_id`` (one-hot), or
-    ``last_step`` (in worlds of trials: the last action, the last reward, and 1 if an episode ended).
-    Worlds without such parts have ``state``. Other classes may have other groups: in ML4 the two splits differ."""
+    """``right_hand``, ``left_hand``, ``object`` (all other entries of a class), ``goal`` (zeros if a suite hides it),
+    ``padding``, ``task_id`` (one-hot), ``task`` for entries whose kind differs by slot (in MT4 these are padding in
+    three classes and the second egg in one), or ``last_step`` (in worlds of trials: the last action, the last reward,
+    and 1 if an episode ended). Worlds that know no such kinds have one group ``state``. The groups depend on the
+    classes: the two splits of ML4 have different groups."""
     where: tuple[slice, ...]
-    """Index ranges in ascending order, none next to another."""
+    """Index ranges in ascending order; no two are adjacent."""
 
     @property
     def size(self) -> int:
@@ -83,7 +88,7 @@ class ObservationGroup:
 
 
 def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
-    """Return the groups of a world without parts: ``state``, and ``task_id`` for the last ``num_id_columns``."""
+    """Return the groups of a world that knows no kinds: ``state``, and ``task_id`` for the last ``num_id_columns``."""
     groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
     return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
 
@@ -106,11 +111,11 @@ class VectorWorld(Protocol):
     task_names: list[str]
     """Names of the slots."""
     gammas: tuple[float | None, ...]
-    """Discount per step that learners shall take for each slot; None: their own."""
+    """Discount factor per step that learners must use for each slot; None: the learner's own."""
     num_id_columns: int
-    """Trailing entries of an observation that are the one-hot of the slot: ``num_tasks`` or 0."""
+    """Number of entries at the end of an observation that are the one-hot of the slot: ``num_tasks`` or 0."""
     observation_groups: tuple[ObservationGroup, ...]
-    """The named parts of an observation, in the order of their first entries; each entry is in one."""
+    """The named parts of an observation, in the order of their first entries; each entry belongs to one group."""
     metadata: dict[str, Any]
     """Holds ``autoreset_mode``, gymnasium's SAME_STEP, NEXT_STEP or DISABLED."""
 
@@ -120,7 +125,7 @@ class VectorWorld(Protocol):
         Args:
             seed: Restarts all draws: equal seeds and actions give equal trajectories. None continues with the old
                 seed's next episodes.
-            options: ``reset_mask``: environments to start, bool (N,); others stay as they are. All by default.
+            options: ``reset_mask``: environments to start, bool (N,), all by default; the others stay unchanged.
 
         Raises BidexError for another option, a seed below 0, or a seed with a partial mask.
         """
@@ -153,23 +158,24 @@ class TaskWorld(VectorWorld, Protocol):
     slot_env_ids: list[slice]
     """Contiguous environments of each slot, as slices."""
     num_slot_tasks: list[int]
-    """Tasks in the pool of each slot."""
+    """Number of tasks in the pool of each slot."""
     task_index: Tensor
-    """Task of its slot's pool that each environment plays, int64 (N,). In DISABLED mode and in ML suites environment j
-    of a slot keeps task j mod n; elsewhere each episode may draw one."""
+    """Index of the task that each environment plays, in the pool of its slot, int64 (N,). In DISABLED mode and in ML
+    suites environment j of a slot keeps task j mod n; otherwise each episode may draw a task."""
     max_episode_steps: Tensor
-    """Time limit of each environment, int64 (N,)."""
+    """Time limit of each environment, control steps, int64 (N,)."""
     success_at_end: bool
-    """True if an episode must hold its goal at the end to be a success; else it must meet the goal at any step."""
+    """True if an episode is a success only if it holds its goal at the end; False if it may meet the goal at any step.
+    """
 
 
 @runtime_checkable
 class PooledWorld(TaskWorld, Protocol):
-    """A world that can be given other tasks."""
+    """A world whose tasks can be replaced."""
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Tasks of each slot, each (n, size of a variation)."""
+        """Task pool of each slot, (n, size of a variation) each."""
         ...
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
@@ -189,18 +195,20 @@ class EndlessWorld(Protocol):
     """
 
     endless: bool
-    """True if training draws tasks without number. Worlds with a fixed number have False, or no such attribute."""
+    """True if training draws an unlimited number of tasks. Worlds with a fixed number have False, or no such attribute.
+    """
 
     def fresh_tasks(self, number: int, count: int, /) -> dict[str, np.ndarray]:
-        """Return ``count`` new tasks of each slot, for ``set_tasks``; each ``number`` (0, 1, ...) gives other tasks.
+        """Return ``count`` new tasks of each slot, for ``set_tasks``.
 
-        ``number`` and the world's own seed determine the tasks. None of them is in a pool of the suite.
+        ``number`` (0, 1, ...) and the world's own seed determine the tasks; another number gives other tasks. None of
+        the tasks is in a pool of the suite.
         """
         ...
 
 
 class PrivilegedWorld(Protocol):
-    """A world that can show what its observations hide: for teachers, and for learners that are taught in training.
+    """A world that can show what its observations hide: for teachers, and for learners that use it in training only.
 
     Hidden values are the numbers of a task that its class hides (such as the goal's position), scaled from their range
     to [-1, 1]. If a class hides fewer than ``hidden_size`` numbers, zeros follow.
@@ -213,7 +221,7 @@ class PrivilegedWorld(Protocol):
 
     @property
     def hidden_columns(self) -> dict[str, list[int]]:
-        """Columns of the tasks in each slot's pool that are hidden, by the slot's name."""
+        """Columns of each slot's task pool that hold hidden numbers, by the slot's name."""
         ...
 
     def hidden_values(self) -> Tensor:

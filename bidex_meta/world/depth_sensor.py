@@ -15,9 +15,9 @@ from bidex_meta.world.cloud import Cloud, camera_of
 from bidex_meta.world.surfaces import sample
 
 CANDIDATES = 3072
-"""Points fixed on a scene at least: fewer leave gaps through which hidden points are seen."""
+"""Minimum number of points fixed to a scene's surfaces; fewer would leave gaps through which hidden points are seen."""
 POINT_ENTRIES = {"points": 3, "kind_points": 4}
-"""Entries of a point, by the name of the clouds' observation group."""
+"""Number of observation entries per point, by the name of the cloud's observation group."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PointsRule:
 class DepthSensor:
     """Puts clouds into the observations of a scene's class, beginning at entry ``first``.
 
-    ``hidden``: entries of the class's observation that depend on objects' states, ascending.
+    The attribute ``hidden`` lists the entries of the class's observation that depend on objects' states, ascending.
     """
 
     def __init__(self, scene: Scene, rule: PointsRule, first: int, device: torch.device) -> None:
@@ -59,7 +59,10 @@ class DepthSensor:
         self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
 
     def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Zero hidden entries of observations (n, d) and fill in clouds, in place; bodies' poses are as for Cloud."""
+        """Zero hidden entries of observations (n, d) and fill in clouds, in place.
+
+        ``position`` and ``rotation`` of the bodies are as for ``Cloud``.
+        """
         values.index_fill_(1, self._hidden, 0.0)
         values[:, self._columns] = self._cloud(position, rotation).flatten(1)
 

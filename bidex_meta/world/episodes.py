@@ -27,11 +27,12 @@ class Episodes:
     number: Tensor
     """Index of the running episode, counted from the last seeding; -1 before the first."""
     elapsed: Tensor
-    """Control steps since its start."""
+    """Control steps since the episode's start; a shortened first episode starts above 0."""
     counts: Tensor
     """True if the episode enters statistics (a shortened first episode does not)."""
     finished: Tensor
-    """True if the episode has ended and waits for a reset (never in SAME_STEP); its flags are the next two."""
+    """True if the episode has ended and waits for a reset (never in SAME_STEP mode); the next two fields are its flags.
+    """
     terminated: Tensor
     truncated: Tensor
     success: Tensor
@@ -40,9 +41,9 @@ class Episodes:
     """Steps for which the episode has been solved without a break."""
     reward: Tensor
     unscaled: Tensor
-    """Sum of the rewards by the printed formula."""
+    """Sum of the rewards before the suite's scale of the class; ``reward`` is the sum of the scaled rewards."""
     length: Tensor
-    """Steps counted in these sums."""
+    """Number of steps in these sums."""
 
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
@@ -52,7 +53,7 @@ class Episodes:
         return cls(number - 1, *rest)
 
     def begin(self, mask: Tensor, elapsed: Tensor) -> None:
-        """Start episodes in the environments of a mask at a given number of elapsed steps, shape (n,)."""
+        """Start episodes in the environments of a mask, with ``elapsed`` (n,) steps counted already."""
         self.elapsed = torch.where(mask, elapsed, self.elapsed)
         self.counts = torch.where(mask, elapsed == 0, self.counts)
         for name in ("finished", "terminated", "truncated", "success"):
@@ -71,11 +72,14 @@ class Episodes:
 
     @property
     def solved_at_end(self) -> Tensor:
-        """Return whether an episode that ends now is a success at the end, (n,), bool."""
+        """Return whether an episode that ends now holds its goal at the end, (n,), bool."""
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
-        """Return statistics of the running episodes, as in ``info["running"]``; ``success`` at the end or once."""
+        """Return statistics of the running episodes, as in ``info["running"]``.
+
+        With ``at_end`` success means that the goal is held at the end, otherwise that it was met at any step.
+        """
         if at_end:
             success = self.solved_at_end
         else:
@@ -96,8 +100,9 @@ class Episodes:
 def ended_info(info: Info) -> Info:
     """Return Gymnasium's keys for the episodes that ended in a step, from the contract's keys; zero outside each mask.
 
-    ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last
-    step's values, ``episode`` once more and a mask each; ``_final_info``: ended.
+    ``episode`` holds r, l, success and unscaled, (N,) each; its mask ``_episode`` marks episodes that ended and count.
+    ``final_info`` holds values of the last step and ``episode`` again, each with a mask. ``_final_info`` marks all
+    environments whose episode ended.
     """
     ended = info["_final_obs"]
     episode_mask = info["episode_mask"]
@@ -108,7 +113,10 @@ def ended_info(info: Info) -> Info:
 
 
 class Clock:
-    """Seconds that the episodes of ``num`` environments have taken: ``t`` of ``episode``, not part of the state."""
+    """Measures the seconds that the episodes of ``num`` environments take, for the entry ``t`` of ``episode``.
+
+    The times are not part of a world's state.
+    """
 
     def __init__(self, num: int, device: torch.device) -> None:
         self._began = torch.full((num,), time.perf_counter(), dtype=torch.float64, device=device)
@@ -126,7 +134,7 @@ class Clock:
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """Return the autoreset mode as a member, from any spelling; None stands for SAME_STEP.
+    """Return the member of ``AutoresetMode`` for a mode in any spelling; None stands for SAME_STEP.
 
     Raises BidexError for other modes, and if torch's default precision is not single.
     """
@@ -144,10 +152,11 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
 
 
 def set_stagger(world: VectorWorld, stagger: bool) -> None:
-    """Set whether first episodes begin at random elapsed steps, from the world's next first reset on.
+    """Set whether first episodes begin at random elapsed steps.
 
-    Other libraries sum rewards from the first step to the first end, so worlds that are made for them begin at 0 by
-    default. The world may be wrapped. A world without ``stagger`` is not changed.
+    It takes effect at the world's first reset, or at the next reset with a seed. Other libraries sum rewards from the
+    first step to the first end, so worlds that are made for them begin at 0 by default. The world may be wrapped. A
+    world without ``stagger`` is not changed.
     """
     stagger = true_or_false("stagger", stagger)
     inner: Any = getattr(world, "unwrapped", world)

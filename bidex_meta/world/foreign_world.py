@@ -1,6 +1,6 @@
 """Worlds of other libraries' environments, on the CPU: the base that each library's world extends.
 
-Our learners, evaluation and checkpoints run on them unchanged; a subclass places environments and advances them.
+Our learners, evaluation and checkpoints run on these worlds unchanged. A subclass starts and steps the environments.
 """
 
 from abc import abstractmethod
@@ -47,7 +47,7 @@ class ForeignWorld(BatchedWorld):
         autoreset_mode: str | AutoresetMode | None = None,
         stagger: bool = True,
     ) -> None:
-        """Set up spaces and episodes; a subclass makes what it steps. Raises as ``BatchedWorld``."""
+        """Set up spaces and episodes; a subclass creates the environments. Raises the errors of ``BatchedWorld``."""
         count = len(names)
         slots = Slots(list(names), [sizes.episode] * count, [1.0] * count, [None] * count, [1] * count)
         super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger, seed)
@@ -64,7 +64,7 @@ class ForeignWorld(BatchedWorld):
         self._success = torch.zeros(self.num_envs, dtype=torch.bool)
 
     def _draws(self, num: int) -> Tensor:
-        """Return uniform numbers (n, num) of the running episodes, from seed, environment and episode."""
+        """Return uniform numbers (n, num) for the running episodes; they depend on seed, environment and episode."""
         return uniform(self._keys, self.episodes.number, num)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
@@ -86,7 +86,7 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        """Step the ``active`` environments under ``_action``; for the others, only read success.
+        """Step the ``active`` environments with the actions in ``_action``; of all others only success is read.
 
         ``broken``: the active environments whose action was not finite; nothing is read from them.
         """

@@ -1,8 +1,8 @@
-"""Ways to keep an accelerator busy during a step: engines side by side on streams, torch's work as CUDA graphs.
+"""Ways to keep an accelerator busy during a step: engines run in parallel on streams, torch's work runs as CUDA graphs.
 
-If torch's kernels were launched one by one, they would take longer than the physics. The state that a stretch of work
-reads and writes is in tensors at fixed addresses. The result is at a fixed address too, and the next replay overwrites
-it.
+If torch's kernels were launched one by one, they would take longer than the physics. A graph records one stretch of
+work, that is, a part of a step. The state that a stretch reads and writes is in tensors at fixed addresses. The result
+is at a fixed address too, and the next replay overwrites it.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -13,14 +13,14 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 Result = TypeVar("Result")
-"""Any nest of tensors, which a stretch of work makes of tensors. On the way it may read and rebind the state."""
+"""Nested containers of tensors that a stretch of work returns. The work may also read and rebind the state."""
 
 Together = Callable[[Sequence[Callable[[], None]]], None]
-"""Does jobs that need nothing of each other, as ``SideBySide.run``."""
+"""A function that runs jobs that do not depend on each other, such as ``SideBySide.run``."""
 
 _BEFORE = 3
-"""Plain runs of a stretch before it is recorded: libraries allocate and compile in the first ones, and a world that is
-stepped a few times only, or whose tasks change as often, never pays for a recording."""
+"""Number of runs of a stretch before it is recorded. Libraries allocate and compile in the first runs. A world that is
+stepped only a few times, or only a few times between changes of its tasks, never spends time on a recording."""
 
 
 class Record(Protocol):
@@ -62,7 +62,7 @@ class GraphCache:
         self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], object]] = {}
 
     def run(self, key: Hashable, work: Callable[..., Result], *inputs: Tensor) -> Result:
-        """Run or replay the work and return what it returns; the next replay of this stretch overwrites it.
+        """Run or replay the work and return its result; the next replay of this stretch overwrites the result.
 
         A key must always come with the same work and inputs of the same shapes.
         """
@@ -86,7 +86,7 @@ class GraphCache:
         return cast(Result, result)
 
     def _settle(self) -> None:
-        """Bring the state into its fixed place."""
+        """Copy the state into the tensors at fixed addresses."""
         now = self._get()
         if not self._state:
             self._state = {name: value.clone() for name, value in now.items()}
@@ -110,9 +110,9 @@ class Stepper(Protocol):
     """Runs stretches: parts of a world's step that read no number on the host."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
-        """Run a method of the world on tensors whose shapes never change, and return what it returns.
+        """Run a method of the world on tensors whose shapes never change, and return its result.
 
-        The next run of the same method may overwrite what it returned.
+        The next run of the same method may overwrite the result.
         """
         ...
 

@@ -21,7 +21,7 @@ from bidex_meta.utils.validation import BelowOne, Text
 from bidex_meta.world.depth_sensor import DepthSensor, PointsRule
 
 _LARGEST = 1e6
-"""Bound of a variation's numbers (metres, radians, draws): single precision keeps the square of a distance finite."""
+"""Largest absolute value in a variation (metres, radians, draws): squared distances stay finite in single precision."""
 
 
 @checked_arguments
@@ -30,13 +30,13 @@ class Slot:
     """A task class with a pool of tasks and a share of a world's environments."""
 
     name: Text
-    """E.g. ``CatchUnderarm`` or ``CatchUnderarm/left``."""
+    """Name, e.g. ``CatchUnderarm`` or ``CatchUnderarm/left``."""
     task_class: TaskClass
     tasks: np.ndarray
     """Variations, shape (n, variation_space.size), float64."""
     reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
     gamma: BelowOne | None = None
-    """Discount that learners shall take for it; None: their own."""
+    """Discount factor per step that learners must use for this slot; None: the learner's own."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Group:
     env_ids: Tensor
     """Environment of each simulation, shape (num,), int64."""
     span: slice | None
-    """The environments as a slice if they are contiguous, else None."""
+    """The group's environments as a slice if they are contiguous, else None."""
 
     def take(self, values: Tensor) -> Tensor:
         """Return this group's part of a tensor over all environments (a view if they are contiguous)."""

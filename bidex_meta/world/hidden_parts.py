@@ -1,4 +1,4 @@
-"""Hidden parts of tasks: the methods by which a world of hands is a ``contract.PrivilegedWorld``."""
+"""Hidden parts of tasks: the methods of ``contract.PrivilegedWorld`` for worlds of hands."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,7 @@ class HiddenParts:
             goal_indices.update(slot.task_class.layout.goal_indices())
         self._goal_entries = torch.tensor(sorted(goal_indices), dtype=torch.int64, device=device)
         self.size = max(map(len, self.columns.values()))
-        """The most numbers that tasks of a class hide."""
+        """Maximum number of values that the tasks of a class hide."""
 
     def with_goals(self, world: PartedWorld, obs: Tensor) -> Tensor:
         """See ``PrivilegedWorld``."""

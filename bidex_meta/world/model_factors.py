@@ -1,6 +1,7 @@
 """The dependence of a scene's model on the factors of a randomisation.
 
-All numbers are multiplied by powers of factors, so that nothing is left to ``mj_setConst``, which would cost a step.
+Every number that depends on a factor is multiplied by a power of the factor. This includes the numbers that
+``mj_setConst`` would compute, because a call of it would take as long as a step.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,7 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks.scene import Scene
 
 Exponents = dict[str, dict[str, Tensor]]
-"""By the model's field and the factor: the power of the factor that each number of the field is multiplied by."""
+"""Exponents by the model's field and by factor: each number of the field is multiplied by the factor to this power."""
 
 
 def object_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -25,7 +26,7 @@ def object_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _free(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies are free objects without joints, (nbody,), bool."""
+    """Return which bodies are free objects that have no other joints and carry no bodies, (nbody,), bool."""
     parents = np.isin(np.arange(model.nbody), model.body_parentid)
     free = np.array(
         [n == 1 and model.jnt_type[a] == 0 for n, a in zip(model.body_jntnum, model.body_jntadr, strict=True)]
@@ -34,7 +35,7 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
 
 
 def heights(scene: Scene) -> dict[int, float]:
-    """Return how far free objects without joints reach below their origin at the start, metres.
+    """Return the extent of the free objects (see ``_free``) below their origin at the start, metres.
 
     The keys are the ``qpos`` columns of z.
     """
@@ -74,7 +75,7 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yield factor, field and exponents (n, 1) or (n, k).
 
-    Factors of size do not change masses; inverse inertias follow both.
+    Size factors do not change masses. Inverse inertias depend on both size and mass.
     """
     objects = object_bodies(model)
     free = _free(model)
@@ -106,7 +107,7 @@ def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _volumes(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
-    """Return which of the bounding volumes belong to some bodies, bool."""
+    """Return which of the bounding volumes belong to the given bodies, bool."""
     found = np.zeros(int(model.body_bvhnum.sum()), dtype=bool)
     for body in bodies.nonzero()[0]:
         found[model.body_bvhadr[body] :][: model.body_bvhnum[body]] = True

@@ -1,4 +1,4 @@
-"""From sensors to observations (one gather, one scale, the goal's blocks), and the groups of their entries."""
+"""The computation of observations from sensors (one gather, one scale, the goal's blocks), and observation groups."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -16,11 +16,11 @@ from bidex_meta.world.contract import ObservationGroup
 Rule = Literal["plain", "one-hot", "masked"]
 """The observation of a suite: everything; everything and the task's id; everything but the goal."""
 _HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both_hands(moving=True, touch=True)}
-"""By name and not by prefix: ``right_handle_position`` is of an object."""
+"""Observation group of each block of a hand. Prefixes would not do: ``right_handle_position`` belongs to an object."""
 
 
 class Observer:
-    """Builds the observations of rows of one layout: a gather of sensors, last actions and base rotations.
+    """Builds the observations of environments with one layout, by a gather of sensors, last actions and base rotations.
 
     Blocks that only a task can compute (such as the goal's pose) are left at zero, and ``Part`` fills them in. A masked
     goal and padding stay at zero.
@@ -71,10 +71,10 @@ class Observer:
         self._scale[where] = 1.0
 
     def _of_quaternions(self, scene: Scene) -> list[int]:
-        """Return the first entries of the quaternions whose sign the scene's rules choose; a pose ends with one.
+        """Return the first entry of each quaternion whose sign the scene's rules choose.
 
-        Quaternions of hands are not among them: joints turn the hands from one start, so that each sign is unique even
-        if w is near 0.
+        A goal's block ends with such a quaternion. Quaternions of hands are left out: joints turn a hand continuously
+        from one start, so that the sign is unique even if w is near 0.
         """
         if not scene.task.rules.wide:
             return []
@@ -91,7 +91,7 @@ class Observer:
         return found
 
     def choose_signs(self, values: Tensor) -> None:
-        """Turn quaternions of objects and goals in observations (n, width), in place, to w >= 0 (wide variation)."""
+        """Negate quaternions of objects and goals with w < 0 in observations (n, width), in place (wide variation)."""
         if len(self._quaternions):
             columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
             turns = values[:, columns].unflatten(1, (-1, 4))
@@ -138,8 +138,9 @@ def observation_groups(
 ) -> tuple[ObservationGroup, ...]:
     """Return groups that are valid for all classes of a world; entries whose kind differs by class are in ``task``.
 
-    ``width``: entries before the task id, at least those of each layout; ``hidden``: entries of each layout that are
-    zero, as padding is; ``points``: name and entries of the cloud between the padded observation and the task id.
+    ``width``: number of entries of the padded observation, without cloud and task id. ``hidden``: for each layout, the
+    entries that are always zero and count as padding. ``points``: name and number of entries of the cloud, which lies
+    between the padded observation and the task id.
     """
     if hidden is None:
         hidden = [()] * len(layouts)

@@ -1,4 +1,4 @@
-"""The environments that one engine carries: controls, starts, observations, rewards."""
+"""The environments that one engine simulates: controls, starts, observations, rewards."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -47,7 +47,7 @@ class Controls:
     def write(self, action: Tensor) -> None:
         """Set targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
 
-        ``action``: clean, shape (num, 52 or 40).
+        ``action``: finite numbers in [-1, 1], shape (num, 52 or 40).
         """
         action = action.to(self._engine.ctrl.dtype)
         share = action.shape[1] // len(SIDES)
@@ -61,7 +61,7 @@ class Controls:
 
 
 class Part:
-    """A group of environments with everything that turns engine numbers into transitions and back."""
+    """A group of environments, with all that turns actions into engine inputs and engine states into transitions."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Part:
         self._rule = rule
         self._sights = sights
         self.engine_rows = torch.full((num_envs,), -1, device=self._engine.device)
-        """Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,)."""
+        """Engine row of each environment of the world, or -1 for environments of other parts, shape (num_envs,)."""
         self.engine_rows[group.env_ids] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         """Engine steps per control step."""
@@ -91,7 +91,7 @@ class Part:
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
-        """Numbers of a start: ``qpos`` and the poses of movable fixtures."""
+        """Size of a start position, which consists of ``qpos`` and the poses of movable fixtures."""
         for member in group.members:
             tasks = slots[member.slot].tasks
             checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
@@ -108,7 +108,7 @@ class Part:
         return mounts
 
     def set_pools(self, slots: list[Slot]) -> None:
-        """Take the pools of tasks of the slots."""
+        """Replace the task pools by those of the slots."""
         self.tasks = list[Tensor]()
         """Pool of each member, (n, size of its variations), float64."""
         self._pools = list[dict[str, Tensor]]()
@@ -125,8 +125,9 @@ class Part:
     def renew(self, mask: Tensor, shares: Tensor) -> None:
         """Give the environments of a mask (num,) new tasks; environment j of a member plays entry j of its pool.
 
-        ``shares`` in [0, 1), (num, at least the size of each variation), say where in their spaces the tasks lie. Pools
-        are rewritten in place, and for all environments, because recorded graphs read them and fix all shapes.
+        ``shares`` in [0, 1), (num, at least the size of each variation), give the tasks' positions in their variation
+        spaces. Pools are rewritten in place and for all environments, because recorded graphs read them and have fixed
+        shapes.
         """
         for member, tasks, pool in zip(self.group.members, self.tasks, self._pools, strict=True):
             task = member.scene.task
@@ -136,7 +137,7 @@ class Part:
                 pool[name].copy_(values)
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Return the frozen numbers of a member's environments, given the pool indices of their tasks."""
+        """Return a member's frozen numbers (see ``TaskClass.freeze``), from the environments' task indices."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
@@ -157,9 +158,10 @@ class Part:
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """Yield the members among some rows, the slice of their rows, and their state.
+        """Yield each member that has chosen rows, the slice of its rows among the chosen rows, and its state.
 
-        ``task_index``: task of each of the part's environments, (num,); ``rows``: engine rows, ascending, None for all.
+        ``task_index``: task of each of the part's environments, (num,); ``rows``: the chosen engine rows, ascending, or
+        None for all.
         """
         for i, member, where, chosen in self.members(rows):
             frozen = self.frozen(i, task_index[chosen])
@@ -177,9 +179,10 @@ class Part:
                 yield i, member, slice(first, last), rows[first:last]
 
     def rows_in(self, mask: Tensor) -> Tensor | None:
-        """Return the engine rows of the environments of a mask (num_envs,), ascending; None (all rows) if masked.
+        """Return the engine rows of the environments of a mask (num_envs,), ascending.
 
-        Counting the entries of a mask would make the host wait for an accelerator.
+        For masked engines return None, which stands for all rows: counting the entries of a mask would make the host
+        wait for the accelerator.
         """
         if self._engine.masked:
             return None
@@ -236,7 +239,7 @@ class Part:
                 values[where, self._observer.layout.range(name)] = block.float()
 
     def goals(self, task_index: Tensor, width: int) -> Tensor:
-        """Return the goals' entries of observations (num, width), as if nothing were hidden, zero elsewhere.
+        """Return observations (num, width) with the goals, as if nothing were hidden; all other entries are zero.
 
         ``task_index``: task of each of the part's environments, (num,).
         """
@@ -255,9 +258,9 @@ class Part:
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor, shares: Tensor | None = None) -> Tensor:
         """Return start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
-        ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
-        numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,). ``shares``: those of new tasks as in
-        ``renew``, (n, ...), in place of tasks of the pools; None: the tasks of the pools.
+        ``rows``: engine rows (n,), ascending; None: all rows, with n / num successive starts for each row. ``draws``:
+        uniform numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,). ``shares``: shares of new
+        tasks as in ``renew``, (n, ...); None: the tasks come from the pools.
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         if rows is None:
@@ -305,8 +308,8 @@ class PartedWorld(Protocol):
 def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None = None) -> Sequence[Tensor | None]:
     """Return, for each part, roll, pitch and yaw (n, 2, 3) of both bases relative to the start.
 
-    Engine rows None stand for all rows. All parts are computed at once, because a dozen operations take as long on a
-    few rows as on all.
+    ``rows`` holds the engine rows of each part; None stands for all rows. All parts are computed at once, because a
+    dozen operations take as long on a few rows as on all.
     """
     mounts = [part.mounts(r) for part, r in zip(parts, rows or [None] * len(parts), strict=True)]
     moving = [each for each in mounts if each is not None]
@@ -327,7 +330,7 @@ class Judgement(NamedTuple):
 
 
 def judge(task: TaskClass, state: TaskState) -> Judgement:
-    """Return reward, success and true ends of the step just made."""
+    """Return reward, success and failure of the step just made."""
     terms = task.rewards(state)
     values = list(terms.values())
     if len(values) > 1:

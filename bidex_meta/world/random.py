@@ -16,7 +16,10 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return two 32-bit words per counter, from two words of key and counter: int64 below 2^32, broadcast together."""
+    """Return two 32-bit words per counter.
+
+    Key and counter have two words each. All words are int64 below 2^32 and are broadcast together.
+    """
     k0, k1 = key
     keys = (k0, k1, k0 ^ k1 ^ _PARITY)
     x0, x1 = torch.broadcast_tensors((counter[0] + k0) & _MASK, (counter[1] + k1) & _MASK)
@@ -44,7 +47,7 @@ def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
 
 
 def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
-    """Return standard normal numbers, float32 (n, draws), of the same keys, episodes and draws as ``uniform``."""
+    """Return standard normal numbers, float32 (n, draws); the arguments are those of ``uniform``."""
     pairs = uniform(keys, episode, draws + draws % 2).float().unflatten(1, (-1, 2))
     radius = (-2.0 * torch.log1p(-pairs[..., 0])).sqrt()
     angle = 2.0 * math.pi * pairs[..., 1]
@@ -52,9 +55,10 @@ def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
 
 
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
-    """Return uniform numbers in [0, 1), float64 (n, draws), that only depend on key (n, 2), episode (n,) and draw.
+    """Return uniform numbers in [0, 1), float64 (n, draws).
 
-    The numbers are multiples of 2^-24 and therefore exact in single precision.
+    A number depends only on key (n, 2), episode (n,) and the number of the draw. All are multiples of 2^-24 and
+    therefore exact in single precision.
     """
     pairs = torch.arange((draws + 1) // 2, device=keys.device)
     words = threefry((keys[:, :1], keys[:, 1:]), (episode[:, None], pairs[None]))

@@ -21,10 +21,10 @@ _DELAY = "action_delay"
 
 
 class Randomiser:
-    """Draws for the environments of a world."""
+    """Draws factors, delays, noise and pushes for the environments of a world, and applies them."""
 
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
-        """``deviation`` holds the standard deviations of the observations' noise, (n, width), or no columns.
+        """``deviation`` (n, columns) is the standard deviation of the noise in the first columns of observations.
 
         Raises BidexError if the size of a mesh object is to vary.
         """
@@ -50,11 +50,14 @@ class Randomiser:
         return most + 1 if most else 0
 
     def seed(self, keys: Tensor) -> None:
-        """Take the environments' random keys, (n, 2), for all later draws."""
+        """Set the environments' random keys, (n, 2), for all later draws."""
         self._keys.copy_(keys)
 
     def begin(self, mask: Tensor, number: Tensor) -> None:
-        """Draw for the episodes ``number`` (n,) of the environments of a mask (n,), and change their models."""
+        """Draw for new episodes in the environments of a mask (n,), and change the environments' models.
+
+        ``number`` (n,) is the number of each environment's episode.
+        """
         masked = self._parts[0].group.engine.masked
         if masked:
             env_ids = torch.arange(len(mask), device=mask.device)
@@ -81,16 +84,17 @@ class Randomiser:
             models.write(self.drawn, mask)
 
     def lift(self, starts: Sequence[Tensor], mask: Tensor) -> None:
-        """Lift larger objects in the starts of a mask's environments (of each part, see ``Starts.take``), in place.
+        """Lift larger objects in the start positions of the environments of a mask, in place.
 
-        Otherwise these objects would start inside the surface that they lie on.
+        Otherwise these objects would start inside the surface on which they lie. ``starts`` holds the start positions
+        of each part, see ``Starts.take``.
         """
         if "object_size" in self.drawn:
             for models, start in zip(self._models, starts, strict=True):
                 models.lift(start, self.drawn["object_size"], mask)
 
     def act(self, action: Tensor, past: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the actions (n, a) that the engines get, and the remembered ones; push objects.
+        """Push objects; return the actions (n, a) that the engines get, and the actions to remember.
 
         ``past``: the remembered actions, newest first, (n, ``remembered``, a); ``elapsed``: steps since the start (n,).
         """
@@ -110,7 +114,7 @@ class Randomiser:
         return action, past
 
     def observe(self, obs: Tensor, elapsed: Tensor, env_ids: Tensor | slice = slice(None)) -> Tensor:
-        """Return observations (k, width) of some environments with noise; ``elapsed`` (k,): their steps so far."""
+        """Return observations (k, width) of some environments with noise; ``elapsed`` (k,): steps of their episodes."""
         if not self._rule.observation_noise:
             return obs
         noise = normal(self._streams[_OBSERVATION][env_ids], elapsed, self._deviation.shape[1])
@@ -139,7 +143,7 @@ class _Models:
         self._heights = [heights(member.scene) for member in members]
 
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:
-        """Multiply fields of the models of a mask's environments, as they were compiled, by the drawn factors."""
+        """Set fields of models to their compiled values times powers of the factors, in the environments of a mask."""
         if not self._fields:
             return
         group = self._part.group
@@ -153,7 +157,7 @@ class _Models:
                 field[rows] = torch.where(new[rows], value.to(field.dtype), field[rows])
 
     def lift(self, start: Tensor, size: Tensor, mask: Tensor) -> None:
-        """See ``Randomiser.lift``; for this part."""
+        """Lift the objects of this part; see ``Randomiser.lift``."""
         size = self._part.group.take(size)
         for i, _, where, rows in self._part.members(self._part.rows_in(mask)):
             for column, height in self._heights[i].items():
@@ -174,9 +178,9 @@ class _Models:
 
 
 def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
-    """Return the noise's standard deviation in each slot's observations, (slots, columns), float32.
+    """Return the standard deviation of the noise in each slot's observations, (slots, columns), float32.
 
-    Goals, actions and columns that a point cloud replaces (``hidden``, of each slot) have no noise.
+    Goals and actions have no noise, nor have the columns that a point cloud replaces (``hidden``, one list per slot).
     """
     table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
     for row, layout, zero in zip(table, layouts, hidden, strict=True):

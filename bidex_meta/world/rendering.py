@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
 """Azimuth and elevation of the named views, degrees; None: the class's ``camera_angle``."""
 _MOST_RENDERERS = 32
-"""A tiled film of all classes fits; each takes some megabytes."""
+"""Maximum number of cached renderers: enough for a tiled film of all classes; each takes some megabytes."""
 MOST_PIXELS = 1080
 """Edge of the largest square picture."""
 _SMALL = 320
-"""Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
+"""Largest width of tiles, pixels. Tiles are drawn faster, without reflections and with coarser shadows."""
 GHOST_ALPHA = 0.35
 """Opacity of goals."""
 
@@ -93,7 +93,7 @@ class Painter(threading.local):
         return renderer.render()
 
     def _renderer(self, model: mujoco.MjModel, key: tuple[int, int, int]) -> tuple[mujoco.Renderer, mujoco.MjData]:
-        """Return the renderer of a slot (its environments have one model) and a size, width and height."""
+        """Return the cached renderer for a key: slot (all its environments have one model), width and height."""
         if key not in self._renderers:
             gl_backend.prepare()
             most = model.vis.global_.offwidth, model.vis.global_.offheight

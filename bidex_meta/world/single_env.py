@@ -1,6 +1,6 @@
-"""One environment of a task class as a suite has it: `env = cls()`, `env.set_task(task)`, as with Meta-World's classes.
+"""Single environments of a suite's task classes, used as Meta-World's: `env = cls()`, then `env.set_task(task)`.
 
-This is for code written in that way; `Benchmark.make_world` makes all environments of a suite at once.
+They serve code that was written for Meta-World; `Benchmark.make_world` makes all environments of a suite at once.
 """
 
 import copyreg
@@ -51,20 +51,20 @@ class EnvRecipe:
 
     name: str
     moving_base: bool | None
-    """True if the hands' bases move, False if they are fixed; None: as the class has it on its own."""
+    """True if the hands' bases move, False if they are fixed, None for the class's default."""
     options: tuple[tuple[str, float | str], ...]
     padded_size: int
     """Entries of an observation, without a point cloud."""
     hides_goal: bool
     reward_scale: float
     class_name: str | None = None
-    """The task class, if its name differs from ``name``, as with an object."""
+    """Name of the task class if it differs from ``name``, which may contain the name of an object."""
     rules: Rules = V1
     """The suite's rules."""
     points: tuple[int, bool] = (0, False)
-    """Points of the cloud in place of objects' states (0: the states), and whether each point has its kind."""
+    """Number of points of the cloud that replaces objects' states (0: no cloud), and whether points have kinds."""
     listed: bool = False
-    """True if the suite's file lists the tasks, which may then lie outside of the class's variation space."""
+    """True if the suite's file lists the tasks; these may lie outside of the class's variation space."""
     touch: bool = False
     """True if observations show touch sensors."""
 
@@ -79,7 +79,7 @@ class EnvRecipe:
 
 
 class _Remade(type):
-    """Metaclass of classes that no module holds; they are pickled as their ``EnvRecipe``."""
+    """Metaclass of classes that are made at run time and are in no module; they are pickled as their ``EnvRecipe``."""
 
 
 def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
@@ -104,9 +104,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     end of an episode, so that `success` is 0.0 before the last step. An episode is a success if any of its steps has
     `success` 1.0.
 
-    `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
-    `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the suite's:
-    `reward_function_version="v2"`, Meta-World's default, stands for it. Raises BidexError for another of these.
+    `render_mode` is None or `"rgb_array"`. `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`;
+    `camera_id` may give its index in this list instead. Pictures have `width` x `height` pixels. There is only the
+    suite's reward: `reward_function_version` must be `"v2"`, Meta-World's default. Raises BidexError for other values.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
@@ -166,7 +166,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return self.task_class.episode_steps
 
     def seed(self, seed: int) -> list[int]:
-        """Restart the random numbers, as `reset(seed=...)` does: of starts, of the spaces and of wrappers."""
+        """Seed the random numbers of starts and wrappers, as `reset(seed=...)` does, and those of the spaces."""
         seed = whole_number("seed", seed, 0)
         super().reset(seed=seed)
         for space in (self.action_space, self.observation_space, self.goal_space):
@@ -216,9 +216,10 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Make one control step of 1/60 s under an action (a,) in [-1, 1].
 
-        Returns observation (d,), float32, reward, terminated (what was to be held is lost; with `terminate_on_success`
-        also success), truncated (time is up, or physics broke), and info. In version 2 nothing is a success before the
-        episode ends, so that `terminate_on_success` shortens no episode. Raises BidexError if no episode runs.
+        Returns observation (d,), float32, reward, terminated (the task failed, e.g. an egg dropped; with
+        `terminate_on_success` also after success), truncated (time is up, or physics broke), and info. In version 2
+        success counts only when the episode ends, so `terminate_on_success` shortens no episode. Raises BidexError if
+        no episode runs.
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")

@@ -20,12 +20,12 @@ _TASK_DRAW = 0
 _ELAPSED_DRAW = 1
 _OWN_DRAWS = 2
 _AHEAD = 8
-"""Episodes drawn ahead per environment: some classes fail within ten steps, so one would run out at almost every step.
-"""
+"""Number of episodes drawn ahead per environment. Some classes fail within ten steps: with one episode drawn ahead, new
+draws would be needed at almost every step."""
 
 
 class Starts:
-    """The coming episodes of every environment: their tasks, elapsed shares and positions."""
+    """The coming episodes of every environment: tasks, elapsed shares of the time limit, and start positions."""
 
     def __init__(
         self,
@@ -42,12 +42,12 @@ class Starts:
         Args:
             parts: The world's parts.
             keys: Random keys of the environments, (n, 2).
-            start_draws: The most draws of any class.
+            start_draws: Maximum number of draws that the start of an episode takes in any class.
             pool_size: Tasks in the pool of each environment's slot, (n,), if episodes draw them; None if environments
                 keep their tasks.
-            together: Does a job for each part.
-            task_keys: Random keys of new tasks, (n, 2), if every episode has one; None: tasks are of the pools.
-            episodes_per_task: Consecutive episodes that play one drawn task.
+            together: Runs one job per part.
+            task_keys: Random keys of new tasks, (n, 2), if episodes draw new tasks; None: tasks come from the pools.
+            episodes_per_task: Number of consecutive episodes that play one drawn task.
         """
         self._together = together
         self._parts = parts
@@ -70,7 +70,7 @@ class Starts:
         self._takes = 0
 
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Draw ahead if the next ``take``, which gets the same mask, number and task_index, needs new draws."""
+        """Draw ahead if the next ``take`` needs new draws; ``take`` must get the same mask, number and task_index."""
         if self._masked:
             # An environment begins at most one episode per take, so counting them replaces a look at any number.
             if self._takes % _AHEAD == 0:
@@ -82,12 +82,14 @@ class Starts:
             self._draw((used >= _AHEAD // 2).nonzero().squeeze(1), number, task_index)
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return the starts of the environments in ``mask``, bool (n,), after ``prepare``; write new tasks into pools.
+        """Return the starts of the environments in ``mask``, bool (n,), and write new tasks into pools.
 
-        ``number``: of the episode that begins, or would begin next, of every environment, (n,); ``task_index``: task
-        that an environment keeps if none is drawn. Returns task and elapsed share in [0, 1) of every environment, (n,),
-        and for each part the starts (k, start_size) of its k environments in the mask, or of all if the engine is
-        masked; all valid where the mask is true.
+        Call ``prepare`` before. ``number`` (n,): number of the episode that begins, or would begin next, in each
+        environment. ``task_index`` (n,): task that an environment keeps if none is drawn.
+
+        Returns the task (n,) and the elapsed share in [0, 1) (n,) of every environment, and for each part the start
+        positions (k, start_size) of its k environments in the mask (of all its environments if the engine is masked).
+        Values of environments outside the mask are not valid.
         """
         place = (number - self._first).clamp(max=_AHEAD - 1)[:, None]
         shares = self._new_tasks(slice(None), number)
@@ -104,7 +106,7 @@ class Starts:
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
     def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Fill the bank of some environments, beginning with the given episode numbers."""
+        """Fill the bank of episodes drawn ahead in some environments, beginning with the given episode numbers."""
         self._first[env_ids] = number[env_ids]
         many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -149,14 +151,17 @@ class Starts:
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
-        """Return shares (k, size), in [0, 1), that place the new tasks of episodes (k,) in their spaces, or None."""
+        """Return the positions of episodes' (k,) new tasks in their variation spaces as shares in [0, 1), (k, size).
+
+        Return None if episodes draw no new tasks.
+        """
         if self._task_keys is None:
             return None
         return uniform(self._task_keys[env_ids], episode // self._episodes_per_task, self._task_size)
 
 
 def _repeated(env_ids: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each environment ``_AHEAD`` times, and the number of the episode ahead, (k _AHEAD,) each."""
+    """Return each environment ``_AHEAD`` times, and with it the offsets 0 to ``_AHEAD`` - 1, (k _AHEAD,) each."""
     # Without output_size repeat_interleave would ask the device for the length.
     many = env_ids.repeat_interleave(_AHEAD, output_size=_AHEAD * len(env_ids))
     return many, torch.arange(_AHEAD, device=env_ids.device).repeat(len(env_ids))

@@ -49,7 +49,7 @@ def area(model: mujoco.MjModel, geom: int) -> float:
 
 
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
-    """Return points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
+    """Return points with normals, spread evenly over the surface of a geom whose type is in ``DRAWN``.
 
     ``offset``, (2,) in [0, 1), is the start of the sequence of ``even_numbers``.
     """
@@ -188,14 +188,14 @@ def _mesh(model: mujoco.MjModel, geom: int, u: np.ndarray) -> Surface:
 _OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
-"""Kinds of points: what stands still in an episode; either hand; what physics moves."""
+"""Kinds of points: on things that stand still during an episode, on either hand, on things that physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
-"""Shares of the candidates: by area only, a table would leave an egg a handful of points."""
+"""Shares of the candidates. If area were the only rule, a table would leave only a handful of points for an egg."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers draw geoms of groups 0 to 2."""
 _PROBES = 512
 _BURIED = 5e-4
-"""A point this deep in another geom of its body, metres, is never seen."""
+"""Depth in another geom of the same body, metres, beyond which a point is never seen."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def visible_geoms(model: mujoco.MjModel) -> list[int]:
 def body_kinds(model: mujoco.MjModel) -> list[float]:
     """Return FIXTURE, HAND or OBJECT for each body.
 
-    A body without a joint up to the world is in no kinematic tree.
+    A body is a fixture if it belongs to no kinematic tree, that is, if no joint lies between it and the world.
     """
     hands = tuple(f"{side}/" for side in SIDES)
     moving = [OBJECT if tree >= 0 else FIXTURE for tree in model.body_treeid]
@@ -274,7 +274,10 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
 
 
 def _portions(areas: np.ndarray, kinds: np.ndarray, count: int) -> np.ndarray:
-    """Return the number of points of each geom, (geoms,), at least one if it has open area; the sum is ``count``."""
+    """Return the number of points of each geom, (geoms,); the sum is ``count``.
+
+    ``areas`` (m²) leave out what is buried in other geoms. A geom with an area gets at least one point.
+    """
     shares = np.zeros(len(areas))
     for kind, share in _SHARES.items():
         if (whole := areas[kinds == kind].sum()) > 0.0:

@@ -23,7 +23,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def set_up_torch(threads: int, deterministic: bool = False) -> None:
-    """Give torch this many threads, and the process the memory settings of training.
+    """Set the number of torch's threads, and the memory settings of the process for training.
 
     With ``deterministic`` torch only uses algorithms that repeat bit for bit on a GPU.
     """
@@ -37,7 +37,7 @@ def set_up_torch(threads: int, deterministic: bool = False) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep up to 64 MB that were freed, for the next tensors; without effect if there is no glibc.
+    """Let glibc keep up to 64 MB of freed memory for the next tensors; this has no effect without glibc.
 
     By default glibc returns free memory beyond twice the size of the largest block that it has freed (blocks above 32
     MB do not count). With small tensors every step then waits for pages: an inner step of the meta-learners took up to

@@ -44,7 +44,7 @@ _DEFAULT_SIZES = {"cpu": 1024, "cuda": 8192}
 _MOST_COLUMNS = 1_000_000
 _NOTHING = vars(Randomisation())
 _STATE = ("_action", "_past", "_obs", "task_index")
-"""Attributes that a step changes, beside the episodes' counters."""
+"""Attributes that a step changes, in addition to the episodes' counters."""
 
 
 @dataclass(frozen=True)
@@ -52,27 +52,27 @@ class WorldConfig:
     """Options of a world, independent of its slots.
 
     Attributes:
-        num_envs: Environments, split evenly over the slots; None: 1024 on the CPU and 8192 on an accelerator.
+        num_envs: Number of environments, split evenly over slots; None: 1024 on the CPU, 8192 on an accelerator.
         device: "cpu", "auto" (CUDA if there is one) or a CUDA device, e.g. "cuda:0".
-        engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": the faster one there.
+        engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": the faster one on the device.
         deterministic: Make physics on a GPU repeat bit for bit; on a CPU it always does.
-        seed: Decides every draw.
+        seed: Seed of all random draws.
         autoreset_mode: SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation), as a
             member or its name.
         observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
-        pad_to: Observation entries before the task id; None: those of the widest class.
-        task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n; "fresh": each
-            episode draws a new task of its class's space, in DISABLED mode as "fixed" (see ``EndlessWorld``).
-        episodes_per_task: Consecutive episodes of an environment that play one task, if episodes draw tasks.
+        pad_to: Number of observation entries before the task id; None: the number of the widest class.
+        task_sampling: "uniform": each autoreset draws a task of the pool; "fixed": environment j keeps task j mod n;
+            "fresh": each episode draws a new task of its class's space; in DISABLED mode as "fixed" (``EndlessWorld``).
+        episodes_per_task: Number of consecutive episodes that play one task, if episodes draw tasks.
         threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.
-        stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that they do not end together,
-            and do not count in ``episode``. False: they begin at 0.
-        points: Observations show a point cloud before the task id, and of objects nothing else; None: their state.
-        randomisation: Factors that are drawn for environments, and noise that is added; None: nothing.
-        pixels: Edge of the square pictures by the classes' cameras in ``info["pixels"]``, pixels; 0: none.
+        stagger: If true, first episodes in SAME_STEP mode begin at random elapsed steps, so that they do not end
+            together; they do not count in ``episode``. If false, first episodes begin at 0.
+        points: Point cloud before the task id, in place of the objects' states; None: observations show the states.
+        randomisation: Factors that are drawn for environments, and noise that is added; None: neither.
+        pixels: Edge of the square pictures in ``info["pixels"]``, by the classes' cameras, pixels; 0: no pictures.
 
     Raises BidexError for an unknown sampling or observation, a seed below 0, too large pictures, or several episodes
-    per task where environments keep their tasks.
+    per task if environments keep their tasks.
     """
 
     num_envs: int | None = None
@@ -104,9 +104,9 @@ class WorldConfig:
 class World(BatchedWorld):
     """Every task of a suite in one Gymnasium vector environment of torch tensors.
 
-    A ``contract.PooledWorld`` and ``contract.PrivilegedWorld``: attributes and ``info`` are explained there. NumPy
-    actions are accepted. Positions and velocities in observations are those of the state after the step; force entries
-    are those of its last substep, and zero right after a reset.
+    It is a ``contract.PooledWorld`` and a ``contract.PrivilegedWorld``; ``contract`` explains attributes and ``info``.
+    NumPy actions are accepted. Positions and velocities in observations are those of the state after the step. Forces
+    are those of the step's last substep, and zero right after a reset.
     """
 
     def __init__(self, slots: Sequence[Slot], config: WorldConfig | None = None) -> None:
@@ -293,7 +293,7 @@ class World(BatchedWorld):
         return active
 
     def step_engines(self, active: Tensor | None = None) -> None:
-        """Advance the physics by a control step, of all environments or those of a mask (num_envs,)."""
+        """Advance the physics of all environments, or of those in a mask (num_envs,), by one control step."""
         masks = [None if active is None else part.group.take(active) for part in self.parts]
         self._side_by_side.run([partial(part.advance, mask) for part, mask in zip(self.parts, masks, strict=True)])
 
@@ -456,11 +456,11 @@ class World(BatchedWorld):
         return [pools[slot] for slot in range(self.num_tasks)]
 
     def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
-        """Return in a sentence what a task of a slot (None: the class) asks for, without what the world hides."""
+        """Return a sentence that describes a task of a slot (None: the class), without what the world hides."""
         return self.slots[slot].task_class.instruction(variation, self.hides_goals)
 
     def instructions(self) -> list[str]:
-        """Return in a sentence what the task asks for that each environment plays."""
+        """Return for each environment a sentence that says what its task asks for."""
         pools = self.pools
         places = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
         return [self.instruction(slot, pools[slot][index]) for slot, index in places]

@@ -1,7 +1,7 @@
-"""Wrappers of a world, the base of recorders and statistics, and the NumPy form that Gymnasium expects.
+"""Base classes for wrappers of a world, such as recorders, and the NumPy form that Gymnasium expects.
 
-Extend the wrapper of the wrapped world's class, so that evaluation and learners still see its abilities, and override
-the methods that are to do more::
+Extend the base class that fits the world, e.g. ``PooledWorldWrapper`` for a ``PooledWorld``: evaluation and learners
+then still see what the world can do. Override the methods that are to do more::
 
     class Count(WorldWrapper):
         steps = 0
@@ -35,7 +35,7 @@ _OF_THE_CONTRACT = (
 
 
 class WorldWrapper(VectorWorld):
-    """A ``VectorWorld`` that passes everything on to another one; attributes are read from it each time."""
+    """A ``VectorWorld`` that passes every call on to the wrapped world, and reads attributes from it at each use."""
 
     @checked_arguments
     def __init__(self, world: VectorWorld) -> None:
@@ -77,13 +77,13 @@ class WorldWrapper(VectorWorld):
 
 
 class TaskWorldWrapper(WorldWrapper, TaskWorld):
-    """A ``TaskWorld`` that passes everything on to another one."""
+    """A ``TaskWorld`` that passes every call on to the wrapped world."""
 
     world: TaskWorld
 
 
 class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
-    """A ``PooledWorld`` that passes everything on to another one."""
+    """A ``PooledWorld`` that passes every call on to the wrapped world."""
 
     world: PooledWorld
 
@@ -93,19 +93,20 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
         return self.world.pools
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Give slots other pools; see ``PooledWorld``."""
+        """Replace the task pools of some slots; see ``PooledWorld``."""
         self.world.set_tasks(pools)
 
 
 class NumpyWorld(VectorEnv):
     """The result of ``world.to_numpy()``: NumPy arrays, for Gymnasium's vector wrappers.
 
-    ``info`` has ``success``, ``unstable``, ... of every environment, and if one ended ``final_obs`` (an array of
-    objects: observations, None for the other environments) and ``final_info``, whose ``episode`` has r, l, t, success,
-    unscaled. ``episode`` itself is left to ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be
-    stepped, as in the world, but its end is reported once, in the step that ended it: later steps would count as
-    episodes. With ``stagger`` a training world's first episodes begin at random elapsed steps, and wrappers that count
-    for themselves count them too short.
+    ``info`` has ``success``, ``unstable``, ... of every environment. If an episode ended, ``info`` also has
+    ``final_obs`` (an array of objects: the last observation where an episode ended, elsewhere None) and ``final_info``,
+    whose ``episode`` has r, l, t, success and unscaled. The key ``episode`` itself is left to Gymnasium's
+    ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be stepped, as in the world, but its end is
+    reported only in the step that ended it; otherwise wrappers would count each later step as an episode. With
+    ``stagger`` a training world's first episodes begin at random elapsed steps, so that wrappers that count steps
+    report too short episodes.
     """
 
     @checked_arguments
@@ -159,7 +160,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _arrays(value: object) -> object:
-    """Return tensors, and those in a dict, as arrays."""
+    """Return a tensor, or each tensor in a dict, as an array; return other values unchanged."""
     if isinstance(value, dict):
         return {name: _arrays(part) for name, part in value.items()}
     if isinstance(value, Tensor):

@@ -32,17 +32,17 @@ class WorldsConfig:
     suite: str | None = None
     task: str | None = None
     base: Base = "own"
-    points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
-    touch: bool = False  # True: observations show touch sensors; False: as the suite has it
+    points: int = 0  # number of points of the cloud that replaces objects' states; 0: as in the suite
+    touch: bool = False  # True: observations show touch sensors; False: as in the suite
     object: str | None = None
     tasks_per_class: int | None = None  # train tasks per class of a suite; 0: a new one in each episode or trial
-    seed: int = 0  # of starts, and of tasks without ``task_seed``
-    task_seed: int | None = None  # of tasks and starts instead
+    seed: int = 0  # seed of tasks and starts, unless there is a ``task_seed``
+    task_seed: int | None = None  # seed of tasks and starts, in place of ``seed``
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
     deterministic: bool = False  # whether a world on a GPU repeats bit for bit
-    randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
+    randomisation: str | None = None  # file whose table randomises all worlds; None: training as in the suite
 
     @staticmethod
     def of(config: "Mapping[str, Json] | WorldsConfig") -> "WorldsConfig":
@@ -67,7 +67,7 @@ class Worlds(ABC):
     moving_base: bool | None = None  # whether a single class has moving bases; None: the class's own bases
     on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
-    """A preset that precedes the others for these worlds, if the learner has it; and the reason in words."""
+    """Name of the preset that ``auto`` prefers for these worlds, if the learner has it, and the reason in words."""
     default_episodes: ClassVar[int] = 4  # default number of episodes per task in an evaluation
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
@@ -93,14 +93,14 @@ class Worlds(ABC):
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """Return a fresh world of a split, ``train`` or ``test``.
 
-        ``mode`` is the autoreset mode of a training world; None makes an evaluation world (DISABLED). ``rows`` are the
-        environments over all tasks, by default one per task (for Meta-World five per class). Raises BidexError for a
-        missing split, too few environments, or a device or engine that the world does not run on.
+        ``mode`` is the autoreset mode of a training world; None makes an evaluation world (DISABLED). ``rows`` is the
+        number of environments over all tasks, by default one per task (for Meta-World five per class). Raises
+        BidexError for a missing split, too few environments, or a device or engine that the world does not support.
         """
 
     @abstractmethod
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """Return the names of the tasks in each slot's pool in a split's worlds, by slot; the dict may be empty."""
+        """Return the task names of each slot's pool, by slot, in a split's worlds; the dict is empty if none exist."""
 
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
@@ -161,7 +161,7 @@ class Worlds(ABC):
         return {}
 
     def protocol(self, split: str, episodes: int | None = None, seed: int = EVALUATION_SEED) -> Protocol:
-        """Return the protocol of an evaluation: ``episodes`` (None: ``default_episodes``) of each task of a split."""
+        """Return the protocol of an evaluation with ``episodes`` (None: ``default_episodes``) per task of a split."""
         return Protocol(split, seed, episodes_per_task=self.default_episodes if episodes is None else episodes)
 
     def judge(self, agent: "Agent", world: "PooledWorld", protocol: Protocol) -> Evaluation:
@@ -175,7 +175,7 @@ V2_PRESET = "v2", "success counts at the end of the episodes, as in version 2"
 
 
 def physics_of(classes: "Mapping[str, TaskClass]") -> str:
-    """Return twelve letters that identify the physics of some classes, which touch sensors do not change."""
+    """Return twelve hexadecimal digits that identify the physics of classes; touch sensors do not change them."""
     from bidex_meta.engine.models import common_identity
     from bidex_meta.tasks.scene import compile_scene
 

@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 HUMANOID = "gymnasium/Humanoid-v5"  # how a run names it (``--task``)
 
-# Of each of Meta-World's classes; 2 M steps are the budget of published results.
+# Environments and steps per class of Meta-World; 2 M steps are the budget of published results.
 _TRAINING_SIZE = 4
 _TRAINING_STEPS = 2_000_000
-# of a class, and how many are played at a time
+# Number of tasks of a Meta-World class, and number of tasks that are played at a time.
 _TASKS = 50
 _EVALUATION_SIZE = 5
 _HUMANOIDS = 50
 
 
 class Foreign(Worlds):
-    """Classes of another library: only the split train, without references or pictures."""
+    """Classes of another library. They have only the split ``"train"``, and neither references nor pictures."""
 
     on_gpu = False
     bytes_per_environment: int
@@ -65,7 +65,7 @@ class Foreign(Worlds):
 
 
 class MetaWorldSuite(Foreign):
-    """One of Meta-World's suites."""
+    """The worlds of one of Meta-World's suites."""
 
     preset = ("metaworld", "the suite is Meta-World's")
     default_episodes = 1  # its tasks fix their start, so that a policy would only repeat itself

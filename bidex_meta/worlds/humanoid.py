@@ -1,4 +1,7 @@
-"""Gymnasium 1.x's Humanoid-v5 as a world, on ``mujoco.batch``, bit for bit to single precision (paper, appendix C)."""
+"""Gymnasium 1.x's Humanoid-v5 as a world, on ``mujoco.batch`` (paper, appendix C).
+
+The results equal Gymnasium's bit for bit in single precision.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +30,7 @@ _HEALTHY_REWARD = 5.0
 _CONTROL_WEIGHT = 0.1
 _CONTACT_WEIGHT = 5e-7
 _CONTACT_MOST = 10.0
-# metres, of the torso
+# Bounds of the torso's height, metres.
 _LOWEST = 1.0
 _HIGHEST = 2.0
 _START_NOISE = 1e-2
@@ -66,7 +69,7 @@ class HumanoidWorld(ForeignWorld):
         self._bound = [torch.from_numpy(bind(name).view()) for name in ("cinert", "cvel", "qfrc_actuator")]
         self._centres = torch.from_numpy(bind("xipos").view())
         self._contact = torch.zeros(num_envs, model.nbody, 6, dtype=torch.float64)
-        self._x = torch.zeros(num_envs, dtype=torch.float64)  # of the centre of mass, metres
+        self._x = torch.zeros(num_envs, dtype=torch.float64)  # x of the centre of mass, metres
         self.set_tasks({NAME: np.zeros((1, 0))})
 
     def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
@@ -141,7 +144,7 @@ class HumanoidWorld(ForeignWorld):
         return {**super().state_dict(), **own, "x": self._x.clone(), "contact": self._contact.clone()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore a ``state_dict``; raises BidexError for one of another size."""
+        """Restore a ``state_dict``; raises BidexError for a state of another size."""
         fits(state, self.state_dict())
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         self._restore(state)

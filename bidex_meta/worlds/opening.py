@@ -46,7 +46,7 @@ def suites_to_run() -> list[str]:
 
 
 def listed() -> list[dict[str, object]]:
-    """Return the entries of ``bidex-meta list suites``: suites, Meta-World's too, then those of the ladder by rung."""
+    """Return the entries of ``bidex-meta list suites``: our suites, Meta-World's, then those of the ladder by rung."""
     rows: list[dict[str, object]] = []
     ladder: list[list[dict[str, object]]] = [[] for _ in RUNGS]
     for suite in map(load_suite, suite_names()):
@@ -64,6 +64,6 @@ def listed() -> list[dict[str, object]]:
 
 
 def _listed(name: str, kind: str, train: list[str], test: list[str], summary: str) -> dict[str, object]:
-    """Return an entry without a place on the ladder."""
+    """Return an entry of the list for a suite that is not on the ladder."""
     classes = {"train_classes": train, "test_classes": test}
     return {"name": name, "kind": kind, **classes, "rung": None, "hidden": None, "needs": None, "summary": summary}

@@ -1,4 +1,4 @@
-"""Worlds of our own classes: a suite, or a class on its own."""
+"""Worlds of our own classes: those of a suite, or of a single class."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -14,11 +14,11 @@ from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig, ph
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import PooledWorld, TaskClass
 
-_TASKS_ALONE = 50  # that ``make_task_world`` draws for a class on its own
+_TASKS_ALONE = 50  # number of tasks that ``make_task_world`` draws for a single class
 
 
 class OwnSuite(Worlds):
-    """A suite file, shipped or the user's own."""
+    """The worlds of a suite file, which is shipped or the user's."""
 
     suite: Suite
 
@@ -72,7 +72,7 @@ class OwnSuite(Worlds):
 
 
 class SingleClass(Worlds):
-    """A class on its own: goal visible, no one-hot, no padding."""
+    """The worlds of a single class, with a visible goal, without one-hot and without padding."""
 
     class_name: str
 

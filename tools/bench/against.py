@@ -45,11 +45,11 @@ def against(
 
     Args:
         other: A commit of the git checkout that this code runs from, or a folder with a checkout.
-        suite: A suite that both know, each by its own file.
-        num_envs: Environments of the suite's world; a class alone has a quarter of them.
-        steps: Control steps of each repeat, after as many to warm up.
-        repeats: Pairs of repeats; medians are reported.
-        classes: Measure each class of the suite alone too, as the suite has it.
+        suite: A suite that both sides know, each by its own file.
+        num_envs: Number of environments of the suite's world; the world of a single class has a quarter of them.
+        steps: Number of control steps of each repeat. One more repeat comes first, to warm up.
+        repeats: Number of pairs of repeats; medians are reported.
+        classes: Also measure each class of the suite on its own, as it is in the suite.
         threads: Engine threads; None takes all CPUs.
         seed: Seed of worlds and actions.
         out: File that takes the result.
@@ -57,8 +57,8 @@ def against(
     Returns:
         ``old`` and ``new`` (git commit, and whether anything was changed since), the settings, and ``table``: for the
         suite and each class ``old`` and ``new`` (env-steps/s), their ``ratio`` (above 1: this code is faster), the
-        ``least`` and ``most`` of the pairs, the ratio of ``cpu`` seconds a step, which other work on the machine sways
-        less, and each side's ``physics``, "time step × substeps" of its engine batches.
+        ``least`` and ``most`` of the pairs, the ratio of ``cpu`` seconds per step, which depends less on other work on
+        the machine, and each side's ``physics``, "time step × substeps" of its engine batches.
 
     Raises:
         BidexError: Either side's code refuses something.

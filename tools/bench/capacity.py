@@ -31,8 +31,8 @@ def capacity(
     Args:
         suite: Measure the classes of this suite.
         task: Measure this class; with neither suite nor task every class is measured.
-        steps: Environment steps a class.
-        num_envs: Rows.
+        steps: Number of environment steps per class.
+        num_envs: Number of environments.
         threads: Engine threads; None takes all CPUs.
         seed: Seed of world and actions.
 

@@ -21,7 +21,7 @@ from bidex_meta.utils.memory import usable_cores
 
 _METAWORLD_ROWS = 10
 _HANDS = ("HandReach-v3", "HandManipulateEgg-v1")
-"""Of gymnasium-robotics: one Shadow Hand of 20 actions, alone, and with an egg in it."""
+"""Environments of gymnasium-robotics: one Shadow Hand with 20 actions, without an object and with an egg."""
 _HAND_ROWS = 4
 _SUITES = ("MT4", "MT20")
 _INSTALL = "pip install gymnasium-robotics"
@@ -34,16 +34,16 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
     of a step differ between the libraries, so the table has further columns besides the speed.
 
     Args:
-        num_envs: Rows of MT4 and MT20. Meta-World's vector environment has ten, and so has ours of it.
-        steps: Environment steps (of one row) of each repeat, after as many to warm up.
-        repeats: Interleaved repeats; medians are reported.
+        num_envs: Number of environments of MT4 and MT20. Both worlds of Meta-World have ten.
+        steps: Number of environment steps of each repeat. One more repeat comes first, to warm up.
+        repeats: Number of interleaved repeats; medians are reported.
         seed: Seed of environments and actions.
 
     Returns:
         ``cpus`` that the process may use, what was ``skipped`` and how to install it, and ``table``: rows, actions, a
         model's degrees of freedom (least-most over the classes), seconds of physics in a step, ``env_steps_per_s``, the
-        same over CPU seconds (which other work on the core sways less), seconds of physics simulated in a second, and
-        the ratio of env-steps/s to Meta-World's own vector environment.
+        same per CPU second (which depends less on other work on the core), seconds of physics simulated in a second,
+        and the ratio of env-steps/s to Meta-World's own vector environment.
     """
     rng = np.random.default_rng(seed)
     skipped = {}

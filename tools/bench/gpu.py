@@ -17,9 +17,10 @@ from bidex_meta.world import World
 
 _SIZES = (1024, 8192, 32768, 131072)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
-"""A thrown egg, a jointed object and a movable fixture."""
+"""Classes with a thrown egg, a jointed object and a movable fixture."""
 _RECORDED = 32
-"""Steps after which a world on CUDA replays all of its work: starts are drawn at every eighth, plainly at first."""
+"""Number of steps after which a world on CUDA replays all of its work: starts are drawn at every eighth step, and the
+first draws are not replayed."""
 
 
 def gpu(
@@ -37,13 +38,13 @@ def gpu(
 
     Args:
         suite: Suite to step.
-        tasks: Classes to step alone.
+        tasks: Classes to step on their own.
         sizes: Numbers of environments.
-        steps: Control steps of each measurement, after as many to warm up, 32 at least.
-        device: Where the worlds live.
+        steps: Number of control steps of each measurement, after the same number (at least 32) to warm up.
+        device: Device of the worlds.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
-        out: File that takes each row as it is measured; what is in it is not measured again.
+        out: File to which each row is written as it is measured; rows that are in the file are not measured again.
         learning: Measure training with MT-PPO too.
 
     Returns:

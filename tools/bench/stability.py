@@ -16,9 +16,10 @@ from bidex_meta.world import World
 MAX_OBJECT_SPEED = 20.0
 """No object may move faster, m/s."""
 SHALLOW, DEEP = 0.005, 0.015
-"""Depths of contacts that may be passed by few states and by hardly any, metres."""
+"""Depths of contacts, metres: few states may exceed the first one, and hardly any may exceed the second one."""
 LEAST_SHALLOW, LEAST_NOT_DEEP, LEAST_SHALLOW_AT_WORK = 0.985, 0.998, 0.999
-"""Shares of states that must stay within these depths under rough actions, and within the first under a witness."""
+"""Minimum shares of states within the first and within the second depth under rough actions, and minimum share of
+states within the first depth under a witness."""
 _SAMPLES_PER_STEP = 8
 
 
@@ -39,14 +40,14 @@ def stability(
     played from its own start and from shifted starts.
 
     Args:
-        suite: Test the classes of this suite, with the bases they have there, by its version's rules.
-        task: Test this class, with a moving base and, where it has one of its own, the fixed one. With neither suite
-            nor task every class is tested.
-        steps: Environment steps a class.
-        num_envs: Rows.
+        suite: Test the classes of this suite, with the suite's bases and the rules of its version.
+        task: Test this class with a moving base, and also with a fixed base if that is the class's default. With
+            neither suite nor task every class is tested.
+        steps: Number of environment steps per class.
+        num_envs: Number of environments.
         threads: Engine threads; None takes all CPUs.
         seed: Seed of world and actions.
-        device: Where the world lives.
+        device: Device of the world.
         engine: As in ``Benchmark.make_world``.
 
     Returns:

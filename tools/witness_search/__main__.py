@@ -21,12 +21,12 @@ from tools.witness_search.whole import searched
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """Arguments of every search, and the storage of its episode."""
+    """Arguments of every search, and the storage of the episode that it finds."""
 
     task: str  # Task class.
     file: Path | None = None
-    """Keep the episode here, even if it does not hold; None: in witnesses/TASK.npz, if it holds, that is if it solves
-    the task from its start and from eight of ten shifted ones."""
+    """Store the episode here, even if it does not hold. None: store it in witnesses/TASK.npz, but only if it holds. An
+    episode holds if it solves the task from its start and from eight of ten shifted starts."""
     threads: int | None = None  # Threads of the physics; None: one per core.
 
     def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
@@ -49,10 +49,10 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Search):
-    """Plan some steps ahead on the printed reward, as the episode goes on."""
+    """Search with a receding horizon: plan some steps ahead on the printed reward, play a few of them, plan again."""
 
     improve: Path | None = None  # Start from the episode in this file.
-    tries: int = 1  # Searches with other seeds before giving up.
+    tries: int = 1  # Number of searches, each with another seed, before giving up.
     planner: PlannerConfig = field(default_factory=PlannerConfig)  # The planner.
 
     def run(self) -> None:
@@ -74,11 +74,11 @@ class Plan(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Improvement(Search):
-    """Arguments of a search that begins with an episode."""
+    """Arguments of a search that begins with a given episode."""
 
     improve: Path  # File of the episode to begin with.
-    rounds: int  # Rounds of the search.
-    seed: int = 0  # Of changes and shifted starts.
+    rounds: int  # Number of rounds of the search.
+    seed: int = 0  # Seed of changes and shifted starts.
 
 
 @dataclass(frozen=True, kw_only=True)

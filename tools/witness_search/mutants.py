@@ -6,7 +6,8 @@ from torch import Tensor
 from bidex_meta.hands.hand import hand
 
 FINEST = 0.05
-"""Deviation of the finest changes, as a share of the coarsest ones': large changes find a way, small ones the rest."""
+"""Standard deviation of the finest changes, as a share of the standard deviation of the coarsest changes. Large changes
+find a way, small changes improve it."""
 
 
 def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: torch.Generator) -> Tensor:
@@ -37,7 +38,10 @@ def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: t
 
 
 def parts_of_the_hands(size: int) -> Tensor:
-    """Return masks of actions, bool (parts, size): fingers per hand; force and torque per base; both bases' forces."""
+    """Return masks of actions, bool (parts, size).
+
+    There is one mask for each hand's fingers, each base's force, each base's torque, and both bases' forces together.
+    """
     joints, one = len(hand().control_low), size // 2
     place = torch.arange(size)
     finger, force = place % one < joints, (place % one >= joints) & (place % one < joints + 3)

@@ -18,37 +18,38 @@ from bidex_meta.witness.store import quantised
 from tools.witness_search.mutants import FINEST, mutants, parts_of_the_hands
 
 RIVALS = 16
-"""Unsuccessful sequences of each plan that are played to the end of the episode."""
+"""Number of unsuccessful sequences of each plan that are played to the end of the episode."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
     """Settings of the planner."""
 
-    samples: int = 128  # Action sequences per round.
+    samples: int = 128  # Number of action sequences per round.
     copies: int = 1
-    """Slightly shifted states that are played side by side, a divisor of ``samples``: each sequence meets one of them,
-    the best ones of a plan meet all, and their mean counts: no plan that holds by luck."""
-    rounds: int = 3  # Rounds per plan.
-    first_rounds: int = 10  # Rounds of the first plan, which has no predecessor.
-    rounds_after: int = 1  # Rounds per plan once the task has been solved.
-    elite_share: float = 0.08  # Share of the sequences that mean and deviation move towards.
-    kept_elites: int = 8  # Elites that are tried again in the next round, and as parents of mutants.
+    """Number of slightly shifted states, a divisor of ``samples``. Each sequence is played from one of these states.
+    The best sequences of a plan are played from all of them, and their mean counts, so that no plan wins by luck."""
+    rounds: int = 3  # Number of rounds per plan.
+    first_rounds: int = 10  # Number of rounds of the first plan, which has no predecessor.
+    rounds_after: int = 1  # Number of rounds per plan once the task has been solved.
+    elite_share: float = 0.08  # Share of the sequences towards which mean and standard deviation move.
+    kept_elites: int = 8  # Number of elites that are tried again in the next round, and become parents of mutants.
     mutants: float = 0.5
     """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
-    mutated: float = 0.15  # Share of the actions that a mutant changes which does not change one part of the hands.
-    horizon: int = 41  # Control steps a plan looks ahead.
-    knots: int = 9  # Knots of a plan; actions between them are interpolated linearly.
+    mutated: float = 0.15  # Share of actions that change in mutants that do not change one part of the hands.
+    horizon: int = 41  # Number of control steps that a plan looks ahead.
+    knots: int = 9  # Number of knots of a plan; actions between knots are interpolated linearly.
     execute: int = 10
-    """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
+    """Number of control steps that are played before the next plan. If they end at a knot, the rest of the plan does
+    not change."""
     std: float = 0.5
-    """Deviation of the knots in a first round; a sequence takes a share of it, from all to a twentieth."""
-    min_std: float = 0.12  # The deviation never falls below this.
-    gamma: float = 0.97  # Discount per control step.
+    """Standard deviation of the knots in a first round; a sequence uses a share of it, from all to a twentieth."""
+    min_std: float = 0.12  # Lower bound of the standard deviation.
+    gamma: float = 0.97  # Discount factor per control step.
     effort: float = 0.05
-    """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N: for
-    free, a hand soon presses on its table so hard that nothing moves it any more."""
-    seed: int = 0  # Of the samples.
+    """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N.
+    Without a price, a hand soon presses on its table so hard that nothing moves it any more."""
+    seed: int = 0  # Seed of the samples.
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,12 @@ class Plan:
     """Result of a search."""
 
     actions: np.ndarray  # Actions of the whole episode, (T, action_size), multiples of 1/127.
-    rewards: np.ndarray  # Unscaled rewards they gave, (T,).
+    rewards: np.ndarray  # Unscaled rewards of these actions, (T,).
     first_success: int | None  # Index of the first successful step, None if there is none.
     rival: float | None
-    """Highest return of the unsuccessful episodes that the search saw: before the first success, the best sequences
-    without one, their last action held to the end. None without any. Above ``total``, reward and success disagree."""
+    """Highest return of the unsuccessful episodes that the search saw, or None if it saw none. Before the first success
+    these are the best unsuccessful sequences of each plan, with the last action held to the end of the episode. If
+    ``rival`` is above ``total``, reward and success disagree."""
 
     @property
     def total(self) -> float:
@@ -84,7 +86,8 @@ class Planner:
     def search(self, earlier: np.ndarray | None = None) -> Plan:
         """Play one episode with replanning, and print the return so far after every plan.
 
-        Every plan also tries the actions (T, action_size) of an ``earlier`` search at their time.
+        Every plan also tries the actions (T, action_size) of an ``earlier`` search, at the steps at which they were
+        played.
         """
         cfg, sim = self.config, self.simulator
         states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
@@ -193,12 +196,12 @@ class Planner:
 
 
 def interpolation(horizon: int, knots: int) -> Tensor:
-    """Return weights (horizon, knots) of linear interpolation; the first knot is the first step, the last the last."""
+    """Return weights (horizon, knots) of linear interpolation; first and last knot are at the first and last step."""
     return _weights(torch.linspace(0.0, knots - 1.0, horizon), knots)
 
 
 def _weights(place: Tensor, knots: int) -> Tensor:
-    """Return the weights (n, knots) of linear interpolation at places (n,), in spaces between knots."""
+    """Return the weights (n, knots) of linear interpolation at places (n,), in units of the space between knots."""
     return (1.0 - (place[:, None] - torch.arange(knots)).abs()).clamp(min=0.0)
 
 

@@ -21,9 +21,9 @@ _STD, _MUTATED = 0.15, 0.15
 _SPACING = 5
 """Control steps between knots of a change."""
 _SHALLOW = 0.004
-"""Contacts may be as deep as this, metres: a millimetre less than what the stability bar counts."""
+"""Depth of contacts up to which a state is not deep, metres: a millimetre less than in ``tools.bench stability``."""
 _BLOW = 3.0
-"""What a deeper state in every start costs; a start that succeeds is worth 1."""
+"""Cost of one deep state per start; each start that succeeds is worth 1."""
 
 
 def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:

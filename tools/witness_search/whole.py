@@ -18,7 +18,7 @@ _SPACING = 3
 """Control steps between knots."""
 _STD, _LEAST_STD = 0.4, 0.12
 _SUCCESS, _LASTING = 5.0, 0.2
-"""What an episode's success is worth in units of return, and each step that it lasts."""
+"""Worth of an episode's success, and of each step in which it is successful, in units of return."""
 
 
 def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Objects chosen by config: shelf files and user files, checked, and laid on a hand."""
+"""Objects chosen by config, from files in the package or of users; each is checked, and may be laid on a hand."""

@@ -1,4 +1,7 @@
-"""Objects that replace the egg in the throwing classes, from the shelf or a user's MJCF file."""
+"""Objects that replace the egg in the throwing classes, from a user's MJCF file or from the shelf.
+
+The shelf is the folder assets/objects/shelf of the package.
+"""
 
 import math
 import os
@@ -23,18 +26,19 @@ from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, 
 
 EGG = "egg"
 _LONGEST, _SHORTEST = 0.25, 0.01
-"""The longest edge of the box around an object, metres: a hand is 20 cm long from the wrist to the middle fingertip."""
+"""Bounds of the longest edge of the box around an object, metres. A hand is 20 cm long from the wrist to the middle
+fingertip."""
 _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
 
 @dataclass(frozen=True)
 class HeldObject:
-    """An object that lies on a hand; mass in kg, lengths in metres, its own frame.
+    """An object that lies on a hand; mass in kg, lengths in metres, in the object's frame.
 
     Attributes:
-        low: Lower corner of the box around its colliding geoms; ``high`` is the upper one.
+        low: Lower corner of the box around the object's colliding geoms; ``high``: upper corner.
         geoms: Number of the object's geoms that collide.
-        centres: Balls whose convex hull holds these geoms: their centres, (k, 3), with ``radii``, (k,).
+        centres: Centres (k, 3) of balls whose convex hull contains these geoms; ``radii``: radii (k,) of the balls.
     """
 
     name: str
@@ -76,11 +80,11 @@ class HeldObject:
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
 
     def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
-        """Lay the object on a broad side: its shortest extent along a palm's normal, turned about the normal at random.
+        """Lay the object on a broad side and turn it about the palm's normal at random.
 
-        The object's positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2), give the
-        turn and which of the two sides faces down. If the hand's start pose is not given, the palm is assumed to be
-        level.
+        Its shortest extent is then along the normal. The object's poses (n, 7), quaternion (w, x, y, z), are written in
+        place. Draws in [-1, 1], (n, 2), give the turn and the side that faces down. If the hand's start pose is not
+        given, the palm is assumed to be level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
         half = 0.5 * math.pi * draws[:, 0]
@@ -106,7 +110,7 @@ class HeldObject:
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
         """Lift the object off its palm, open the fingers that would penetrate it and lay the thumb flat.
 
-        The object's positions (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in
+        The object's poses (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in
         place.
         """
         quaternion = xyzw(constant(pose.quaternion, place))
@@ -119,20 +123,20 @@ class HeldObject:
         place[:, :3] += rotate(quaternion, shift).float()
 
     def depth_below(self, place: Tensor) -> Tensor:
-        """Return the object's extent below its origin, metres, from its positions (n, 7). Shape (n,)."""
+        """Return the object's extent below its origin, metres, for poses (n, 7). Shape (n,)."""
         points = rotate(xyzw(place[:, 3:])[:, None], torch.as_tensor(self.centres).to(place)[None])
         return (torch.as_tensor(self.radii).to(place) - points[..., 2]).amax(dim=1)
 
 
 def shelf() -> list[str]:
-    """Return the names of the shelf, sorted, without the egg."""
+    """Return the sorted names of the objects on the shelf, without the egg."""
     return sorted(path.stem for path in (paths.assets_dir() / "objects" / "shelf").glob("*.xml"))
 
 
 def held_object(name: object) -> HeldObject | None:
-    """Return the object of a shelf name, in any case, or of an MJCF file, which ends in ``.xml``; None for ``"egg"``.
+    """Return an object by its name on the shelf, in any case, or by the path of its MJCF file, which ends in ``.xml``.
 
-    Raises BidexError for an unknown name, or a file that holds no object for a hand.
+    Return None for ``"egg"``. Raises BidexError for an unknown name, or a file without an object that a hand can hold.
     """
     if not isinstance(name, str) or not name.isprintable():
         raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")

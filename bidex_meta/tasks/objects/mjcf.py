@@ -1,4 +1,4 @@
-"""An object's MJCF file from a user, checked before MuJoCo reads it, and the outline of its colliding geoms.
+"""Users' MJCF files with objects, which are checked before MuJoCo reads them, and outlines of their colliding geoms.
 
 MuJoCo opens any file that a model names, so only listed tags are allowed: no entities, no includes, no file from
 another folder.
@@ -26,9 +26,10 @@ _TAGS |= {"body", "inertial", "geom", "joint", "freejoint", "site"}
 """Tags that a file may hold; a file that names points (``points=True``) may also hold sensors."""
 _SENSOR_TAGS = {"sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"}
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
-"""The values of the files under assets/objects, as stiff as the time step allows (bidex_meta/hands/README.md)."""
+"""Contact parameters of the files under assets/objects, as stiff as the time step allows (bidex_meta/hands/README.md).
+"""
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
-"""MuJoCo accepts numbers that are not finite, and writes a log file into the working folder."""
+"""Finds numbers that are not finite: MuJoCo accepts such numbers and writes a log file into the working folder."""
 _MOST_FRICTION = 5.0
 
 
@@ -93,7 +94,7 @@ def _reason(error: Exception) -> str:
 
 
 def _beside(path: Path, name: Path) -> Path:
-    """Return the file of a name in the folder of an MJCF file, or below it."""
+    """Return the path of a file that an MJCF file names; it must lie in the folder of the MJCF file or below it."""
     folder = path.resolve().parent
     found = (folder / name).resolve()
     if not found.is_relative_to(folder):

@@ -1,4 +1,7 @@
-"""A user's objects for classes with points such as handles, named in the file as in the usual object's file."""
+"""Users' objects for classes whose hands must reach points such as handles.
+
+The user's file names these points as the file of the class's usual object does.
+"""
 
 import hashlib
 from collections.abc import Hashable
@@ -22,7 +25,8 @@ from bidex_meta.utils.files import absolute
 _MOST_MASS, _LARGEST, _MOST_GEOMS = 10.0, 0.6, 64
 """Limits of an object: mass, kg; size of the box around it, metres; number of colliding geoms."""
 _LEVEL = 0.003
-"""Largest distance of an object's foot from the usual object's foot, metres, so that it starts at rest on the table."""
+"""Largest height difference between the feet of an object and of the usual object, metres: the object must start at
+rest on the table."""
 _DEEPEST = 0.005
 """Deepest penetration of hands or table at the start, metres, as for every class (docs/figures.md)."""
 
@@ -40,7 +44,7 @@ class PointedObject(SceneObject):
 
 
 class OwnObjectClass(ReachTask):
-    """A class whose object may be the user's, with the sensors and joints of the class's own object.
+    """A class whose object may be replaced by a user's object with the same sensors and joints.
 
     ``usual_stands`` says whether the class's own object stands on its foot at the start.
     """
@@ -48,7 +52,7 @@ class OwnObjectClass(ReachTask):
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
-        """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
+        """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the usual object.
 
         Raises BidexError if the file holds no such object, or the object starts inside hands or table.
         """
@@ -150,7 +154,7 @@ def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:
 
 
 def _box(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the box around all colliding geoms, from the origin of the body ``object``, metres."""
+    """Return the corners of the box around all colliding geoms, relative to the body ``object``'s origin, metres."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     lows = []

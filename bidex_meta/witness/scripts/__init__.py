@@ -29,7 +29,7 @@ SCRIPTS: dict[str, Script] = {
     "ReOrientation": turn_cubes,
     "StackBlock": stack_in_order,
 }
-"""Of version 1; they play version 2 too."""
+"""Scripts for both versions of a class, by the class's name."""
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "BottleCap": pull_cap,
     "CatchUnderarm": carry_egg,
@@ -41,16 +41,16 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "SwingCup": swing_cup,
     "Switch": press_switches,
 }
-"""Of version 2: they read what a task hides."""
+"""Scripts for version 2, by the class's name; they read what a task hides."""
 
 
 def scripts_of(rules: Rules) -> dict[str, Script]:
-    """Return the scripts that play by a suite's rules, by class."""
+    """Return the scripts for a suite's rules, by the class's name."""
     return WIDE_SCRIPTS if rules.wide else SCRIPTS
 
 
 def script_of(task: TaskClass) -> Script:
-    """Return the script of a class by its rules; raises BidexError if it has none, or its bases are fixed."""
+    """Return the script for a class and its rules; raises BidexError if there is none, or if the bases are fixed."""
     known = scripts_of(task.rules)
     if not task.moving_base:
         raise BidexError(f"Expected moving bases for the script of {task.name}, got fixed ones: moving_base=True.")

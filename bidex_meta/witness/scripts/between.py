@@ -1,4 +1,4 @@
-"""Steps of the policies that carry an object between both hands, one on either side of it along y.
+"""Steps of the policies that carry an object between both hands, with one hand on each side of the object along y.
 
 Every step is a function of the present state, and changes little when the state changes little. A policy without memory
 can therefore learn the steps, and a policy that is late or drops the object can continue.
@@ -15,14 +15,18 @@ from bidex_meta.witness.controller import HandController, Point, point
 
 @dataclass(frozen=True)
 class Take:
-    """The way two hands take an object; metres.
+    """The way in which two hands take an object; lengths in metres.
 
-    ``ahead``, ``above``: from the object to the hands' points along x and z. ``high``: height of the hands' points when
-    they pass over everything. ``apart``: from the object to each hand's point along y before they close. ``aim``: how
-    far off their middle may be as they go down. ``joints``: one joint of the right and one of the left hand that gives
-    way to the object it presses: its angle while ``free``, and while the object is ``firm``ly held, rad. The hands
-    close until the object is firm. A base that presses by itself holds too hard or too loosely: a newton is 0.1 to
-    0.3 % of its range.
+    Attributes:
+        ahead: Offset along x from the object to the hands' points; ``above``: offset along z.
+        high: Height at which the hands' points pass over all objects.
+        apart: Distance along y from the object to each hand's point before the hands close.
+        aim: Largest horizontal distance of the hands' middle from its target while the hands go down.
+        joints: One joint of each hand, right then left, that gives way when the hand presses the object.
+        free: Angles of these joints while nothing is touched, rad.
+        firm: Angles of these joints while the object is held firmly, rad. The hands close until the joints have these
+            angles. Forces on the bases would hold an object too hard or too loosely, because a newton is only 0.1 to
+            0.3 % of a base's range.
     """
 
     ahead: float
@@ -35,7 +39,7 @@ class Take:
     firm: tuple[float, float]
 
 
-_CLOSING = 0.015  # how far ahead a hand is led that does not press yet, metres
+_CLOSING = 0.015  # distance by which the target leads a hand that does not press yet, metres
 
 
 def ramp(value: float, first: float, last: float) -> float:
@@ -49,7 +53,7 @@ class Between:
     def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
         """Read the state.
 
-        ``room`` bounds the distance of each hand's point from the object before they close, metres.
+        ``room`` bounds the distance of each hand's point from the object before the hands close, metres.
         """
         right, left = (min(take.apart, each) for each in room)
         self.take = take
@@ -74,11 +78,11 @@ class Between:
         self.held = near * ramp(self.firm, 0.15, 0.35)
 
     def far(self, goal: Tensor) -> float:
-        """Return the horizontal distance of the object from a place, metres."""
+        """Return the horizontal distance of the object from ``goal``, metres."""
         return math.hypot(float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1])
 
     def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
-        """Return the hands' points to take the object to ``goal`` and set it down there.
+        """Return the next targets of the hands' points, to take the object to ``goal`` and set it down there.
 
         The object travels at height ``carried`` and is set down at height ``lowered``.
         """
@@ -88,7 +92,7 @@ class Between:
         return self._points(x, y, z, half)
 
     def leave(self) -> tuple[Point, Point]:
-        """Return the hands' points for letting go of the object and then going up."""
+        """Return the next targets of the hands' points, to let go of the object and then go up."""
         x, y, _ = self.middle
         return self._points(x, y, self._rise(self.take.high), self.apart)
 
@@ -97,17 +101,17 @@ class Between:
         return (x, y + half, z), (x, y - half, z)
 
     def _rise(self, height: float) -> float:
-        """Return a height to go to; it rises only once the hands are apart, because they lift what they touch."""
+        """Return the hands' next height; they rise only when they are apart, else they would lift what they touch."""
         way = height - self.middle[2]
         apart = ramp(self.half, self.apart - 0.02, self.apart - 0.005)
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
 
     def _close(self) -> float:
-        """Return half the target distance of the hands that holds the object firmly."""
+        """Return half the distance that the hands should have next, in order to hold the object firmly."""
         return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
-        """Return the hands' middle point and half their distance for taking the object.
+        """Return the next middle of the hands and half their distance, to take the object.
 
         The hands go from above to both sides of the object, then closer together until they hold it.
         """
@@ -121,7 +125,7 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Return the hands' middle point and half their distance to carry the object up, over the goal, and down."""
+        """Return the next middle of the hands and half their distance, to carry the object up, over the goal, down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)

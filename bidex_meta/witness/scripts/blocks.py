@@ -1,4 +1,4 @@
-"""Scripted policies for blocks on a table."""
+"""Scripted policy that pushes blocks on a table."""
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, beside
@@ -6,8 +6,8 @@ from bidex_meta.witness.controller import Actions, HandController, beside
 _DOWN = 0.2  # bend of the wrist that brings straight fingers below the forearm, rad
 
 
-# Of a fork: from its block to the hand's point where it pushes, and where it lets go of it; height above the floor;
-# angles that spread forefinger and little finger. Metres, rad.
+# A fork of forefinger and little finger: distances from the block to the hand's point while it pushes and while it lets
+# go of the block, height above the floor, and joint angles that spread the fork. Metres, rad.
 _BEHIND = 0.06
 _CLEAR = 0.09
 _LOW = 0.642

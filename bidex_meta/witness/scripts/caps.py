@@ -1,4 +1,4 @@
-"""Scripted policies in which one finger moves a part: a bottle's cap, and a cup by its ear."""
+"""Scripted policies in which one finger moves an object: a bottle's cap, or a cup by its handle."""
 
 import math
 from itertools import product
@@ -15,7 +15,7 @@ _FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"
 
 
 def pull_cap(hands: HandController) -> Actions:
-    """Press the left little finger on the cap's side and drag it along the bottle; friction keeps it there."""
+    """Press the left little finger on the cap's side, and drag the cap along the bottle by friction."""
     slide = float(hands.frozen("slide"))
     stay = point(hands.at("right"))
     for side in ("right", "left"):
@@ -23,7 +23,7 @@ def pull_cap(hands: HandController) -> Actions:
     ahead = _ahead(hands)
 
     def poke(back: float) -> Point:
-        """Return the left hand's point with the little finger ``back`` before the cap, metres."""
+        """Return the left hand's point for which the little finger is ``back`` metres short of the cap."""
         cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
         return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
 
@@ -61,9 +61,10 @@ def _ahead(hands: HandController) -> Tensor:
     return way / way.norm()
 
 
-_PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
-# Of a peg's circle about the cup, and of the right fingertips', metres; how far either is behind an ear that it pushes;
-# angle of the left ear from which on the right hand pushes it: the left thumb would meet the lid, rad.
+_PEG = 0.015  # height of a peg (a bent finger) above the cup's origin, metres; higher pegs tip the cup
+# Radius of the peg's circle about the cup, and of the right fingertips' circle, metres; angle of either behind a handle
+# that it pushes, rad; angle of the left handle from which on the right hand pushes it, rad: the left thumb would meet
+# the lid.
 _RADIUS = 0.068
 _TIP_RADIUS = 0.078
 _TOUCH = 0.2
@@ -72,7 +73,7 @@ _FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
 
 
 def swing_cup(hands: HandController) -> Actions:
-    """Pull the left ear around with the left little finger, bent to a peg; the right fingers push it on from behind."""
+    """Pull the left handle around with the left little finger as a peg, then push it on with the right fingers."""
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
     away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
@@ -81,7 +82,7 @@ def swing_cup(hands: HandController) -> Actions:
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """Return the left hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
+        """Return the left hand's point for a peg at an angle behind the handle and a height above the cup's origin."""
         return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
     x, y, z = hands.at("left").tolist()
@@ -102,15 +103,15 @@ def swing_cup(hands: HandController) -> Actions:
 
 
 def _push_on(hands: HandController) -> Actions:
-    """Move the left hand aside, and push the ear to its goal with the right hand's straight fingers."""
+    """Move the left hand aside, and push the handle to its goal with the right hand's straight fingers."""
     x, y, z = hands.at("left").tolist()
     back = (x + 0.05, y - 0.08, z)
     aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
-        """Return the right hand's point for a fingertip at an angle behind the ear.
+        """Return the right hand's point for a fingertip at an angle behind the handle.
 
-        ``before`` is the distance from there towards the hand, metres.
+        ``before`` is the fingertip's distance from that place towards the hand, metres.
         """
         way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
         return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
@@ -126,20 +127,20 @@ def _push_on(hands: HandController) -> Actions:
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """Return the place at an angle behind the left ear on a circle about the cup, at a height above its origin."""
+    """Return the point at an angle behind the left handle on a circle about the cup, at a height above its origin."""
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle
     return cup + torch.tensor([radius * math.cos(at), radius * math.sin(at), height], dtype=cup.dtype)
 
 
 def _missing(hands: HandController) -> float:
-    """Return the angle by which the cup must yet turn, within half a turn, rad."""
+    """Return the angle by which the cup must still turn, in [-pi, pi), rad."""
     goal = hands.frozen("goal")
     wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
     return (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _yaw(hands: HandController) -> float:
-    """Return the angle of the right ear about the vertical, rad."""
+    """Return the angle of the cup's right handle about the vertical axis, rad."""
     turn = hands.orientation("cup/quaternion")
     return 2.0 * math.atan2(float(turn[2]), float(turn[3]))

@@ -1,4 +1,4 @@
-"""Scripted policy for bucket and block on a table: in version 2 the bucket is first carried to its goal."""
+"""Scripted policy that puts a block into a bucket; in version 2 the bucket is first carried to its goal."""
 
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.between import Between, Take
@@ -16,7 +16,7 @@ _OVER = 0.765
 
 
 def place_in_bucket(hands: HandController) -> Actions:
-    """Clamp the bucket with both hands and carry it to its goal, then drop the block in; repeat what fails."""
+    """Clamp the bucket with both hands and carry it to its goal, then drop the block in; repeat a step that fails."""
     # A bucket that is dragged tips: friction acts 5 cm below its middle, and its foot is 3 cm wide.
     thumb_away = {"THJ3": 0.5, "THJ1": -0.5, "THJ0": -1.5}
     hands.bend("right", 0.0, 0.0, WRJ0=0.2, WRJ1=_WRIST, FFJ3=_SPREAD, **thumb_away)

@@ -1,4 +1,4 @@
-"""Scripted policy for the pot."""
+"""Scripted policy that lifts a pot."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Scripted policy for kettle and bucket: in version 2 the bucket is carried to its goal after pouring."""
+"""Scripted policy that pours water from a kettle into a bucket; in version 2 it then carries the bucket to its goal."""
 
 import math
 
@@ -14,12 +14,12 @@ _POUR = math.radians(50.0)
 _RUNNING = 25  # steps in which the water runs out
 # Metres.
 _STANDS = 0.457  # height of a bucket on the table
-_AHEAD = 0.03  # of the hands' points from the bucket, along x
-_UP = 0.03  # of the hands' points from a standing bucket; lower, the left thumb would touch the table
+_AHEAD = 0.03  # offset of the hands' points from the bucket along x
+_UP = 0.03  # height of the hands' points above a standing bucket's origin; below, the left thumb would touch the table
 _OVER = 0.18  # how much higher the hands pass over the bucket
 _LIFT = 0.012
 _APART = 0.13  # half the distance of the hands before they close
-_SIGNS = (1.0, -1.0)  # side of the bucket along y, of the right and the left hand
+_SIGNS = (1.0, -1.0)  # sides of the bucket along y on which the right and the left hand are
 
 
 def pour_water(hands: HandController) -> Actions:
@@ -31,7 +31,10 @@ def pour_water(hands: HandController) -> Actions:
     back = back / back.norm()
 
     def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
-        """Lead the hands to where they hold a kettle at ``origin``, or ``loose`` metres off it, ``aside`` in x."""
+        """Lead the hands to where they hold a kettle at ``origin``.
+
+        They stay ``loose`` metres off the kettle and are shifted by ``aside`` metres along x.
+        """
 
         def at(x: float, along: float, up: float) -> Point:
             flat = along * math.cos(tilt) - up * math.sin(tilt)
@@ -110,7 +113,10 @@ def _carry_bucket(hands: HandController) -> Actions:
 
 
 def _beside(way: Tensor, sign: float) -> float:
-    """Return how much a hand is on its side of the bucket, 0 to 1; ``way`` leads from the bucket to the hand."""
+    """Return 1 if a hand is on its side of the bucket, 0 if not, and numbers between for a hand on its way there.
+
+    ``way`` leads from the bucket to the hand.
+    """
     return ramp(abs(float(way[0]) - _AHEAD), 0.05, 0.03) * ramp(sign * float(way[1]), 0.03, 0.045)
 
 

@@ -1,4 +1,4 @@
-"""Scripted policy for two blocks that are stacked at a given place, in version 2 in a given order."""
+"""Scripted policy that stacks two blocks at a given place, and in version 2 in a given order."""
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController
@@ -15,7 +15,7 @@ _EDGE = 0.05
 
 
 def stack_in_order(hands: HandController) -> Actions:
-    """Clamp the lower block with the backs of both hands' fingers, carry it, and stack the other on it."""
+    """Clamp the lower block with the backs of both hands' fingers, carry it, and stack the other block on it."""
     if hands.wide and float(hands.frozen("upper")) < 0.0:
         upper = "block2"
         lower = "block1"
@@ -43,7 +43,7 @@ def stack_in_order(hands: HandController) -> Actions:
 
 
 def _between(hands: HandController, block: str, other: str) -> Between:
-    """Return the state of the hands and a block; there is little room if the other block is near."""
+    """Return the state of the hands and a block; if the other block is near, the hand next to it has little room."""
     x, y, _ = (hands.where(f"{other}/position") - hands.where(f"{block}/position")).tolist()
     if abs(x) < 0.075:
         room = max(0.08, min(_TAKE.apart, abs(y) - 0.025))

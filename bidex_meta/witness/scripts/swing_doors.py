@@ -1,4 +1,4 @@
-"""Scripted policies for the four doors."""
+"""Scripted policies for the four door classes."""
 
 import math
 from collections.abc import Sequence
@@ -8,8 +8,8 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, Point
 
 _ABOVE = 1.0  # height at which a hand is clear of the bars, metres
-_DOOR_HEIGHT = 0.72  # of the hands at a door, between the ends of the bars, metres
-# From a hand's point to its fingers' middle joints: ahead, and away from where the palm faces, metres.
+_DOOR_HEIGHT = 0.72  # height of the hands at a door, between the ends of the bars, metres
+# Offset from a hand's point to the middle joints of its fingers: ahead, and away from where the palm faces, metres.
 _TO_FINGERS = 0.06
 _TO_PALM = 0.02
 
@@ -27,7 +27,10 @@ class _Leaf:
     over: float
 
     def place(self, along: float, over: float, angle: float) -> tuple[float, float]:
-        """Return a point of the leaf that is open by this angle towards the hands (negative: away from them)."""
+        """Return x and y of a point on the leaf, for a leaf that is open towards the hands by an angle, rad.
+
+        A negative angle means that the leaf is open away from the hands.
+        """
         sine = math.sin(angle)
         cosine = math.cos(angle)
         return self.hinge[0] + over * cosine + along * sine, self.hinge[1] + over * sine - along * cosine
@@ -44,7 +47,10 @@ def open_inward(hands: HandController) -> Actions:
     def go(
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
     ) -> Actions:
-        """Lead bent fingers behind the bars of leaves open by these angles, or ``aside`` and ``back`` of that."""
+        """Lead bent fingers behind the bars of leaves that are open by these angles.
+
+        ``aside`` and ``back`` shift the fingers from there, metres.
+        """
         pairs = zip(_INWARD, angles, strict=True)
         at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle) for leaf, angle in pairs]
         yield from _lead(hands, at, angles, steps, speed)
@@ -68,7 +74,7 @@ def close_outward(hands: HandController) -> Actions:
     start = _angles(hands)
 
     def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Lead fingers behind the bars of leaves that are open by these angles, or ``back`` of that."""
+        """Lead fingers behind the bars of leaves that are open by these angles, or ``back`` metres away from there."""
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
         for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
@@ -92,7 +98,7 @@ def close_outward(hands: HandController) -> Actions:
 
 
 def push(hands: HandController) -> Actions:
-    """Push the leaves away with fists above the bars, each to its angle, and then let go of it."""
+    """Push each leaf to its angle with a fist above the bars, and then let go of it."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     if inward:
@@ -106,7 +112,7 @@ def push(hands: HandController) -> Actions:
     goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Lead fists to leaves that are open towards the hands by these angles, at distance ``back``."""
+        """Lead fists to leaves that are open towards the hands by these angles, or ``back`` metres away from them."""
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
         yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 
@@ -123,7 +129,10 @@ def push(hands: HandController) -> Actions:
 
 
 def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
-    """Return the angles of a task for the right and the left leaf minus ``less``, rad; ``usual`` if it has none."""
+    """Return a task's angles for the right and the left leaf minus ``less``, rad.
+
+    If the task has no such angles, return ``usual`` for both leaves.
+    """
     if hands.wide:
         return (hands.frozen("leaves") - less).tolist()
     return [usual, usual]
@@ -142,7 +151,7 @@ def _lead(
     speed: float,
     height: float = _DOOR_HEIGHT,
 ) -> Actions:
-    """Move the right hand to its point and the left one to its mirrored point, turned outwards."""
+    """Move each hand to its point in ``at`` (x, and y outwards from the door's middle), turned outwards by its yaw."""
     middle = float(hands.where("object/position")[1])
     points: list[Point] = []
     for side, sign, (x, y), yaw in zip(SIDES, (1.0, -1.0), at, yaws, strict=True):

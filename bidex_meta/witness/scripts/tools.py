@@ -15,7 +15,7 @@ _LEVER = 0.035  # from a rocker's hinge to its button, metres
 def press_switches(hands: HandController) -> Actions:
     """Press each button with a fingertip until its rocker has the requested angle, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
-    buttons = ("switch2", "switch1")  # of the right and the left hand
+    buttons = ("switch2", "switch1")  # the buttons of the right and the left hand
     for side in SIDES:
         hands.bend(side, 0.9, 0.5, THJ3=0.5)
         hands.hold(side)
@@ -73,7 +73,7 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Return where the hand's point goes next: down to an end of the pen, and once ``closed``, ``way`` along it."""
+    """Return where the hand's point goes next: down to an end of the pen; if ``closed``, by ``way`` along the pen."""
     end = hands.where(_ENDS[side]).clone()
     at = hands.at(side)
     end[0] -= 0.008
@@ -87,7 +87,7 @@ def _around(hands: HandController, side: str, along: Tensor, way: float, closed:
     return float(goal[0]), float(goal[1]), above + closed * (0.65 - above)
 
 
-_HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
+_HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other hand
 
 
 def open_scissors(hands: HandController) -> Actions:
