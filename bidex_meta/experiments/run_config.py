@@ -1,4 +1,4 @@
-"""A run's config, resolved and checked: names as they are written, the preset's values, sizes that suit the device."""
+"""Resolves and checks a run's config: complete names, the preset's values, sizes that suit the device."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -136,7 +136,7 @@ def _check_names(config: AnyConfig) -> None:
 
 
 def _written(name: str | None) -> str | None:
-    """Return a name as a config holds it: the whole path of a file."""
+    """Return a name as a config stores it: the absolute path of a file, any other name unchanged."""
     if name is not None and Path(name).suffix in (".toml", ".xml"):
         return str(absolute(name))
     return name
