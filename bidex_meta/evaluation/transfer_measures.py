@@ -35,7 +35,7 @@ def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int 
 
 
 def median_steps(counts: Sequence[int | None]) -> int | None:
-    """Return the median, the larger middle value of an even count; None counts as more steps than any number."""
+    """Return the median (the larger middle value if the count is even); None counts as larger than any number."""
     ranked = sorted(counts, key=lambda steps: np.inf if steps is None else steps)
     return ranked[len(ranked) // 2]
 
@@ -77,7 +77,7 @@ def over_seeds(of_seeds: list[float]) -> Json:
 
 
 def add_over_nothing(rows: Sequence[Json], measure: str) -> None:
-    """Add the difference from the same runs trained from scratch to each row; seeds of both are resampled."""
+    """Add to each row the difference from the row of the same runs from scratch; seeds of both are resampled."""
     alone = {(row["class"], row.get("demonstrations")): row for row in rows if row["from"] == NOTHING}
     for row in rows:
         other = alone.get((row["class"], row.get("demonstrations")), row)
