@@ -1,4 +1,4 @@
-"""A run's config: what flags become, what ``config.json`` holds, what a resumed run and a sweep compare."""
+"""The config of a run: flags set it, ``config.json`` stores it, and resumed runs and sweeps compare it."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ UNRESOLVED: Any = None
 
 _UNRESOLVED = ("num_envs", "steps", "threads")
 _WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
-"""Fields that no ``config.json`` may lack."""
+"""Fields that every ``config.json`` must have."""
 
 MAY_CHANGE = {"may_change": True}
 """Metadata of a field that a resumed run may change, because it does not affect what is learned."""
@@ -69,7 +69,7 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 
 
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""A flag without a value and without a ``--no-`` twin."""
+"""A flag without a value and without a ``--no-`` counterpart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,8 @@ class RunConfig(Generic[LearnerSettings]):
     task: Text | None = None
     """Train on this single task class instead of a suite; also package.module:Class of your own (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class itself does. In HandOver the bases are fixed, in
-    all other classes and in our suites they move."""
+    """With --task: whether the hands' bases move; own: as the class itself defines it. In HandOver the bases are fixed;
+    in all other classes and in our suites they move."""
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
     """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
     original; docs/points.md); 0: the states, or as the suite's file says."""
@@ -125,24 +125,28 @@ class RunConfig(Generic[LearnerSettings]):
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
-    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of acting, with --algo bc, bcq,
-    td3bc or iql, for the suite or task that it was recorded on. If given several times: from all of them."""
+    """With --algo bc, bcq, td3bc or iql: learn from this data set (a name of `bidex-meta data list`, or a folder)
+    instead of acting. The run is for the suite or task that the data set was recorded on. If given several times: learn
+    from all of them."""
     task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
-    """Imitate this data set too (named as for --dataset; see `bidex-meta record demonstrations`), with a weight that
-    decays; with --algo mtppo and ppo (see --learner.demonstration-batch). If given several times: all of them."""
+    """With --algo mtppo and ppo: imitate this data set too, with a weight that decays (see
+    --learner.demonstration-batch). It is named as for --dataset; see `bidex-meta record demonstrations`. If given
+    several times: imitate all of them."""
     teacher: Several = ()
-    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. scripts: the
-    scripts of all classes that have one; or the folder of a run on the same suite, or on one of its classes. If given
-    several times: each class takes the first teacher that knows it."""
+    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. The value is
+    scripts (the scripts of all classes that have one), or the folder of a run on the same suite or on one of the
+    suite's classes. If given several times: each class takes the first teacher that knows it."""
     record: Steps = 0
     """Keep about this many transitions of the training as the data set replay/ in the run's folder; they are whole
     episodes of some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
-    """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""
+    """``record`` divided by the steps that the run began with: if the run is resumed for more steps, the same
+    environments are recorded."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the mean return reaches this: in evaluations with --evaluate-every, otherwise in training."""
+    """End as soon as the mean return reaches this value: in evaluations with --evaluate-every, otherwise in
+    training."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
     """End as soon as this fraction of the episodes succeeds, such as 0.8: in evaluations with --evaluate-every,
     otherwise in training, where actions explore."""
@@ -176,11 +180,11 @@ class RunConfig(Generic[LearnerSettings]):
         return json.loads(msgspec.json.encode(self))
 
     def flat(self) -> JsonObject:
-        """Return plain values without nesting: ``learner.gamma`` beside ``seed``."""
+        """Return plain values in one flat dict, with names such as ``seed`` and ``learner.gamma``."""
         return flat(self.to_json())
 
     def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
-        """Yield name, value here and value there of all entries that differ.
+        """Yield the name, the value in this config and the value in ``other`` of every entry that differs.
 
         Entries that a resumed run may change are left out.
         """
@@ -218,7 +222,7 @@ class RunConfig(Generic[LearnerSettings]):
 
 
 def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
-    """Return tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    """Return nested tables as one flat dict: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
     found: JsonObject = {}
     for name, value in content.items():
         found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
@@ -226,7 +230,7 @@ def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
 
 
 def read_config(path: Path) -> RunConfig[JsonObject]:
-    """Return a run's ``config.json``. Raises BidexError if it is none, or cannot be read."""
+    """Return a run's ``config.json``. Raises BidexError if the file is not a config, or cannot be read."""
     return config_of(read_json(path, "a run's config"), str(path))
 
 
