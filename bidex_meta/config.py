@@ -83,26 +83,27 @@ class RunConfig(Generic[LearnerSettings]):
     suite: Text | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: Text | None = None
-    """Train on this single task class instead of a suite; also package.module:Class of your own (docs/own-task.md)."""
+    """Train on this single task class instead of a suite; or your own class as package.module:Class
+    (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class itself defines it. In HandOver the bases are fixed;
     in all other classes and in our suites they move."""
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
-    """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
-    original; docs/points.md); 0: the states, or as the suite's file says."""
+    """Number of points of the cloud that observations show in place of objects' states, as if from a depth camera
+    (docs/points.md; the original has 768). 0: observations show the states, unless the suite's file says otherwise."""
     touch: Switch = False
     """Observations also show touch sensors: normal forces at the fingertips and palms, 14 entries (docs/world.md)."""
     object: Text | None = None
-    """With --task: the object to throw in place of the class's own object: a name of the shelf or the path of an MJCF
-    file (docs/objects.md)."""
+    """With --task: the object to throw in place of the class's own object: a name of `bidex-meta list objects`, or the
+    path of an MJCF file (docs/objects.md)."""
     tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
-    """With --suite: train tasks of each class; 0: a new task in each episode, or in each trial of a learner that
-    adapts (docs/own-suite.md); by default as the suite's file says."""
+    """With --suite: number of train tasks of each class. 0: a new task in each episode, or in each trial of a learner
+    that adapts (docs/own-suite.md). By default the suite's file decides."""
     start_from: Text | None = None
     """Begin with the policy of this run's last checkpoint (its network and observation statistics) instead of a new
     policy."""
     algo: Text = "mtppo"
-    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
+    """Learner (see `bidex-meta list algos`), or your own class as package.module:Class (docs/own-learner.md)."""
     preset: Text = "auto"
     """Values of the learner's options that no flag sets. auto: metaworld for Meta-World's suites; v2 for version 2 if
     the learner has it; else laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
@@ -110,16 +111,16 @@ class RunConfig(Generic[LearnerSettings]):
     num_envs: Environments = UNRESOLVED
     """Environments stepped together by each process, over all tasks."""
     steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
-    """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
+    """Environment steps to train for, over all environments of all processes; may be written 2e7. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
     """Minutes to train for, summed over all resumes; training ends after --minutes or --steps, whichever is reached
     first. Building the world and evaluations are not counted; in short runs they can take longer than training. None:
     no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
-    that adapt: after two shots on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect
-    training. None: never."""
+    """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation has an episode of up
+    to ten tasks of each class, at least ten in all; learners that adapt are evaluated after two shots on train tasks.
+    Evaluations do not affect training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
@@ -165,7 +166,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
-    processes. A resumed run keeps its number."""
+    processes. A resumed run keeps its number of threads."""
 
     def __post_init__(self) -> None:
         check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)

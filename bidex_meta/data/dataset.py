@@ -99,7 +99,10 @@ def dataset_names(folder: Path | None = None) -> list[str]:
 
 @checked_arguments
 def open_dataset(name_or_path: str | Path) -> "Dataset":
-    """Open a data set by name in ``data_folder()`` or by path; raise BidexError if missing, incomplete or damaged."""
+    """Open a data set by name in ``data_folder()`` or by path.
+
+    Raises BidexError if the data set is missing, incomplete or damaged.
+    """
     named = expanded(name_or_path)
     for folder in (named, data_folder() / named):
         for inner in (folder / "data", folder):

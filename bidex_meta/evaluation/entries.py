@@ -22,7 +22,7 @@ MULTI_TASK = "multi-task"
 TRANSFER = "transfer"
 TRANSFER_STEPS = 1_000_000  # of training on each held-out class
 _FIRST_SEED = 2**30
-"""The least evaluation seed: seeds of training are small, so that no run trains on the tasks of an evaluation."""
+"""The smallest evaluation seed. Seeds of training are smaller, so that no run trains on the tasks of an evaluation."""
 _TASKS_OF_METAWORLD = 50
 _MOST_EPISODES = 1000  # of a task after a shot, over all trials
 _ITEMS = {MULTI_TASK: 1, TRANSFER: 2}  # of ``shots`` by track; other tracks have one before and one after each shot

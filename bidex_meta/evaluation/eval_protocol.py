@@ -1,4 +1,4 @@
-"""Protocol of an evaluation: seeds, tasks and episodes, the same object for Python and for the commands."""
+"""Protocol of an evaluation: seeds, tasks and episodes. Python functions and the commands share it."""
 
 from dataclasses import dataclass, replace
 

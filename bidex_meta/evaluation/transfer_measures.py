@@ -18,7 +18,7 @@ def area(steps: np.ndarray, success: np.ndarray, end: float) -> float:
     """Return the mean success over the environment steps 0 to ``end``, by the trapezoid rule.
 
     Evaluations are at rising ``steps`` (n,), n > 0, with ``success`` (n,) in [0, 1]. Success before the first
-    evaluation is taken to equal the first, and success after the last to equal the last.
+    evaluation is taken to equal the first, and success after the last evaluation to equal the last.
     """
     grid = np.unique(np.concatenate([[0.0, end], steps[steps < end]]))
     return float(np.trapezoid(np.interp(grid, steps, success), grid) / end)

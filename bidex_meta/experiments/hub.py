@@ -70,7 +70,7 @@ def checked(folder: Path) -> RunFolder | Dataset:
 
 
 def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes]:
-    """Return the files of a checked folder as published: without paths of this machine, with a user's suite file."""
+    """Return a checked folder's files for publication, without paths of this machine and with a user's suite file."""
     content: dict[str, Path | bytes] = dict(files)
     for name in files.keys() & {"config.json", "versions.json", "evaluation.json"}:
         found = read_json(files[name], "a file of a run")

@@ -24,9 +24,9 @@ _WIDTH = 1200  # numbers that a step of one environment holds at most: two obser
 def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     """Return a config with every value filled in, as ``config.json`` holds it.
 
-    A value that is None, ``"auto"`` or left out of ``learner`` gets what suits the suite, the learner and the device.
-    Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes nothing.
-    ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
+    A value that is None, ``"auto"`` or left out of ``learner`` gets a value that suits the suite, the learner and the
+    device. Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes
+    nothing. ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
     """
     dataset = run_data.whole_paths(config.dataset)
     datasets = run_data.open_datasets(dataset)

@@ -75,7 +75,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
     """Return data sets in the form that a config stores: paths of folders are made absolute.
 
-    A run may be resumed from another working folder.
+    This is needed because a run may be resumed from another working folder.
     """
     return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 
