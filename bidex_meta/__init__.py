@@ -5,9 +5,9 @@
     run = train(RunConfig(suite="MT4-v2", algo="mtppo", minutes=5))
     print(evaluate(run).success)
 
-Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...), shortens how long waiting OpenMP
-threads spin (docs/troubleshooting.md#slow-runs-and-poor-results) and asks CUDA for 32 queues; torch and MuJoCo are
-loaded when a name first needs them.
+Importing the package registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...), shortens the time that waiting OpenMP
+threads spin (docs/troubleshooting.md#slow-runs-and-poor-results) and lets CUDA use 32 queues. Torch and MuJoCo are
+loaded when a name that needs them is first used.
 """
 
 import os

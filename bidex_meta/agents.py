@@ -1,4 +1,4 @@
-"""Protocols of agents. Names and order of calls are Meta-World's, so that both libraries can evaluate an agent."""
+"""Protocols of agents, with Meta-World's method names and order of calls: both libraries can evaluate an agent."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -13,13 +13,13 @@ class Agent(Protocol):
         ...
 
     def reset(self, env_mask: Tensor) -> None:
-        """Forget the last episode of the environments in a mask, bool ``(num_envs,)``: they start a new one."""
+        """Forget the last episode in the environments of a mask, bool ``(num_envs,)``; they start a new episode."""
 
 
 class Timestep(NamedTuple):
     """One transition of every environment, as an adapting agent receives it.
 
-    The first six entries are Meta-World's. Its evaluation leaves out the other entries (None).
+    The first six entries are Meta-World's. In Meta-World's evaluation the other entries are None.
     """
 
     observation: Tensor
@@ -28,9 +28,10 @@ class Timestep(NamedTuple):
     reward: Tensor
     terminated: Tensor
     truncated: Tensor
-    """Bool ``(num_envs,)``: the episode was cut by its time limit, or because it was long enough to adapt to."""
+    """Bool ``(num_envs,)``: the episode was cut off by its time limit, or by the agent's limit
+    (``max_adapt_steps``)."""
     aux_policy_outputs: dict[str, Tensor]
-    """The other outputs of ``adapt_action``."""
+    """The policy's outputs other than actions, as returned by ``adapt_action``."""
     next_observation: Tensor | None = None
     """Observations after the transition, in the same episode, ``(num_envs, observation)``."""
     valid: Tensor | None = None
@@ -43,11 +44,12 @@ class MetaLearningAgent(Agent, Protocol):
     The methods are called in this order: first ``assign`` (only in our evaluation) and ``init``; then, for each shot,
     ``reset`` of all environments, ``adapt_action`` and ``step`` until every environment has played its episodes, and
     ``adapt``. Evaluations before, between and after shots call ``reset`` and ``eval_action``. An agent that learns
-    within an episode also has ``observe(timestep)``, which these evaluations call after each step to show its reward.
+    within an episode also has ``observe(timestep)``, which these evaluations call after each step, so that the agent
+    sees the reward.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Learn which environments share a task: tasks are numbers from 0, int64 ``(num_envs,)``.
+        """Receive the number of each environment's task, int64 ``(num_envs,)``; equal numbers mean the same task.
 
         None means that each environment has its own task, as in Meta-World's evaluation, which does not call this
         method.
@@ -69,7 +71,7 @@ class MetaLearningAgent(Agent, Protocol):
 
 @runtime_checkable
 class TrialAgent(Protocol):
-    """An agent of your own that learns about a task while it plays. ``meta_test`` asks nothing else of it.
+    """An agent of your own that learns about a task while it acts; ``meta_test`` needs only these methods.
 
     A trial is a few episodes of one task in each of N environments, with rewards shown in all of them. ``reset`` begins
     trials of other tasks; the size of its mask is N. Then each step calls ``act`` and ``observe``. The next episode of
@@ -77,7 +79,7 @@ class TrialAgent(Protocol):
     its episode is over and the environment waits for the others, or its physics broke. Tensors are on the device of the
     world.
 
-    ``copy.deepcopy`` must copy what the agent has learned: copies play the evaluation episodes, and the agent itself
+    ``copy.deepcopy`` must copy what the agent has learned: copies act in the evaluation episodes, and the agent itself
     learns only from exploring episodes.
     """
 

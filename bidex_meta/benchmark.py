@@ -1,6 +1,7 @@
 """`Benchmark("ML20")`: a suite file and a seed become task classes, tasks and worlds.
 
-The four properties and `Task` have Meta-World's names, so that code for Meta-World also runs here.
+The properties `train_classes`, `test_classes`, `train_tasks` and `test_tasks`, and the class `Task`, have Meta-World's
+names, so that code for Meta-World also runs here.
 """
 
 import hashlib
@@ -35,12 +36,14 @@ class Benchmark:
 
     `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of your own suite file, or a `Suite`.
     `seed`, a non-negative integer, chooses the tasks and is the default seed of the worlds. The same name and seed give
-    the same tasks in every process; no global random generator is used. The classes make single environments, as in
-    Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a `metaworld.Benchmark`. `tasks_per_class`
-    is the number of train tasks per class; 0: training draws a new task in each episode or trial, and `train_tasks` are
-    tasks that training never draws; None: as the suite's file says.
+    the same tasks in every process; no global random generator is used. `train_classes` and `test_classes` make single
+    environments, as in Meta-World. If `bidex_meta.metaworld` is imported, a `Benchmark` is also a
+    `metaworld.Benchmark`. `tasks_per_class` is the number of train tasks per class. With 0, training draws a new task
+    in each episode or trial, and `train_tasks` are tasks that training never draws. With None, the suite's file
+    decides.
 
-    Raises BidexError for an unknown suite, a faulty suite file or seed, or `tasks_per_class` with listed tasks.
+    Raises BidexError for an unknown suite, a faulty suite file or seed, or if `tasks_per_class` is given for a suite
+    that lists its tasks.
 
     Examples:
         >>> from bidex_meta import Benchmark
@@ -111,7 +114,7 @@ class Benchmark:
         return list(chain.from_iterable(self._tasks["test"].values()))
 
     def tasks_of(self, name: str, split: str = "train") -> list[Task]:
-        """Return the tasks of a class in a split; in version 2 the name may end in `-v2` or not.
+        """Return the tasks of a class in a split; in version 2 the ending `-v2` of the name may be left out.
 
         Raises BidexError if the split does not have the class.
         """
@@ -122,7 +125,7 @@ class Benchmark:
 
     @property
     def others(self) -> "Benchmark":
-        """Return the same suite with unseen tasks: the same number, drawn by another seed, that no run trained on."""
+        """Return the same suite with the same number of unseen tasks, drawn with a seed that no run trains with."""
         suite = self.suite
         if suite.train_tasks == 0:
             suite = replace(suite, train_tasks=None)
@@ -153,28 +156,30 @@ class Benchmark:
     ) -> World:
         """Make a batched world of one split.
 
-        In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks. In a meta
-        suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the number of
-        tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task. With
-        `episodes_per_task` above 1 environments of a training world keep each drawn task for that number of episodes.
+        In a training world (SAME_STEP) of a multi-task suite, every episode draws one task of the environment's class.
+        In a meta suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the
+        number of tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task.
+        If `episodes_per_task` is above 1, environments of a training world keep each drawn task for that number of
+        episodes.
 
         Args:
-            split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes, the same number, drawn by
-                another seed, that no run trained on.
-            num_envs: Environments over all classes, divided evenly; None: 1024 on the CPU, 8192 on an accelerator.
+            split: `"train"`, `"test"`, or `"others"`: the same number of unseen tasks of the train classes, drawn with
+                a seed that no run trains with.
+            num_envs: Number of environments, divided evenly among the classes; None: 1024 on the CPU, 8192 on an
+                accelerator.
             device: `"auto"` (CUDA if there is a GPU), `"cpu"`, `"cuda"`, ... or a `torch.device`.
             seed: Seed of starts and task draws; None: the benchmark's seed.
             autoreset_mode: SAME_STEP (the default, for training), NEXT_STEP (for Gymnasium's tools) or DISABLED (for
-                evaluation); also as text.
+                evaluation), as a member of Gymnasium's `AutoresetMode` or as text.
             threads: Engine threads on the CPU; None: one per core. Results do not depend on it.
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either device) or `"auto"`: the faster one.
-            stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
-                environments do not end together; False: all begin at step 0.
-            randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training
-                worlds; or a `Randomisation` (docs/randomisation.md).
-            pixels: Edge of square pictures in `info["pixels"]` (docs/looking.md); 0: none.
-            episodes_per_task: Consecutive episodes of an environment that play one drawn task, as in a trial
-                (docs/clients.md#trials-as-episodes); 1: as above.
+            stagger: In training worlds the first episodes begin at random elapsed steps, so that environments do not
+                all end together; these first episodes do not count. False: all begin at step 0.
+            randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training worlds;
+                or a `Randomisation` (docs/randomisation.md).
+            pixels: Edge length of the square pictures in `info["pixels"]`, pixels (docs/looking.md); 0: no pictures.
+            episodes_per_task: Number of consecutive episodes in which an environment keeps a drawn task, as in a trial
+                (docs/clients.md#trials-as-episodes); 1: as described above.
             deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
                 always does.
 
@@ -299,8 +304,9 @@ def make_task_world(
 ) -> World:
     """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
-    `task_name` is a task class, e.g. `"HandOver"` (the only one with a fixed base: 398 observations, 40 actions), or
-    your own class as `"package.module:Class"` (docs/own-task.md). In addition to arguments of `Benchmark.make_world`:
+    `task_name` is a task class, e.g. `"HandOver"` (the only one with a fixed base: observation size 398, 40 actions),
+    or your own class as `"package.module:Class"` (docs/own-task.md). Arguments that `Benchmark.make_world` does not
+    have:
 
     - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50;
       `"fresh"`: each episode draws a new task, which is not one of the 50. None: uniform in training worlds, fixed in
@@ -311,7 +317,7 @@ def make_task_world(
     - `randomisation`: randomisation of the environments (docs/randomisation.md); None: nothing is randomised.
     - `task_seed`: seed of the 50 tasks; None: `seed`.
     - `object`: name or MJCF file (docs/objects.md) of an object that replaces the class's own; the slot's name then
-      ends in a dash and the object.
+      ends in a dash and the object's name.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """

@@ -1,4 +1,4 @@
-"""A run's config: what flags become, what ``config.json`` holds, what a resumed run and a sweep compare."""
+"""The config of a run: flags set it, ``config.json`` stores it, and resumed runs and sweeps compare it."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ UNRESOLVED: Any = None
 
 _UNRESOLVED = ("num_envs", "steps", "threads")
 _WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
-"""Fields that no ``config.json`` may lack."""
+"""Fields that every ``config.json`` must have."""
 
 MAY_CHANGE = {"may_change": True}
 """Metadata of a field that a resumed run may change, because it does not affect what is learned."""
@@ -69,7 +69,7 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 
 
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""A flag without a value and without a ``--no-`` twin."""
+"""A flag without a value and without a ``--no-`` counterpart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,26 +83,27 @@ class RunConfig(Generic[LearnerSettings]):
     suite: Text | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: Text | None = None
-    """Train on this single task class instead of a suite; also package.module:Class of your own (docs/own-task.md)."""
+    """Train on this single task class instead of a suite; or your own class as package.module:Class
+    (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class itself does. In HandOver the bases are fixed, in
-    all other classes and in our suites they move."""
+    """With --task: whether the hands' bases move; own: as the class itself defines it. In HandOver the bases are fixed;
+    in all other classes and in our suites they move."""
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
-    """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
-    original; docs/points.md); 0: the states, or as the suite's file says."""
+    """Number of points of the cloud that observations show in place of objects' states, as if from a depth camera
+    (docs/points.md; the original has 768). 0: observations show the states, unless the suite's file says otherwise."""
     touch: Switch = False
     """Observations also show touch sensors: normal forces at the fingertips and palms, 14 entries (docs/world.md)."""
     object: Text | None = None
-    """With --task: the object to throw in place of the class's own object: a name of the shelf or the path of an MJCF
-    file (docs/objects.md)."""
+    """With --task: the object to throw in place of the class's own object: a name of `bidex-meta list objects`, or the
+    path of an MJCF file (docs/objects.md)."""
     tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
-    """With --suite: train tasks of each class; 0: a new task in each episode, or in each trial of a learner that
-    adapts (docs/own-suite.md); by default as the suite's file says."""
+    """With --suite: number of train tasks of each class. 0: a new task in each episode, or in each trial of a learner
+    that adapts (docs/own-suite.md). By default the suite's file decides."""
     start_from: Text | None = None
     """Begin with the policy of this run's last checkpoint (its network and observation statistics) instead of a new
     policy."""
     algo: Text = "mtppo"
-    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
+    """Learner (see `bidex-meta list algos`), or your own class as package.module:Class (docs/own-learner.md)."""
     preset: Text = "auto"
     """Values of the learner's options that no flag sets. auto: metaworld for Meta-World's suites; v2 for version 2 if
     the learner has it; else laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
@@ -110,39 +111,43 @@ class RunConfig(Generic[LearnerSettings]):
     num_envs: Environments = UNRESOLVED
     """Environments stepped together by each process, over all tasks."""
     steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
-    """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
+    """Environment steps to train for, over all environments of all processes; may be written 2e7. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
     """Minutes to train for, summed over all resumes; training ends after --minutes or --steps, whichever is reached
     first. Building the world and evaluations are not counted; in short runs they can take longer than training. None:
     no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
-    that adapt: after two shots on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect
-    training. None: never."""
+    """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation has an episode of up
+    to ten tasks of each class, at least ten in all; learners that adapt are evaluated after two shots on train tasks.
+    Evaluations do not affect training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
-    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of acting, with --algo bc, bcq,
-    td3bc or iql, for the suite or task that it was recorded on. If given several times: from all of them."""
+    """With --algo bc, bcq, td3bc or iql: learn from this data set (a name of `bidex-meta data list`, or a folder)
+    instead of acting. The run is for the suite or task that the data set was recorded on. If given several times: learn
+    from all of them."""
     task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
-    """Imitate this data set too (named as for --dataset; see `bidex-meta record demonstrations`), with a weight that
-    decays; with --algo mtppo and ppo (see --learner.demonstration-batch). If given several times: all of them."""
+    """With --algo mtppo and ppo: imitate this data set too, with a weight that decays (see
+    --learner.demonstration-batch). It is named as for --dataset; see `bidex-meta record demonstrations`. If given
+    several times: imitate all of them."""
     teacher: Several = ()
-    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. scripts: the
-    scripts of all classes that have one; or the folder of a run on the same suite, or on one of its classes. If given
-    several times: each class takes the first teacher that knows it."""
+    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. The value is
+    scripts (the scripts of all classes that have one), or the folder of a run on the same suite or on one of the
+    suite's classes. If given several times: each class takes the first teacher that knows it."""
     record: Steps = 0
     """Keep about this many transitions of the training as the data set replay/ in the run's folder; they are whole
     episodes of some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
-    """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""
+    """``record`` divided by the steps that the run began with: if the run is resumed for more steps, the same
+    environments are recorded."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the mean return reaches this: in evaluations with --evaluate-every, otherwise in training."""
+    """End as soon as the mean return reaches this value: in evaluations with --evaluate-every, otherwise in
+    training."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
     """End as soon as this fraction of the episodes succeeds, such as 0.8: in evaluations with --evaluate-every,
     otherwise in training, where actions explore."""
@@ -161,7 +166,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
-    processes. A resumed run keeps its number."""
+    processes. A resumed run keeps its number of threads."""
 
     def __post_init__(self) -> None:
         check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)
@@ -176,11 +181,11 @@ class RunConfig(Generic[LearnerSettings]):
         return json.loads(msgspec.json.encode(self))
 
     def flat(self) -> JsonObject:
-        """Return plain values without nesting: ``learner.gamma`` beside ``seed``."""
+        """Return plain values in one flat dict, with names such as ``seed`` and ``learner.gamma``."""
         return flat(self.to_json())
 
     def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
-        """Yield name, value here and value there of all entries that differ.
+        """Yield the name, the value in this config and the value in ``other`` of every entry that differs.
 
         Entries that a resumed run may change are left out.
         """
@@ -218,7 +223,7 @@ class RunConfig(Generic[LearnerSettings]):
 
 
 def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
-    """Return tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    """Return nested tables as one flat dict: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
     found: JsonObject = {}
     for name, value in content.items():
         found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
@@ -226,7 +231,7 @@ def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
 
 
 def read_config(path: Path) -> RunConfig[JsonObject]:
-    """Return a run's ``config.json``. Raises BidexError if it is none, or cannot be read."""
+    """Return a run's ``config.json``. Raises BidexError if the file is not a config, or cannot be read."""
     return config_of(read_json(path, "a run's config"), str(path))
 
 

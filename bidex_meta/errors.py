@@ -8,8 +8,8 @@ EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141
-"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM, SIGHUP,
-SIGUSR1 and SIGUSR2), and of SIGPIPE where nobody reads any more what is printed."""
+"""Exit codes of the command line. After Ctrl-C, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 the code is 128 plus the signal's
+number, as shells expect. If the reader of the output has ended, the code is that of SIGPIPE."""
 
 
 class BidexError(ValueError):
@@ -21,10 +21,10 @@ class BidexError(ValueError):
 
 
 def known_name(kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return the known name that equals a name except for upper and lower case.
+    """Return the known name that equals ``name``, ignoring case.
 
-    ``kind`` says what is looked up, e.g. ``"suite"``. Raises BidexError if there is none, with the nearest name (or the
-    name that ``meant`` has for it) and the list.
+    ``kind`` says what is looked up, e.g. ``"suite"``. Raises BidexError if there is none. The message suggests the
+    nearest name, or the name that ``meant`` maps ``name`` to, and lists all known names.
     """
     names = list(known)
     if isinstance(name, str) and name in names:
@@ -53,9 +53,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def unknown_name(
     kind: str, name: str, known: Iterable[str], meant: Mapping[str, str] = MappingProxyType({})
 ) -> BidexError:
-    """Return the error for an unknown name, with the nearest known name and the list.
+    """Return the error for an unknown name, with the nearest known name and a list of all known names.
 
-    ``kind`` says what was looked up, e.g. ``"suite"``.
+    ``kind`` says what was looked up, e.g. ``"suite"``. ``meant`` maps names, in lower case, to the names to suggest.
     """
     names = sorted(known)
     near = meant.get(str(name).casefold()) or nearest(str(name), names)
@@ -76,9 +76,9 @@ def shortened(value: object) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a text on one line, without control characters that a terminal would obey.
+    """Return a text on one line, without control characters that a terminal would act on.
 
-    Names in it may come from anybody. Words of more than 400 letters are cut after 200.
+    The text may contain names that strangers chose. Words of more than 400 letters are cut after 200.
     """
     words = " ".join(word if len(word) <= 400 else f"{word[:200]}..." for word in str(text).split())
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)

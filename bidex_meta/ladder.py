@@ -1,10 +1,10 @@
 """Suites of a single class: ``MT1-Switch-v2``, ``ML1-Switch-v2``, and with fewer hidden numbers ``ML1-Switch-choice2``.
 
 ``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. A choice suite has two or four tasks, which
-are the same in both splits. Each of the goal's two numbers is small or large: both are equally small or large with two
-tasks, and they vary independently with four. In a ``-shared`` suite both numbers have the same value, anywhere in the
-class's range. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on it
-shows what adaptation can reach.
+are the same in both splits. A goal has two numbers, and each is small or large. With two tasks both are small or both
+are large; with four tasks they vary independently. In a ``-shared`` suite both numbers have the same value, anywhere in
+the class's range. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on
+the former shows what adaptation can reach in the latter.
 """
 
 import re
@@ -36,12 +36,12 @@ CHOICES = {
 }
 """Classes with choice and shared suites."""
 ANY_CLASS = "CLASS"
-"""The name of any class in messages."""
+"""Placeholder for the name of a class, in messages."""
 _VARIANTS = ("choice2", "choice4", "shared")
 _NAME = re.compile(rf"(MT1|ML1)-([^-]+)-(v2|{'|'.join(_VARIANTS)})")
 _Task = tuple[str, Literal["train", "test", "both"], dict[str, float]]
 _SHARED_TASKS = 50
-"""Tasks of each split of a shared suite, those of the test split midway between those of the train split."""
+"""Number of tasks in each split of a shared suite. The test tasks lie midway between the train tasks."""
 
 
 HIDDEN_NUMBERS = {
@@ -61,7 +61,7 @@ class Rung(NamedTuple):
     hidden: str
     """Hidden part of a task, in words."""
     budget: str
-    """Estimate of the time that a learner needs: docs/results/ladder.md has no figures for most rungs yet."""
+    """Estimate of a learner's training time. For most rungs docs/results/ladder.md has no measurement yet."""
 
 
 RUNGS = (
@@ -78,10 +78,10 @@ class OfOneClass(NamedTuple):
     """The parsed name of a suite with a single class."""
 
     template: str
-    """Name of the suite that it is made from."""
+    """Name of the suite that this suite is made from."""
     class_name: str
     variant: str
-    """What goals there are: ``v2`` (as in the template), ``choice2``, ``choice4`` or ``shared``."""
+    """Kind of goals: ``v2`` (as in the template), ``choice2``, ``choice4`` or ``shared``."""
 
     @property
     def shows_goals(self) -> bool:
@@ -156,7 +156,7 @@ def names_of(classes: Iterable[str]) -> list[str]:
 
 
 def parts_of(name: str) -> OfOneClass | None:
-    """Return the parts of the name of a single-class suite; None for another suite."""
+    """Return the parts of the name of a single-class suite; None for any other name."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None

@@ -14,21 +14,23 @@ from bidex_meta.utils.validation import check_fields, check_rising
 CONTROL_RATE = 60
 """Control steps per second of every class (docs/figures.md, control)."""
 HELD_STEPS = 15
-"""Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
+"""Number of last control steps in which the condition must hold without a break, if success counts at the end: 0.25
+s."""
 
 
 @checked_arguments
 @dataclass(frozen=True)
 class Rules:
-    """Four independent choices; the defaults are version 1, and ``V2`` has all of version 2."""
+    """Four independent rules of a suite; the defaults are those of version 1, and ``V2`` has those of version 2."""
 
     reward: Literal["paper", "v2"] = "paper"
-    """The printed formula of each class, or ``aligned_terms``."""
+    """``paper``: the formula that the paper prints for each class; ``v2``: the terms of ``aligned_terms``."""
     variation: Literal["narrow", "wide"] = "narrow"
     """Narrow goals vary about as much as success tolerates; wide goals vary several times as much, with a hidden
     quantity in every class. Wide observations also give objects' and goals' quaternions with w >= 0."""
     success: Literal["once", "at-end"] = "once"
-    """The condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
+    """``once``: the condition must hold in at least one step of the episode; ``at-end``: in the last ``HELD_STEPS``
+    steps."""
     starts: Literal["plain", "jittered"] = "plain"
     """If jittered, every episode of every class draws joint noise and shifts fixtures and objects."""
 
@@ -70,7 +72,7 @@ def versioned_name(name: str, rules: Rules) -> str:
 
 
 def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Describe how other rules, by name, differ from ``rules``; return an empty text if they are equal."""
+    """Describe how other rules, given as values by name, differ from ``rules``; return "" if they are equal."""
     pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
     return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
@@ -83,33 +85,33 @@ _Range = tuple[_Factor, _Factor]
 
 @dataclass(frozen=True)
 class Randomisation:
-    """Factors drawn for an environment, uniformly from ranges, and added noise; nothing by default.
+    """Random factors, drawn uniformly from ranges for each environment, and noise. By default there is neither.
 
-    Raises BidexError for values out of bounds or ranges that fall.
+    Raises BidexError for values out of bounds, or if a range ends below its start.
     """
 
     friction: _Range = (1.0, 1.0)
     """Factor of the friction of all contacts."""
     object_mass: _Range = (1.0, 1.0)
     object_size: tuple[_Size, _Size] = (1.0, 1.0)
-    """Factor of the lengths of free objects without joints; their masses stay."""
+    """Factor of the lengths of free objects without joints; their masses do not change."""
     actuator_gain: _Range = (1.0, 1.0)
     """Factor of the fingers' actuator forces, before their limits."""
     joint_damping: _Range = (1.0, 1.0)
     """Factor of the damping of the fingers' joints."""
     gravity: _Range = (1.0, 1.0)
     observation_noise: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
-    """Standard deviation in an observation's units, of what sensors show of hands and objects."""
+    """Standard deviation of the noise on sensor readings of hands and objects, in the units of the observation."""
     action_noise: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0
-    """Standard deviation; actions are clipped afterwards."""
+    """Standard deviation of the noise on actions, which are clipped afterwards."""
     action_delay: tuple[_Steps, _Steps] = (0, 0)
-    """Control steps, a whole number of the range."""
+    """Range of the delay of actions, in whole control steps."""
     push_speed: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Most that a push adds to the velocity of all objects along each axis, m/s."""
+    """Largest change that a push makes to the velocity of every object along each axis, m/s."""
     push_interval: Annotated[float, Meta(ge=0.1, le=1000.0)] = 1.0
     """Mean time between pushes, s."""
     draw: Literal["episode", "environment"] = "episode"
-    """Factors and the delay are drawn for every episode, or once per environment."""
+    """Factors and the delay are drawn in every episode, or once per environment."""
 
     def __post_init__(self) -> None:
         check_fields(self, "randomisation")
@@ -117,4 +119,4 @@ class Randomisation:
 
 
 FACTORS = ("friction", "object_mass", "object_size", "actuator_gain", "joint_damping", "gravity")
-"""Of a randomisation, those that are factors of the model's numbers."""
+"""Fields of ``Randomisation`` that are factors of quantities of the physics model."""

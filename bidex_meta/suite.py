@@ -1,6 +1,6 @@
 """Reads and checks `suites/*.toml` into frozen dataclasses; `suites/README.md` explains the files field by field.
 
-Names of task classes and of their variations are checked where the classes are known, in `bidex_meta.benchmark`.
+The names of task classes and of their variations are checked in `bidex_meta.benchmark`, which knows the classes.
 """
 
 import hashlib
@@ -37,11 +37,11 @@ from bidex_meta.utils.validation import parse, whole_number
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
 OTHERS, OTHER_SEED = "others", 500_000
-"""Name of the tasks of train classes that no run trained on, and what is added to a run's seed to draw them."""
+"""Split name of unseen tasks of the train classes, and the number that is added to a run's seed to draw them."""
 DRAWN = 50
-"""Tasks drawn per class and split where a file says ``tasks_per_class = 0``."""
+"""Number of tasks drawn per class and split if a file says ``tasks_per_class = 0``."""
 MOST_POINTS = 16_384
-"""Of a cloud: more than a coarse image has pixels are no finer."""
+"""Largest number of points of a cloud: more points than a coarse image has pixels show no more detail."""
 MOST_TASKS = 1_000_000
 METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     "metaworld/MT10": (
@@ -51,19 +51,19 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     # No suite of Meta-World's: three of its classes that are learned within minutes.
     "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
 }  # fmt: skip
-"""Suites of Meta-World's own environments, and their classes in its order."""
+"""Suites of Meta-World's own environments, with their classes in Meta-World's order."""
 
 
 @checked_arguments
 @dataclass(frozen=True)
 class ListedTask:
-    """One task that a suite file lists, instead of drawing tasks."""
+    """One task that a suite file lists; a class with listed tasks draws none."""
 
     name: str
-    """Unique within its class, e.g. `"left"`."""
+    """Name that is unique within the class, e.g. `"left"`."""
     split: Split | Literal["both"]
     fixed: Mapping[str, float]
-    """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
+    """Fixed components of the variation by name (metres and radians, world frame); the seed draws the others."""
 
     def of(self, split: Split) -> bool:
         """Return whether the task belongs to a split."""
@@ -83,9 +83,9 @@ class SuiteClass:
     gamma: float | None
     """Discount per step of this class; None: the learner's own."""
     tasks: tuple[ListedTask, ...]
-    """Listed tasks; empty where the tasks are drawn."""
+    """Listed tasks; empty if the tasks are drawn."""
     options: Mapping[str, float | str]
-    """Further options of the class, by the names of its constructor's arguments."""
+    """Further options of the class, by the names of the class's constructor arguments."""
 
 
 @checked_arguments
@@ -95,26 +95,30 @@ class Suite:
 
     name: str
     version: int
-    """The `-vN` of the Gymnasium id; goes up when results change."""
+    """The `-vN` of the Gymnasium id; it goes up when results change."""
     kind: Literal["multi-task", "meta"]
-    """Multi-task suites have a train split only; meta suites both, without a task in common."""
+    """Multi-task suites have only a train split. Meta suites have both splits, which share only tasks listed as
+    ``both``."""
     description: str
     observation: Literal["plain", "one-hot", "masked"]
-    """Change of the padded observation: none, task id appended, goal entries zeroed."""
+    """Change of the padded observation: none (``plain``), task id appended (``one-hot``), goal entries zeroed
+    (``masked``)."""
     task_id: Literal["class", "task"]
     """Meaning of one entry of the one-hot: a class or a listed task."""
     rules: Rules
     base: Literal["moving", "alone"]
-    """Moving bases for every class, or for each class the base of the class itself."""
+    """``moving``: the hands' bases move in every class; ``alone``: each class keeps the base that it has outside of
+    suites."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
     file: Path
     train_tasks: int | None = None
-    """Tasks drawn per class of the train split instead; 0: training draws a new one in each episode or trial, and
-    evaluations on the train split play ``tasks_per_class`` tasks that training never draws."""
+    """Number of tasks drawn per class for the train split; None: ``tasks_per_class``. With 0, training draws a new task
+    in each episode or trial, and evaluations on the train split use ``tasks_per_class`` tasks that training never
+    draws."""
     points: int = 0
-    """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
+    """Number of points of the cloud that observations show instead of objects' states; 0: they show the states."""
     point_kinds: bool = False
     """True if each point has its kind as a fourth entry."""
     randomisation: Randomisation | None = None
@@ -123,12 +127,12 @@ class Suite:
     """True if observations show touch sensors of both hands."""
 
     def __post_init__(self) -> None:
-        """Name classes without a version; raise BidexError for ``CatchUnderarm-v2`` in a suite with other rules."""
+        """Remove ``-v2`` from names of classes; raise BidexError for such a name in a suite with other rules."""
         object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
 
     @property
     def digest(self) -> str:
-        """Return twelve hexadecimal digits of everything that decides tasks, rewards and observations.
+        """Return a hash, twelve hexadecimal digits, of everything that decides tasks, rewards and observations.
 
         The digest ignores the file's version. It also ignores entries that have their default value, so that a new kind
         of entry does not change old digests.
@@ -186,7 +190,7 @@ _OF_THE_FILE = ("name", "version", "description", "file")
 
 
 def _chosen(value: object) -> Json:
-    """Return a value ready for JSON: the fields of dataclasses that differ from their default, paths as names."""
+    """Return a value for JSON: dataclasses become dicts of fields that differ from the default, paths become names."""
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))
         return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
@@ -211,7 +215,7 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
 
 
 def suite_names() -> list[str]:
-    """Return the names of the suites that this installation ships: sorted, then those of a single class."""
+    """Return the names of all shipped suites: first those with a file, sorted, then the suites of a single class."""
     classes = [entry.name for entry in _shipped("MT20-v2").classes]
     return [*file_names(), *ladder.names_of(classes)]
 
@@ -231,9 +235,9 @@ def metaworld_classes(suite: str) -> tuple[str, ...]:
 
 @checked_arguments
 def load_suite(name_or_path: str | Path) -> Suite:
-    """Read a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
+    """Read a shipped suite by name, ignoring case, or a suite file by path: a `Path`, or a text ending in `.toml`.
 
-    Raises BidexError for a missing suite or file, or a file that is not as `suites/README.md` describes.
+    Raises BidexError for a missing suite or file, or for a file that does not follow `suites/README.md`.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
@@ -246,9 +250,10 @@ def load_suite(name_or_path: str | Path) -> Suite:
 
 
 def known_suite(name: str, more: Iterable[str] = (), kind: str = "suite") -> str:
-    """Return the name of a suite, or the entry of ``more``, that equals a given name in upper or lower case.
+    """Return the name of a suite, or the entry of ``more``, that equals ``name``, ignoring case.
 
-    Raises BidexError if there is none, with the nearest name and a list that shows suites of one class only once.
+    Raises BidexError if there is none. The message has the nearest name and a list in which ``CLASS`` stands for every
+    class, so that the suites of a single class are not all listed.
     """
     names = [*suite_names(), *more]
     folded = {known.casefold(): known for known in names}
@@ -261,7 +266,7 @@ def known_suite(name: str, more: Iterable[str] = (), kind: str = "suite") -> str
 
 @cache
 def _shipped(name: str) -> Suite:
-    """Return the suite of a file."""
+    """Return the suite of a shipped file, by name."""
     return _parse(suites_dir() / f"{name}.toml")
 
 
@@ -277,7 +282,7 @@ def _of_one_class(name: str, parts: ladder.OfOneClass) -> Suite:
 
 @checked_arguments
 def load_randomisation(path: str | Path) -> Randomisation:
-    """Read the table ``[randomisation]`` of a TOML file: a suite's, or a file that holds nothing else.
+    """Read the table ``[randomisation]`` of a TOML file: a suite file, or a file that has only this table.
 
     Raises BidexError if the file has no such table, or a faulty one.
     """
@@ -399,7 +404,7 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
 
 
 def _object(file: Path, name: str) -> str:
-    """Return an object's name; for a file its path, which is relative to the suite file's folder."""
+    """Return an object's name, or for a file its absolute path; ``name`` is relative to the suite file's folder."""
     if name.endswith(".xml"):
         return str(absolute(file.parent / expanded(name)))
     return name

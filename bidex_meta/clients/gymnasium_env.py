@@ -15,9 +15,9 @@ from bidex_meta.world.episodes import check_single_reset
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
-    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Without `seed` the tasks are those of seed 0,
-    and the starts differ from environment to environment. With `touch` observations show touch sensors. Raises
-    BidexError for an unknown task class or a render mode other than None and `"rgb_array"`.
+    `seed` chooses the 50 tasks. It also seeds the starts, until `reset(seed=...)` sets another seed. Without `seed`,
+    the tasks are those of seed 0, and the starts differ from environment to environment. With `touch`, observations
+    show touch sensors. Raises BidexError for an unknown task class or a render mode other than None and `"rgb_array"`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (Gymnasium's own convention)
@@ -60,7 +60,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Returns observation (d,) float32, reward, terminated, truncated and info. `info` has ``success`` (of this state;
         in version 2 whether the goal has been held for 0.25 s), ``unstable`` and ``reward_terms``. At an episode's end
         `info` also has ``is_success``: whether the episode was a success, in version 1 at any step, in version 2 at its
-        end. BidexError is raised if no episode runs, because the last episode's end would count twice.
+        end. BidexError is raised if no episode is running, because otherwise the end of the last episode would count
+        twice.
         """
         if self._over:
             raise BidexError("Expected reset() before step(): no episode runs.")

@@ -29,7 +29,7 @@ def task_id(task_name: str) -> str:
 
 
 def register_ids() -> None:
-    """Register all ids; ids that are registered already stay as they are."""
+    """Register all ids; ids that are already registered are not changed."""
     for name in suite_names():
         for env_id, split in suite_ids(load_suite(name)).items():
             _register(env_id, None, f"{__name__}:make_suite_world", suite=name, split=split)
@@ -55,12 +55,12 @@ def make_suite_world(
 ) -> VectorEnv:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, with environments of all classes.
 
-    `seed` chooses tasks, starts and task draws. `benchmark_seed` chooses the tasks instead, and without `seed` also
-    starts and task draws. Without both seeds, the tasks are those of seed 0, and starts and draws differ each time. The
-    render modes, None and `"rgb_array"`, are equivalent, because a world draws on request. Other arguments are as in
-    `Benchmark.make_world`, except that `stagger` is off: wrappers would count shortened episodes. With
-    `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is Meta-World's vector of
-    single environments with NumPy arrays, and `num_envs` is ignored.
+    `seed` chooses tasks, starts and task draws. If `benchmark_seed` is given, it chooses the tasks instead; without
+    `seed`, it also chooses starts and task draws. Without both seeds, the tasks are those of seed 0, and starts and
+    draws differ each time. The render modes, None and `"rgb_array"`, are equivalent, because a world renders only on
+    request. Other arguments are as in `Benchmark.make_world`, except that `stagger` is off: wrappers would count
+    shortened episodes. With `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is
+    Meta-World's vector of single environments with NumPy arrays, and `num_envs` is ignored.
     """
     check_render_mode(render_mode)
     task_seed, start_seed = both_seeds(seed, benchmark_seed)

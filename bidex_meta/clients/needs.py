@@ -22,7 +22,7 @@ def extra(name: str) -> Iterator[None]:
 
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
-    """Set whether a world staggers episodes; raise BidexError if its autoreset mode is not the one that is needed."""
+    """Set whether a world staggers episodes; raise BidexError if the world's autoreset mode is not ``mode``."""
     check_argument("world", world, VectorWorld)
     given = world.metadata["autoreset_mode"]
     if given != mode:

@@ -1,4 +1,4 @@
-"""A task class as PettingZoo's parallel environment: fingers, hands or any of them as agents. Extra: `marl`."""
+"""A task class as PettingZoo's parallel environment, with hands, fingers or other units as agents. Extra: `marl`."""
 
 from collections.abc import Mapping
 
@@ -21,7 +21,7 @@ with extra("marl"):
 class HandsEnv(ParallelEnv):
     """A single environment of a task class with several agents, which share reward, ends and `info`.
 
-    `agents` is the partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or units by agent
+    `agents` is the partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or a mapping from agents to units
     (docs/learners/multiagent.md). Other arguments are as in `TaskEnv`. Raises BidexError for an unknown task class or
     render mode, or a bad partition.
     """
@@ -70,7 +70,7 @@ class HandsEnv(ParallelEnv):
 
     @checked_arguments
     def step(self, actions: Mapping[str, object]) -> tuple[dict, dict, dict, dict, dict]:
-        """Advance 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
+        """Advance 1/60 s by each agent's action in [-1, 1], whose entries are in the order of the world's actions.
 
         Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; all are empty
         once the episode is over. BidexError is raised if an agent's action is missing or has another shape.

@@ -1,11 +1,11 @@
-"""A policy in another process, asked over a WebSocket, as an agent for our evaluation. Extra: `policy-server`.
+"""An agent for our evaluation whose policy runs in another process, over a WebSocket. Extra: `policy-server`.
 
 Messages are msgpack maps. An array is a map of `dtype` (NumPy's, such as `<f4`), `shape` and `data` (raw bytes, in C
 order). For each step of N environments the client sends:
 
 - `state`: observations (N, d), float32.
 - `reset`: whether an episode begins with this observation, bool (N,).
-- `instruction`: a sentence for each environment that says what to do, where the world has them.
+- `instruction`: a sentence for each environment that says what to do, if the world has such sentences.
 - `pixels`: pictures (N, edge, edge, 3), uint8, if the world was made with `pixels`.
 
 The server answers `action`: an array (N, a) of floats in [-1, 1]; or `error`: a text, which ends the evaluation.
@@ -44,8 +44,8 @@ class PolicyClient:
     """The policy of a server at `url`, such as `ws://localhost:8765`, in the environments of `world`.
 
     `evaluate(PolicyClient(url, world), world)` plays the usual evaluation. A `with` block closes the connection. The
-    server has `timeout` seconds for each answer. Raises BidexError if the server cannot be reached, goes away, is late,
-    reports an error, or answers anything but actions of the world's shape.
+    server has `timeout` seconds for each answer. Raises BidexError if the server cannot be reached, disconnects,
+    answers too late, reports an error, or answers anything but actions of the world's shape.
     """
 
     @checked_arguments

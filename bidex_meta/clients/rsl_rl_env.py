@@ -18,13 +18,13 @@ with extra("rsl-rl"):
 
 
 class RslRlVecEnv(VecEnv):
-    """All environments of one world on its device; observations in the groups `policy` and `critic`.
+    """All environments of one world on the world's device; observations are in the groups `policy` and `critic`.
 
     `extras` has `time_outs` (episodes cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty if no
-    episode ended). `policy` names the world's `observation_groups` for the policy (none: all); the critic gets all
-    groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md); "Mean
-    reward" counts shortened episodes, `log` does not. Raises BidexError for a mode other than SAME_STEP, an unknown
-    group, or an `episode_length_buf` whose values are not non-negative integers.
+    episode ended). `policy` lists the `observation_groups` of the world that the policy gets (empty: all); the critic
+    gets all groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md);
+    rsl-rl's "Mean reward" counts shortened episodes, but `log` does not. Raises BidexError for a mode other than
+    SAME_STEP, an unknown group, or an `episode_length_buf` whose values are not non-negative integers.
     """
 
     @checked_arguments
@@ -55,7 +55,10 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps since each environment's start, int64 (num_envs,). Setting it shortens running episodes, uncounted."""
+        """Steps since each environment's start, int64 (num_envs,).
+
+        Setting the property shortens the running episodes, which then do not count.
+        """
         return self.world.episodes.elapsed.clone()
 
     @episode_length_buf.setter

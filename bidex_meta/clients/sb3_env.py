@@ -19,12 +19,13 @@ with extra("sb3"):
 
 
 class SB3VecEnv(vec_env.VecEnv):
-    """All environments of one world, NumPy arrays in and out; one SB3 seed starts all environments.
+    """All environments of one world, with NumPy arrays; one SB3 seed seeds the starts of all environments.
 
     At an episode's end `infos` has `terminal_observation` and `TimeLimit.truncated` (if true, SB3 bootstraps from that
-    observation's value). Unless it was a shortened first episode, `infos` also has `episode` (r, l, t), `is_success`
-    (by the suite's rule) and `task`. `stagger` shortens first episodes (docs/clients.md); SB3 does not count shortened
-    episodes, but `VecMonitor` does. Raises BidexError for a world in another autoreset mode than SAME_STEP.
+    observation's value). Unless the episode was a shortened first episode, `infos` also has `episode` (r, l, t),
+    `is_success` (by the suite's rule) and `task`. `stagger` shortens first episodes (docs/clients.md); SB3 does not
+    count shortened episodes, but `VecMonitor` does. Raises BidexError for a world in another autoreset mode than
+    SAME_STEP.
     """
 
     @checked_arguments

@@ -18,11 +18,11 @@ with extra("skrl"):
 
 
 class SkrlEnv(Wrapper):
-    """All environments of one world on its device, without NumPy in between (as `wrap_env` takes it).
+    """All environments of one world on the world's device, without the NumPy arrays that `wrap_env` puts in between.
 
     skrl stores the observation that `step` returns as the next observation, bootstraps from it at time limits, and acts
     on it. skrl does not read `final_obs`, so the world must be in mode NEXT_STEP: an ended environment returns its last
-    observation, and its next step starts the next episode, with reward 0, whatever the action.
+    observation, and its next step starts the next episode, with reward 0, regardless of the action.
 
     `infos` are those of the world; if full episodes ended, `episode` has their means in the form that skrl's trainers
     log. `seed` is the seed of the first reset (None: the world's). `stagger` shortens first episodes (docs/clients.md),

@@ -15,7 +15,7 @@ _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 
 
 class TorchRLEnv(envs.EnvBase):
-    """All environments of one world, batch size (num_envs,), each entry (num_envs, ...).
+    """All environments of one world, with batch size (num_envs,); each entry is (num_envs, ...).
 
     `next` holds the observation that the step led to, also if an episode ended. TorchRL then asks for a reset, which
     returns the first observation of the new episode; the world has already begun this episode. In addition to

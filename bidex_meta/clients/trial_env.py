@@ -1,7 +1,8 @@
-"""Trials as episodes, for any recurrent learner: `TrialEnv` is one environment, `TrialWorld` a world of them.
+"""Trials as episodes, for any recurrent learner: `TrialEnv` is one environment, `TrialWorld` a batched world.
 
-A trial is a few episodes of one task with rewards shown, as in RL² (Duan et al. 2016). An observation is followed by
-the last action, the last reward and 1 if the last step ended an episode, all 0 at the start of a trial.
+A trial is a few episodes of one task with rewards shown, as in RL² (Duan et al. 2016). Each observation ends in the
+last action, the last reward, and a flag that is 1 if the last step ended an episode. These entries are 0 at the start
+of a trial.
 """
 
 from pathlib import Path
@@ -29,7 +30,7 @@ from bidex_meta.world.single_env import SuiteEnv
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 EPISODES = 3
-"""Of a trial, as in the meta-test."""
+"""Default number of episodes in a trial, as in the meta-test."""
 _OF_EPISODES = ("episode", "_episode", "final_info", "_final_info")
 _SUMS = ("r", "l", "unscaled")
 _SEEDS = 2**31
@@ -38,10 +39,10 @@ _SEEDS = 2**31
 class TrialWorld(PooledWorldWrapper):
     """A training world whose episodes are trials of `world.episodes_per_task` episodes: a `contract.VectorWorld`.
 
-    `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` goes into the other adapters, such as
-    `SB3VecEnv`. Return and length are those of the trial, success is that of its last episode. Within a trial the next
-    episode starts in the step that ends the previous one, and neither `terminated` nor `truncated` is set. The trial
-    ends when its last episode does, or when physics breaks. First episodes are not shortened.
+    `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` can be passed to the other adapters,
+    such as `SB3VecEnv`. Return and length are those of the trial; success is that of the trial's last episode. Within a
+    trial, the next episode starts in the step that ends the previous one, and neither `terminated` nor `truncated` is
+    set. The trial ends when its last episode ends, or when physics breaks. First episodes are not shortened.
 
     Raises BidexError for a world in another autoreset mode than SAME_STEP, or one that shows its goals.
     """
@@ -124,7 +125,7 @@ class TrialWorld(PooledWorldWrapper):
         return torch.cat((obs, self._last), dim=1), info
 
     def state_dict(self) -> State:
-        """Return the world's state and what the trials have shown so far."""
+        """Return the world's state, and the last step and the sums of the running trials."""
         trials = {"last": self._last, **self._sums}
         return {**super().state_dict(), "trials": {name: value.clone() for name, value in trials.items()}}
 
@@ -139,18 +140,19 @@ class TrialWorld(PooledWorldWrapper):
 
 
 class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment that plays a trial of a suite with hidden goals as one episode: a new task at each reset.
+    """One environment of a suite with hidden goals, in which an episode is a whole trial; each reset draws a task.
 
-    `suite` is a name, a file or a `Suite`; `split` is `"train"` or `"test"`; `episodes` counts those of a trial. All
-    tasks of the split are equally likely; in a suite with `tasks_per_class = 0` the train split draws new ones. `seed`
-    chooses the tasks, and the trials until `reset(seed=...)`. Without `seed` the tasks are those of seed 0, and the
-    trials differ from environment to environment. `render_mode` is None or `"rgb_array"`. `task` is the task of the
-    running trial, and `max_episode_steps` the longest trial: the sum of the time limits of its episodes.
+    `suite` is a name, a file or a `Suite`; `split` is `"train"` or `"test"`; `episodes` is the number of episodes in a
+    trial. All tasks of the split are equally likely; in a suite with `tasks_per_class = 0` the train split draws new
+    tasks. `seed` chooses the tasks. It also seeds the order and the starts of the trials, until `reset(seed=...)` sets
+    another seed. Without `seed`, the tasks are those of seed 0, and the trials differ from environment to environment.
+    `render_mode` is None or `"rgb_array"`. `task` is the task of the running trial, and `max_episode_steps` the length
+    of the longest trial, that is, the sum of the time limits of its episodes.
 
-    `info` has `success`, `unscaled_reward` and `unstable`, at the end of each episode also `episode_success`, by the
-    suite's rule, and at the end of the trial `is_success`, that of its last episode. The trial ends as its last episode
-    does, or where physics breaks. Raises BidexError for an unknown suite, split or render mode, and for a suite that
-    shows its goals.
+    `info` has `success`, `unscaled_reward` and `unstable`. At the end of each episode it also has `episode_success`, by
+    the suite's rule. At the end of the trial it also has `is_success`, the success of the last episode. The trial
+    terminates or is truncated like its last episode, or ends when physics breaks. Raises BidexError for an unknown
+    suite, split or render mode, and for a suite that shows its goals.
     """
 
     metadata = SuiteEnv.metadata
@@ -201,7 +203,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._seen(self._begin_episode(), np.zeros(self._num_actions), 0.0, False), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Advance 1/60 s by an action (a,) in [-1, 1]; where an episode of the trial ends, begin the next one.
+        """Advance 1/60 s by an action (a,) in [-1, 1]; if an episode of the trial ends, begin the next one.
 
         Raises BidexError if no trial runs.
         """
@@ -255,7 +257,7 @@ def make_trials(
 ) -> TrialWorld:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/trials", num_envs=64, suite="ML1-v2")`.
 
-    `episodes` counts those of a trial; other arguments are those of `make_suite_world`.
+    `episodes` is the number of episodes in a trial; other arguments are those of `make_suite_world`.
     """
     options["episodes_per_task"] = episodes
     made = make_suite_world(suite, split, num_envs, seed, benchmark_seed, render_mode, **options)

@@ -1,9 +1,9 @@
 """Checks and summaries of a data set.
 
 The check recomputes rewards by the class's own formula, from the sensors that the observation shows and the variation
-that the episode stores. This reveals shifted environments, wrong tasks and wrong starts. The check reports a formula
-that reads more than the observation shows (the hand's point of most classes with tables; objects' states if point
-clouds replace the states).
+that the episode stores. This reveals shifted environments, wrong tasks and wrong starts. If a formula reads more than
+the observation shows, the check reports this. This concerns most classes with tables, which read the hand's point, and
+data with point clouds, which replace objects' states.
 """
 
 import math
@@ -39,14 +39,14 @@ _Shown = dict[str, tuple[slice, float]]
 class Findings:
     """Result of a check."""
 
-    episodes: int = 0  # checked
-    steps: int = 0  # their transitions
-    wrong: list[str] = field(default_factory=list)  # what is wrong, a line for each of the first few wrong episodes
+    episodes: int = 0  # checked episodes
+    steps: int = 0  # checked transitions
+    wrong: list[str] = field(default_factory=list)  # faults, one line for each of the first few wrong episodes
     count: int = 0  # wrong episodes
     recomputed: dict[str, int] = field(default_factory=dict)  # transitions whose reward was computed again, by class
     largest: dict[str, float] = field(default_factory=dict)
     """Largest difference between a stored reward and a computed one, in the formula's units, by class."""
-    skipped: dict[str, str] = field(default_factory=dict)  # why rewards of a class were not computed again
+    skipped: dict[str, str] = field(default_factory=dict)  # by class, why its rewards were not computed again
     unsealed: list[str] = field(default_factory=list)  # files without a digest
 
 
@@ -104,7 +104,7 @@ def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, 
 
 
 def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -> Iterator[str]:
-    """Yield the faults that an episode shows without its reward formula."""
+    """Yield the faults of an episode that can be found without the reward formula."""
     steps = len(episode)
     if steps == 0:
         yield "no transition"
@@ -194,9 +194,10 @@ class _Formulas:
 
 
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
-    """Map each sensor that an observation shows whole and unmapped to its slice and factor, without ``hidden`` entries.
+    """Return slice and factor of each sensor that an observation shows completely and unchanged, by sensor.
 
-    Joint positions are left out: the observation maps each one from its joint's range. So are blocks that saturate.
+    Sensors with ``hidden`` entries are left out. Joint positions are left out, because the observation maps each one
+    from its joint's range. Blocks that saturate are left out too.
     """
     shown: _Shown = {}
     for block, where in task.layout:
@@ -230,8 +231,8 @@ class SlotSummary:
     length: float  # mean length of an episode, steps
     returns: tuple[float, float, float, float]  # unscaled: least, median, mean, largest
     success: float  # share of episodes that met their goal
-    score: float | None  # mean normalised score (``evaluation.references``); None where a reference is missing
-    tasks: int  # different ones played
+    score: float | None  # mean normalised score (``evaluation.references``); None if a reference is missing
+    tasks: int  # number of different tasks
     broken: int  # episodes ended by broken physics
 
 
@@ -269,7 +270,8 @@ def coverage(dataset: Dataset) -> Json:
 
     Two results are per group of the observation: ``observation_std`` is the standard deviation over all states,
     averaged over the group's entries; ``constant`` is the share of the group's entries that never change.
-    ``action_std`` is the standard deviation averaged over actions; ``action_at_bounds`` is the share at ±1.
+    ``action_std`` is the standard deviation averaged over actions; ``action_at_bounds`` is the share of action entries
+    at ±1.
     """
     d = dataset.observation_size
     a = dataset.action_size

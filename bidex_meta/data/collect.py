@@ -45,7 +45,8 @@ class Actor:
 
     policy: Agent | None  # None: uniform actions
     sampled: bool = False
-    """Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken."""
+    """True: actions are drawn from the policy's distribution, if the policy has one. Otherwise they are its mean
+    action."""
     noise: float = 0.0  # standard deviation of Gaussian noise on the actions
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
@@ -78,11 +79,11 @@ class Actor:
 class Progress:
     """Progress of a collection by policy, computed only from the collection's parts."""
 
-    rounds: int  # parts that are there
+    rounds: int  # existing parts
     steps: list[int]  # transitions of each policy
-    episodes: list[int]  # of each policy
+    episodes: list[int]  # episodes of each policy
     returns: float  # mean unscaled return over all episodes, NaN without any
-    success: float  # share of them that succeeded, NaN without any
+    success: float  # share of successful episodes, NaN without any
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:

@@ -224,7 +224,8 @@ class RunCollector(EpisodeCollector):
 
     Saving a checkpoint calls ``state_dict``, which commits the collected episodes as a part; the result holds the
     number of parts and the running episodes. A run that resumes from this state deletes later parts and plays them
-    again. ``folder`` is the data set's folder: call ``open``, or set it before ``load_state_dict``, which opens it.
+    again. ``folder`` is the data set's folder. Call ``open``, or set ``folder`` before ``load_state_dict``, which opens
+    the folder.
     """
 
     folder: Path

@@ -42,7 +42,7 @@ class _Reference:
 
 @dataclass(frozen=True)
 class _Collected:
-    """The fields that are read of our metadata entry ``bidex``, which may hold further fields."""
+    """The fields of our metadata entry ``bidex`` that are read; the entry may hold further fields."""
 
     tasks: Annotated[list[Text], Meta(min_length=1)]
     kind: Text
@@ -71,7 +71,7 @@ class _Collected:
 
 @dataclass(frozen=True)
 class _Metadata:
-    """The entries that are read of ``metadata.json``: Minari's entries, and ours."""
+    """The entries of ``metadata.json`` that are read: Minari's entries, and ours."""
 
     total_episodes: Whole
     total_steps: Whole
@@ -87,7 +87,10 @@ def data_folder() -> Path:
 
 @checked_arguments
 def dataset_names(folder: Path | None = None) -> list[str]:
-    """List the complete data sets in a folder (``data_folder()``), by names such as ``CatchUnderarm/random-v0``."""
+    """List the names, such as ``CatchUnderarm/random-v0``, of complete data sets.
+
+    ``folder`` is the folder that is searched; None: ``data_folder()``.
+    """
     if folder is None:
         folder = data_folder()
     complete = islice(folder.glob("**/data/" + part_files.METADATA) if folder.is_dir() else (), _MOST_LISTED)
@@ -96,7 +99,10 @@ def dataset_names(folder: Path | None = None) -> list[str]:
 
 @checked_arguments
 def open_dataset(name_or_path: str | Path) -> "Dataset":
-    """Open a data set by name in ``data_folder()`` or by path; raise BidexError if missing, incomplete or damaged."""
+    """Open a data set by name in ``data_folder()`` or by path.
+
+    Raises BidexError if the data set is missing, incomplete or damaged.
+    """
     named = expanded(name_or_path)
     for folder in (named, data_folder() / named):
         for inner in (folder / "data", folder):
@@ -112,10 +118,11 @@ def open_dataset(name_or_path: str | Path) -> "Dataset":
 
 
 class Dataset:
-    """Whole episodes on disk, as ``open_dataset`` returns it; only small tables stay in memory.
+    """A data set of whole episodes on disk, from ``open_dataset``; only small tables stay in memory.
 
-    ``folder`` is the folder ``data``, ``content`` is all of ``metadata.json``, and ``metadata`` is our entry of it
-    (``commands.run_data.dataset_metadata``). Without our entry ``metadata`` has only ``tasks`` and ``kind``.
+    ``folder`` is the folder ``data``, ``content`` is all of ``metadata.json``, and ``metadata`` is our entry in it
+    (``bidex_meta.experiments.run_data.dataset_metadata``). Without our entry ``metadata`` has only ``tasks`` and
+    ``kind``.
     """
 
     def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
@@ -154,7 +161,10 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """Return the columns of ``part_files.TABLE`` and ``variation`` by episode; raise BidexError for damage."""
+        """Return the columns of ``part_files.TABLE`` and ``variation`` by episode.
+
+        Raises BidexError if files are damaged.
+        """
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes = len(columns["steps"])
         steps = int(columns["steps"].sum())
@@ -178,7 +188,7 @@ class Dataset:
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the least and largest actions, (a,) each, of a data set from elsewhere; None for our own: ±1.
+        """Return lower and upper bounds of actions, (a,) each, of a data set from elsewhere; None for our own (±1).
 
         Raises BidexError if the bounds are not finite.
         """

@@ -1,4 +1,4 @@
-"""Join data sets in memory, each observation stored once, in the form of the world that a policy is trained for."""
+"""Join data sets in memory, in the form of the world that a policy is trained for; store each observation once."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,9 +49,9 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     """Read at least one data set for a world, without stepping or resetting the world.
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards get the world's scale. Goals that the world hides become zero, and actions from elsewhere are mapped to
-    [-1, 1]. With ``every`` each of the world's classes needs data. BidexError is raised if actions, states or clouds
-    have another form, actions from elsewhere have no bounds, classes do not match, or memory is too small.
+    rewards get the world's scale. Goals that the world hides become zero, and actions from elsewhere are mapped to [-1,
+    1]. With ``every`` each of the world's classes needs data. BidexError is raised if actions, states or clouds have
+    another form, if actions from elsewhere have no bounds, if classes do not match, or if memory is too small.
     """
     ids = world.num_id_columns
     plain = world.single_observation_space.shape[0] - ids
@@ -104,7 +104,7 @@ def gathered(
 def check_touch(dataset: Dataset, touch: bool) -> None:
     """Raise BidexError unless a data set and a world both show touch sensors (``touch``), or neither does.
 
-    Padding would hide the different widths.
+    Otherwise padding would hide that the widths differ.
     """
     if bool(dataset.metadata.get("touch")) != touch:
         if touch:
@@ -115,8 +115,8 @@ def check_touch(dataset: Dataset, touch: bool) -> None:
 class _Columns(NamedTuple):
     """Columns of an observation without its task id; padding stands before the cloud."""
 
-    state: np.ndarray  # without the cloud, ascending
-    cloud: np.ndarray  # of the point cloud, point after point
+    state: np.ndarray  # columns of the state, that is, all but the cloud, ascending
+    cloud: np.ndarray  # columns of the point cloud, point after point
     label: str  # form of the cloud, for messages
 
     @staticmethod
@@ -135,7 +135,11 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """Converts a data set's episodes to a world's form; the world has ``slots``; ``plain`` excludes the one-hot."""
+    """Converts a data set's episodes to a world's form.
+
+    ``plain`` is the size of the world's observations without the one-hot, and ``actions`` the number of its actions.
+    ``slots`` has the world's slot for each slot of the data set.
+    """
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset = dataset

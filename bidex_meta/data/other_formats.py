@@ -22,7 +22,7 @@ def check_spaces(content: Json, name: str) -> None:
 
 
 def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.ndarray:
-    """Read an array of an episode by Minari's name of it; raise BidexError for a wrong shape, type or ``length``."""
+    """Read an episode's array that Minari calls ``array``; raise BidexError for a wrong shape, type or ``length``."""
     if not hasattr(stored, "shape"):
         raise _not_flat(name, array, f"a group of {shortened(', '.join(stored))}")
     shape = stored.shape or ()
@@ -35,9 +35,9 @@ def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.
 
 
 def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and largest actions, (a,) each, float64, to be mapped to ±1.
+    """Return lower and upper bounds of actions, (a,) each, float64, which are mapped to ±1.
 
-    Raises BidexError unless the bounds are finite and rising.
+    Raises BidexError unless all bounds are finite and upper bounds are above lower bounds.
     """
     space = _space(content, "action_space")
     try:

@@ -42,7 +42,7 @@ ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
 TABLE: dict[str, type] = dict.fromkeys(("steps", "task", "task_index", "row", "policy"), np.int64)
 TABLE |= {"success": np.bool_, "broken": np.bool_, "return": np.float64, "return_unscaled": np.float64}
-"""Columns of the table of a part's episodes, beside ``variation`` (episodes, v), padded with NaN."""
+"""Columns of the table of a part's episodes. A further column, ``variation`` (episodes, v), is padded with NaN."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class Episode:
     actions: np.ndarray  # (T, a), float32, clipped to [-1, 1]
     rewards: np.ndarray  # (T,), float32, with the suite's scale of the class
     terminated: np.ndarray  # (T,), bool: true at most for the last transition
-    truncated: np.ndarray  # (T,), bool: likewise, by time, or before a broken transition
+    truncated: np.ndarray  # (T,), bool: the same; ended by time, or before a broken transition
     task: int = 0  # slot of the world
-    task_name: str = ""  # its name: a class, or ``Class/task``
-    task_index: int = 0  # task of the slot's pool
-    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: what that task freezes, if any
+    task_name: str = ""  # name of the slot: a class, or ``Class/task``
+    task_index: int = 0  # index of the task in the slot's pool
+    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: values that the task fixes
     success: bool = False  # by the suite's rule: the goal was met at any step, or held at the end
     broken: bool = False  # whether physics broke in the next transition, which is left out
-    return_unscaled: float = 0.0  # sum of the rewards by the printed formula, before the suite's scale
+    return_unscaled: float = 0.0  # sum of the rewards before the suite's scale
     row: int = 0  # environment of the process's world
-    policy: int = 0  # which of several policies acted, from 0 on
-    instruction: str = ""  # what the task asks for, without what the suite hides; empty if the world has no sentences
+    policy: int = 0  # number of the acting policy, from 0
+    instruction: str = ""  # the task in words, without hidden parts; empty if the world has no sentences
 
     def __len__(self) -> int:
         """Return the number of transitions, T."""
@@ -254,7 +254,7 @@ def reading(path: Path) -> Iterator[H5]:
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
-    """Read the columns of a part's episodes, (episodes,), ``variation`` (episodes, v); raise BidexError for damage."""
+    """Read a part's table: columns (episodes,), and ``variation`` (episodes, v); raise BidexError for damage."""
     with reading(path) as file:
         table = {name: file["table"][name] for name in (*TABLE, "variation")}
         rows = table["steps"].shape[:1]

@@ -36,7 +36,7 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Check a file's digest by reading all bytes; return False without a digest. Raises BidexError if it is wrong."""
+    """Check a file's digest by reading all bytes; return False if there is none. Raises BidexError if it is wrong."""
     with open_regular(path, "a file of a data set") as file:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):

@@ -71,7 +71,10 @@ def check_name(name: str) -> None:
 
 
 def check_room(folder: Path, needed: int, subject: str) -> None:
-    """Raise BidexError if the disk of a folder, perhaps a missing one, lacks ``needed`` bytes for ``subject``."""
+    """Raise BidexError if the disk of a folder, which need not exist, has too few bytes free.
+
+    ``subject`` is what takes the ``needed`` bytes, for the message.
+    """
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
@@ -130,7 +133,7 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
-    """Lock a folder against other processes, from before anything is written there to the end.
+    """Lock a folder against other processes while the block records into it, before anything is written there.
 
     The folder is created, and removed again if it stays empty. Arguments and errors are those of ``has_begun``;
     BidexError is also raised if another process records there.
@@ -206,8 +209,8 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: J
     """Complete a data set: write Minari's index over the parts of all processes, then the metadata.
 
     ``name`` must be one that Minari accepts; the spaces are those of one observation (d,) and action (a,). ``metadata``
-    is our entry: it must have ``tasks``, and ``left_out`` is added. BidexError is raised for another name, or a damaged
-    part.
+    is our entry: it must have ``tasks``, and ``left_out`` is added. BidexError is raised for any other name, or a
+    damaged part.
     """
     check_name(name)
     inner = folder / "data"

@@ -21,9 +21,9 @@ _MEASURES = 2  # success and return
 class Agreement:
     """One class in both evaluations."""
 
-    name: str  # of the class; for a meta-test with split and shot
+    name: str  # name of the class; for a meta-test, with split and shot
     outcome: str
-    """``equal``: bit for bit; ``within``: success and return within what their intervals allow; ``differs``."""
+    """``equal``: bit for bit; ``within``: success and return differ no more than their intervals allow; ``differs``."""
     recorded: ClassSummary
     again: ClassSummary
 

@@ -37,10 +37,10 @@ class Group:
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
     scores: np.ndarray | None  # normalised score, (seeds, classes); None if a class has no reference
-    steps: int  # environment steps of a seed, over all its runs: the mean over seeds, which may differ
-    steps_range: tuple[int, int]  # fewest and most steps of a seed
+    steps: int  # environment steps of a seed, summed over its runs: mean over seeds
+    steps_range: tuple[int, int]  # smallest and largest number of steps of a seed
     hours: float  # mean time of a seed's training, over all its runs, without evaluation
-    paths: list[Path]  # its run folders, or files of JSON
+    paths: list[Path]  # the runs' folders, or JSON files
 
     def steps_text(self) -> str:
         """Return the mean number of steps, with its range if seeds differ."""
@@ -77,7 +77,7 @@ def run_kind(config: AnyConfig, split: str = "train") -> Json:
 
 
 def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
-    """Return the names of data sets, without the name of the run's own class: classes of one group share the rest."""
+    """Return the names of data sets without the prefix of the run's own class: the rest is equal within a group."""
     if config.task is None:
         own = ""
     else:
@@ -128,7 +128,7 @@ def _differing_settings(kind: Json, kinds: Iterable[Json]) -> str:
 
 
 def _check_copies(runs: Sequence[Run]) -> None:
-    """Raise BidexError if one run is a copy of another: the times of their metrics are equal, even if seeds differ."""
+    """Raise BidexError if one run is a copy of another, that is, if the times in their metrics are equal."""
     known: dict[tuple[float, ...], Path] = {}
     for run in runs:
         times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
@@ -235,9 +235,9 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
 class History:
     """Curves of runs that differ only in the seed."""
 
-    label: str  # as of :class:`Group`
+    label: str  # label as in :class:`Group`
     runs: list[Run]
-    curves: dict[str, Curve]  # of each tag that a run has logged
+    curves: dict[str, Curve]  # curve of each tag that a run has logged
 
 
 def read_histories(runs: Sequence[Run]) -> list[History]:

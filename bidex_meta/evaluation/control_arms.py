@@ -32,7 +32,7 @@ class Control:
     before: Evaluation
     own: Evaluation  # adapted to data of the tasks themselves
     foreign: list[Evaluation]  # adapted to data of each train task
-    adaptations: dict[str, np.ndarray]  # per class the adaptation that each episode followed, (episodes,)
+    adaptations: dict[str, np.ndarray]  # by class, number of the adaptation before each episode, (episodes,)
     rollouts: int  # episodes of each task in a shot
 
 
@@ -40,7 +40,7 @@ def control(
     load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, *, protocol: Protocol = DEFAULT,
     references: Mapping[str, Reference] | None = None, say: Callable[[str], None] = lambda line: None
 ) -> Control:  # fmt: skip
-    """Play all arms by ``meta_evaluate``, whose errors are raised.
+    """Play all arms with ``meta_evaluate``, and raise its errors.
 
     ``load`` makes a new MetaLearningAgent for each arm, so that all arms draw the same numbers. Both worlds must be in
     autoreset mode DISABLED and have the same classes (else BidexError) and the same number of environments; the pools

@@ -22,7 +22,7 @@ MULTI_TASK = "multi-task"
 TRANSFER = "transfer"
 TRANSFER_STEPS = 1_000_000  # of training on each held-out class
 _FIRST_SEED = 2**30
-"""The least evaluation seed: seeds of training are small, so that no run trains on the tasks of an evaluation."""
+"""The smallest evaluation seed. Seeds of training are smaller, so that no run trains on the tasks of an evaluation."""
 _TASKS_OF_METAWORLD = 50
 _MOST_EPISODES = 1000  # of a task after a shot, over all trials
 _ITEMS = {MULTI_TASK: 1, TRANSFER: 2}  # of ``shots`` by track; other tracks have one before and one after each shot
@@ -33,8 +33,8 @@ _Identity = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$")]
 _Version = Annotated[str, Meta(max_length=100, pattern=r"^[0-9][\w.+]*$")]
 
 AdaptationTrack = Literal["reward-only", "privileged"]
-"""The training of an agent that adapts: rewards of its own episodes alone; or also teachers, hidden parts of tasks, or
-rewards of other goals."""
+"""Information in the training of an agent that adapts. ``reward-only``: only the rewards of the agent's own episodes;
+``privileged``: also teachers, hidden parts of tasks, or rewards of other goals."""
 Track = Literal["multi-task", "reward-only", "privileged", "transfer"]
 ADAPTATION: tuple[str, ...] = get_args(AdaptationTrack)
 
@@ -44,15 +44,15 @@ Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 
 @dataclass(frozen=True)
 class Part:
-    """The results on tasks of one kind."""
+    """The results on one kind of tasks: new tasks or the runs' own tasks."""
 
-    trials: Few  # adaptations to each task, each with ``episodes`` of the entry
+    trials: Few  # adaptations to each task, each followed by the entry's ``episodes``
     rollouts: Whole  # exploration episodes of each task in a shot; 0 for a policy that does not adapt
     shots: Annotated[list[Classes], Meta(min_length=1)]
-    """Results after 0, 1, ... shots; of a transfer, from scratch and from the run."""
+    """Results after 0, 1, ... shots; for a transfer, results from scratch and then from the run."""
 
     def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
-        """Return success (runs, units) in each class after a shot; ``episodes`` are those of an adaptation."""
+        """Return success (runs, units) in each class after a shot; ``episodes`` is their number per adaptation."""
         return [row_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
 
 
@@ -75,17 +75,17 @@ class Tuning:
     """The submitter's statement of the search for settings."""
 
     trials: Count  # settings that were tried
-    seeds: Count  # of each
+    seeds: Count  # seeds of each setting
 
 
 @dataclass(frozen=True)
 class Receipt:
     """Digests of everything that the results come from; lists have one item per run."""
 
-    weights: list[_Digest]  # of the policies, see ``weights_digest``
+    weights: list[_Digest]  # digests of the policies, see ``weights_digest``
     config: list[_Digest]
-    code: _Commit | None  # that evaluated; + if files differed from the commit; None: not from a repository
-    evaluation: _Digest  # of all other content of the entry
+    code: _Commit | None  # commit of the code that evaluated; + if files differed from it; None: no repository
+    evaluation: _Digest  # digest of all other content of the entry
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ class Stated:
     """Statements of the run folders that nobody can verify; lists have one item per run."""
 
     seeds: list[Seed]
-    hours: list[NonNegative]  # of training, without evaluation
-    device: _Name  # that trained
-    commit: list[_Commit | None]  # that trained; + if files differed from the commit
+    hours: list[NonNegative]  # hours of training, without evaluation
+    device: _Name  # device that trained
+    commit: list[_Commit | None]  # commit of the code that trained; + if files differed from it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,21 +109,21 @@ class _Listed(ABC):
     suite: _Name
     track: Track
     tuning: Tuning
-    seed: Seed  # of starts; of a run also of new tasks
-    episodes: Few  # of each task after each adaptation
+    seed: Seed  # seed of starts; for runs also of new tasks
+    episodes: Few  # episodes of each task after each adaptation
     new: Part
-    """Results on tasks that the seed draws; of an agent that is no run, on test tasks."""
+    """Results on tasks that the seed draws; for an agent that is not a run, results on test tasks."""
     conditions: Conditions
     receipt: Receipt
 
     @property
     def runs(self) -> int:
-        """Return the number of runs, which is that of the lists of successes in every class."""
+        """Return the number of runs; every class has one list of successes per run."""
         return len(self.receipt.weights)
 
     @property
     def result(self) -> list[np.ndarray]:
-        """Return the success (runs, units) in each class by which entries are ranked: on new tasks, at the end."""
+        """Return the success (runs, units) in each class that ranks entries: on new tasks, after the last shot."""
         return self.new.tables(self.episodes)
 
     @property
@@ -132,7 +132,7 @@ class _Listed(ABC):
         return {"new": self.new}
 
     def summaries(self) -> dict[str, ClassSummary]:
-        """Return the results, without returns, that a repetition compares: of each run, part, shot and class."""
+        """Return the success of each run, part, shot and class, for the comparison with a repetition."""
         found = {}
         for where, part, shot, name, row in self._rows():
             episodes = self.episodes * part.trials
@@ -150,7 +150,7 @@ class _Listed(ABC):
                 yield from ((where, part, shot, name, row) for name, row in classes.items())
 
     def faults(self) -> Iterator[str]:
-        """Yield the contradictions within an entry and to its suite."""
+        """Yield the contradictions within the entry, and between the entry and its suite."""
         conditions = self.conditions
         if missing := {"bidex-meta", "mujoco"} - conditions.packages.keys():
             yield f"conditions.packages: expected {min(missing)} to be there"
@@ -170,7 +170,7 @@ class _Listed(ABC):
             yield from (f"{where}.{fault}" for fault in self._faults_of(part, self._pools(where)))
 
     def _faults_of(self, part: Part, pools: Mapping[str, int]) -> Iterator[str]:
-        """Yield the contradictions within a part whose classes have ``pools`` tasks."""
+        """Yield the contradictions within a part; ``pools`` has the number of tasks by class."""
         adapts = self.track in ADAPTATION
         shots = _ITEMS.get(self.track, SHOTS + 1)
         if len(part.shots) != shots:
@@ -212,24 +212,24 @@ class _Listed(ABC):
 
     @abstractmethod
     def _tasks(self, pool: int) -> range:
-        """Return the numbers of tasks that may be played of a pool."""
+        """Return the allowed numbers of evaluated tasks, of ``pool`` tasks in all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _OfRuns(_Listed):
-    """An entry of runs, which `submit` has played."""
+    """An entry of runs, which `submit` has evaluated."""
 
     verified = True
     algorithm: _Name
-    train_tasks: Whole | None  # per class; 0: a new task in each episode or trial; None: the suite's number
-    steps: list[Count]  # of the checkpoints
+    train_tasks: Whole | None  # train tasks per class; 0: a new task per episode or trial; None: as in the suite
+    steps: list[Count]  # environment steps of the checkpoints
     stated: Stated
 
     def _train_tasks(self) -> int | None:
         return self.train_tasks
 
     def faults(self) -> Iterator[str]:
-        """Yield the contradictions within an entry and to its suite."""
+        """Yield the contradictions within the entry, and between the entry and its suite."""
         weights = self.receipt.weights
         if len({*weights}) < len(weights):
             yield "receipt.weights: expected another policy of each run, got one twice"
@@ -256,7 +256,7 @@ class Entry(_OfRuns):
         return range(tasks, tasks + 1)
 
     def faults(self) -> Iterator[str]:
-        """Yield the contradictions within an entry and to its suite."""
+        """Yield the contradictions within the entry, and between the entry and its suite."""
         receipt = self.receipt
         named = {"steps": self.steps, "receipt.weights": receipt.weights, "receipt.config": receipt.config}
         named |= {f"stated.{name}": value for name, value in vars(self.stated).items() if isinstance(value, list)}
@@ -277,9 +277,10 @@ class TransferEntry(_OfRuns):
     """
 
     start: _Digest
-    """The weights of the run's policy; those in the receipt are of the policies that it became, class by class."""
-    scratch: list[_Digest]  # of the policies from scratch, in the same order
-    seeds: Annotated[list[Seed], Meta(min_length=1)]  # of the training on each class
+    """Digest of the run's policy. The digests in the receipt are of the policies that were trained from it, class by
+    class."""
+    scratch: list[_Digest]  # digests of the policies from scratch, in the same order
+    seeds: Annotated[list[Seed], Meta(min_length=1)]  # seeds of the training on each class
     budget: Count  # environment steps of the training on each class
 
     @property
@@ -291,7 +292,7 @@ class TransferEntry(_OfRuns):
         return range(pool, pool + 1)
 
     def faults(self) -> Iterator[str]:
-        """Yield the contradictions within an entry and to its suite."""
+        """Yield the contradictions within the entry, and between the entry and its suite."""
         if self.track != TRANSFER:
             yield f"track: expected {TRANSFER}, got {self.track}"
         if self.budget != TRANSFER_STEPS:
@@ -315,7 +316,7 @@ class AgentEntry(_Listed):
 
     verified = False
     track: AdaptationTrack
-    agent: _Name  # its class
+    agent: _Name  # name of the agent's class
     task_seed: Seed
 
     @property
@@ -327,7 +328,7 @@ class AgentEntry(_Listed):
         return range(1, pool + 1)
 
     def faults(self) -> Iterator[str]:
-        """Yield the contradictions within an entry and to its suite."""
+        """Yield the contradictions within the entry, and between the entry and its suite."""
         receipt = self.receipt
         if receipt.weights or receipt.config or receipt.code:
             yield "receipt: expected no weights, config and code of an agent that was played elsewhere"
@@ -353,7 +354,7 @@ def _suite(name: str) -> Suite | None:
 
 
 def held_out(suite: Suite | None) -> dict[str, int]:
-    """Return the number of test tasks of each class of a suite that is tested but not trained on."""
+    """Return the number of test tasks of each class that a suite tests but does not train on."""
     if suite is None:
         return {}
     pools = suite.task_names("test") if "test" in suite.splits else {}

@@ -27,7 +27,10 @@ class ClassRow:
 
 
 def class_row(solved: list[list[int]], episodes: int) -> Json:
-    """Return the results of a class, ready for JSON, from the number of successes per run and task, of ``episodes``."""
+    """Return the results of a class for JSON.
+
+    ``solved`` has the number of successes of each run and task, in ``episodes`` episodes of the task.
+    """
     mean = _mean(row_table(solved, episodes))
     return {"success": mean.value, "interval": mean.interval, "solved": solved}
 
@@ -57,7 +60,10 @@ def _mean(table: np.ndarray) -> Estimate:
 
 
 def faults_of_row(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
-    """Yield the contradictions within a class of ``runs`` runs, ``tasks`` tasks and ``episodes`` of each."""
+    """Yield the contradictions in a class's results of ``runs`` runs with ``episodes`` episodes of each task.
+
+    ``tasks`` has the allowed numbers of tasks.
+    """
     counts = {len(of_run) for of_run in row.solved}
     if len(row.solved) != runs or len(counts) != 1 or min(counts) not in tasks:
         yield f"solved: expected {tasks[-1]} values of each of {runs} runs, got {[*map(len, row.solved)]}"

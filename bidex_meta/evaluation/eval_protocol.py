@@ -1,4 +1,4 @@
-"""Protocol of an evaluation: seeds, tasks and episodes, the same object for Python and for the commands."""
+"""Protocol of an evaluation: seeds, tasks and episodes. Python functions and the commands share it."""
 
 from dataclasses import dataclass, replace
 
@@ -7,7 +7,7 @@ from bidex_meta.suite import OTHERS, SPLITS
 from bidex_meta.utils.validation import whole_number
 
 EVALUATION_SEED = 1_000_000
-"""Seed of the starts in evaluations. Nobody trains with it, so the starts are new to the policy."""
+"""Seed of the starts in evaluations. Training does not use this seed, so the starts are new to the policy."""
 _LEAST = {
     "seed": 0, "tasks": 1, "episodes_per_task": 1, "shots": 0, "rollouts": 1, "trials": 1, "max_adapt_steps": 1
 }  # fmt: skip
@@ -22,18 +22,19 @@ class Protocol:
     """
 
     split: str | None = None
-    """Tasks of a world: ``train``, ``test``, or ``others``: the same number of unseen tasks of the train classes, drawn
-    by another seed; see ``Benchmark.make_world``. None: the tasks of the given world."""
+    """Split that the tasks belong to: ``train``, ``test``, or ``others`` (the same number of unseen tasks of the train
+    classes, drawn with another seed; see ``Benchmark.make_world``). None: the tasks of the given world."""
     seed: int = EVALUATION_SEED  # Seed of all starts.
     tasks: int | None = None  # Number of tasks of each class, the first of its pool; None: all.
     episodes_per_task: int = 4  # Evaluation episodes of each task, after each trial.
-    shots: int = 2  # Number of adaptation rounds, one after the other; ``evaluate`` plays without adaptation.
+    shots: int = 2  # Number of adaptation rounds, one after the other; ``evaluate`` ignores it.
     rollouts: int | None = None
-    """Exploring episodes of each task in a shot; None: one in each environment that plays it."""
-    trials: int = 1  # Number of adaptations to each task, each from the start and with other episodes.
+    """Exploring episodes of each task in a shot; None: one in each environment that has the task."""
+    trials: int = 1  # Number of adaptations to each task, each from the unadapted policy and with new episodes.
     hidden_rewards: bool = False
     """Also play the evaluation episodes with their rewards hidden. Otherwise rewards are shown in all episodes, as in
-    the papers: an agent that learns while it acts needs them. Hidden rewards test what it remembers."""
+    the papers: an agent that learns while it acts needs them. Episodes with hidden rewards test what the agent
+    remembers."""
     max_adapt_steps: int | None = None
     """Number of steps after which exploring episodes are cut (``truncated``); None: they are not cut."""
 

@@ -1,4 +1,4 @@
-"""Frames of a policy at work: one environment, or one environment of each class as tiles."""
+"""Frames of an acting policy: one environment, or one environment of each class as tiles."""
 
 from collections.abc import Iterator, Sequence
 from typing import Protocol, TypedDict, cast
@@ -27,7 +27,7 @@ class Look(TypedDict, total=False):
 
 
 class RenderedWorld(PooledWorld, Protocol):
-    """A world that can be drawn, as all but Meta-World's can."""
+    """A world that can be drawn; all worlds except Meta-World's can."""
 
     def render(self, env_id: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """Return a picture of an environment, (height, width, 3), uint8."""
@@ -64,12 +64,13 @@ def film_tiles(
     large: bool = False,
     **look: Unpack[Look],
 ) -> Iterator[np.ndarray]:
-    """Yield frames of ``steps`` steps of several environments as tiles; each starts a new episode when one ends.
+    """Yield frames of ``steps`` steps of several environments as tiles.
 
-    An environment's name is green while its episode counts as a success: from the first success to the end of the
-    episode, or, if success counts at the end, while the goal is held. The world is in autoreset mode DISABLED.
-    ``width`` and ``height`` are those of a tile. With ``large`` there is an additional picture on the left, as high as
-    all tiles. It shows one environment after the other, each for an equal share of the steps.
+    When an episode ends, its environment starts a new one. An environment's name is green while its episode counts as a
+    success: from the first success to the end of the episode, or, if success counts at the end, while the goal is held.
+    The world is in autoreset mode DISABLED. ``width`` and ``height`` are those of a tile. With ``large`` there is an
+    additional picture on the left, as high as all tiles. It shows one environment after the other, each for an equal
+    share of the steps.
     """
     drawn = cast(RenderedWorld, world)
     names = [world.task_names[int(world.task_id[row])] for row in rows]
@@ -98,7 +99,7 @@ def film_tiles(
 
 
 def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, look: Look) -> np.ndarray:
-    """Return a tile of another height with the same shape; its width is even, as films need it."""
+    """Return a tile of the given height with the same aspect ratio; its width is even, as films require."""
     inner = height - LABEL
     width = 2 * round(inner * look.get("width", 640) / look.get("height", 480) / 2)
     picture = world.render(row, width, inner, look.get("camera"))
@@ -114,7 +115,7 @@ def with_clouds(world: PooledWorld) -> PooledWorld:
 
 
 class CloudView(PooledWorldWrapper):
-    """A world whose pictures also show the environment's point cloud, from its camera and from the side.
+    """A world whose pictures also show the environment's point cloud, from the class's camera and from the side.
 
     The cloud has ``count`` points and shows the state of the physics, whatever observations show.
     """
@@ -128,7 +129,7 @@ class CloudView(PooledWorldWrapper):
             part.group.engine.body_poses()  # from now on the engine gives them
 
     def render(self, env_id: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
-        """Return three pictures side by side, (height, 3 width, 3), uint8; arguments as those of ``World.render``."""
+        """Return three pictures side by side, (height, 3 width, 3), uint8; arguments are those of ``World.render``."""
         picture = self._world.render(env_id=env_id, width=width, height=height, camera=camera)
         cloud, eye = self._cloud(env_id)
         views = (draw(cloud, eye, width, height), draw(cloud, beside(eye), width, height))

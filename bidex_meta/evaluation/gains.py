@@ -1,10 +1,11 @@
 """Gains of adaptation: differences between two policies' episodes of the same tasks and starts, with intervals.
 
-The bootstrap resamples runs (seeds), adaptations (a task, or one of several trials of it: its episodes share its luck)
-and, within each, episodes. Intervals over few adaptations are too narrow. We simulated five adaptations of ten episodes
-whose results depended more on the adaptation than on the episode: a nominal 95 % interval held the truth in 81 to 88 %
-of cases, and with three runs in 82 %. If adaptations do not differ, the interval is slightly too wide. With a single
-adaptation, the interval does not cover the results that another adaptation would give.
+The bootstrap resamples runs (seeds), adaptations and, within each adaptation, episodes. An adaptation is one trial of a
+task; the results of its episodes are correlated. Intervals over few adaptations are too narrow. We simulated five
+adaptations of ten episodes whose results depended more on the adaptation than on the episode: a nominal 95 % interval
+contained the true value in 81 to 88 % of cases, and with three runs in 82 %. If adaptations do not differ, the interval
+is slightly too wide. With a single adaptation, the interval does not cover the results that another adaptation would
+give.
 """
 
 from collections.abc import Callable, Mapping
@@ -65,5 +66,5 @@ def _over_classes(means: list[float], resampled: list[np.ndarray], classes: int)
 
 
 def grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return values (groups, episodes per group) from values (n,) and the number of the group of each, (n,)."""
+    """Return values (groups, episodes per group) from values (n,) and the group number of each value (n,)."""
     return values[np.argsort(groups, kind="stable")].reshape(len(np.unique(groups)), -1)

@@ -39,7 +39,7 @@ def entry_name(suite: str, name: str) -> str:
 def sealed(content: Json, kind: type[AnyEntry], where: str) -> Json:
     """Return the content of a new entry with the digest of its evaluation.
 
-    Raises BidexError, which begins with ``where``, if the leaderboard does not take the entry.
+    Raises BidexError, which begins with ``where``, if the leaderboard does not accept the entry.
     """
     content = {**content, "receipt": {**content["receipt"], "evaluation": "0" * 32}}
     entry = parse(content, kind, where, exact=True)
@@ -78,14 +78,14 @@ def _check(entry: AnyEntry, where: str) -> None:
 
 
 def read_entries(folder: Path) -> dict[Path, AnyEntry]:
-    """Read all entries in a folder and its ``trials/``; raise BidexError if one is refused or a policy is in two."""
+    """Read all entries in a folder and its ``trials/``; raise BidexError if one is faulty or two share a policy."""
     entries = {path: read_entry(path) for path in sorted((*folder.glob("*.json"), *folder.glob("trials/*.json")))}
     check_apart(entries)
     return entries
 
 
 def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
-    """Raise BidexError if one policy is in two entries, of any suites, or transferred in two."""
+    """Raise BidexError if two entries, of any suites, have the same policy, or transfer the same policy."""
     known: dict[str, Path] = {}
     for path, entry in entries.items():
         weights = [*entry.receipt.weights]
@@ -100,7 +100,7 @@ def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
 def agent_part(evaluation: MetaTestEvaluation, where: str) -> tuple[int, Part]:
     """Return the evaluation episodes of each task, and the results on test tasks, of an agent's meta-test.
 
-    Raises BidexError, which begins with ``where``, for a meta-test that the leaderboard does not take.
+    Raises BidexError, which begins with ``where``, for a meta-test that the leaderboard does not accept.
     """
     again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
     if evaluation.agent is None or evaluation.suite is None:
@@ -128,13 +128,13 @@ def agent_part(evaluation: MetaTestEvaluation, where: str) -> tuple[int, Part]:
 
 
 def _digest_of(entry: AnyEntry) -> str:
-    """Return the digest of all content of an entry but the digest itself."""
+    """Return the digest of all content of an entry except the digest itself."""
     content = to_builtins(replace(entry, receipt=replace(entry.receipt, evaluation="")))
     return content_digest(content)
 
 
 def content_digest(content: Json) -> str:
-    """Return 32 hexadecimal digits that identify content of JSON."""
+    """Return 32 hexadecimal digits that identify JSON content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 
 

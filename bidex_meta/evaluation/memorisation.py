@@ -17,7 +17,7 @@ _FOLDS = 5
 _GUESSES = 500
 """Guesses of each class, over all of its tasks: their share has a standard error of at most 2.3 points."""
 _RIDGE = 1.0
-"""Weight of the penalty, against standardised observations."""
+"""Weight of the ridge penalty, for standardised observations."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Memorised:
     """Results of the probes for one class."""
 
     named: float
-    """Share of the episodes whose task the better probe names."""
+    """Share of the episodes whose task the better probe guesses correctly."""
     chance: float
-    """That share for a guess: one over the number of tasks."""
+    """The same share for random guesses: one over the number of tasks."""
     explained: float
     """R² of the hidden values, predicted for unseen tasks by the better probe; at most 0 if nothing shows them."""
 

@@ -36,12 +36,12 @@ _ADAPTS = ("init", "adapt_action", "step", "adapt")
 class MetaEvaluation:
     """The results of ``meta_evaluate``."""
 
-    by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
+    by_shot: list[Evaluation]  # results after 0, 1, ..., K shots (or those requested), on equal episodes
     adaptations: dict[str, np.ndarray]
-    """Per class the number from 0 of the adaptation (a trial of a task) that each episode followed, ``(episodes,)``."""
+    """By class, the number, from 0, of the adaptation (a trial of a task) before each episode, ``(episodes,)``."""
     protocol: Protocol  # as played, with the actual number of rollouts and length of the longest exploring episode
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
-    hidden_by_shot: list[Evaluation] | None = None  # the same with rewards hidden, if the protocol asks for that
+    hidden_by_shot: list[Evaluation] | None = None  # results with hidden rewards, if the protocol requests them
 
     @property
     def rollouts(self) -> int:
@@ -50,7 +50,7 @@ class MetaEvaluation:
 
     @property
     def before(self) -> Evaluation:
-        """Return the results without adaptation (or the first results that were asked for)."""
+        """Return the results without adaptation (or the first requested results)."""
         return self.by_shot[0]
 
     @property
@@ -86,15 +86,15 @@ def meta_evaluate(
     references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
     evaluated: Collection[int] | None = None
 ) -> MetaEvaluation:  # fmt: skip
-    """Evaluate an agent before adaptation and after each shot; a shot is exploring episodes of each task and ``adapt``.
+    """Evaluate an agent before adaptation and after each shot.
 
-    Environments that play the same task share one adaptation. If the world has fewer environments than tasks times
-    rollouts, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The world
-    must be reset afterwards. Before adaptation, and with all tasks in the world at once, starts are those of
-    ``evaluate``.
+    A shot consists of exploring episodes of each task and a call of ``adapt``. Environments that play the same task
+    share one adaptation. If the world has fewer environments than tasks times rollouts, its pools of tasks are played
+    in portions (``world.set_tasks``), or a shot takes several rounds. The world must be reset afterwards. If all tasks
+    fit in the world at once, evaluations have the same starts as ``evaluate``.
 
     Args:
-        agent: A MetaLearningAgent; with no shots any Agent.
+        agent: A MetaLearningAgent, or any Agent if there are no shots.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
         shots: Adaptation rounds; None: those of ``protocol``.
         protocol: The tasks and episodes to play.
@@ -174,7 +174,10 @@ def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgen
 
 
 def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps: int, seed: int) -> int:
-    """Play a shot: ``rollouts`` exploring episodes of each task, then ``adapt``; return its valid transitions."""
+    """Play a shot: ``rollouts`` exploring episodes of each task, then ``adapt``.
+
+    Returns the number of valid transitions.
+    """
     obs, _ = world.reset(seed=seed)
     remaining = quota(world, rollouts)
     first = True
@@ -194,7 +197,7 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
 
 @torch.no_grad()
 def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: Tensor, max_steps: int) -> int:
-    """Play an exploring episode in each environment of ``playing`` for the agent; return its valid transitions."""
+    """Play an exploring episode in each environment of ``playing``; return the number of valid transitions."""
     limit = world.max_episode_steps.clamp(max=max_steps)
     running = playing.clone()
     steps = torch.zeros((), dtype=torch.int64, device=playing.device)

@@ -1,9 +1,9 @@
-"""Success and return of a policy per class, over a fixed number of whole episodes of every task, by the mean action.
+"""Evaluation of a policy's mean action: success and return per class, over the same number of episodes of each task.
 
-A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. An episode is a success
-if it was solved at any step, or in its last steps, as the suite says; both are reported. Its return is the sum of the
-unscaled reward. An episode of broken physics is no success and counts with the return of random actions, or its own if
-that is lower.
+A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. The suite decides
+whether an episode is a success when it was solved at any step, or only when it was solved in its last steps; both
+measures are reported. The return of an episode is the sum of its unscaled rewards. An episode whose physics broke is a
+failure. It counts with the return of random actions, or with its own return if that is lower.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,15 +34,16 @@ def evaluate(
     agent: Agent, world: TaskWorld, episodes_per_task: int | None = None, *, seed: int | None = None,
     protocol: Protocol = DEFAULT, references: Mapping[str, Reference] | None = None
 ) -> Evaluation:  # fmt: skip
-    """Play every task of ``world`` equally often, from the starts of the protocol's seed, and report per class.
+    """Play every task of ``world`` equally often, with starts from the protocol's seed, and return results per class.
 
     The world must be in autoreset mode DISABLED and have at least one environment for each task. Environments that
-    share a task share its episodes. ``episodes_per_task`` (4) and ``seed`` (``EVALUATION_SEED``, as in the commands)
-    replace those of ``protocol``. ``references``, by class, define the normalised score and the return of broken
-    episodes; the default is the references that the installation stores for the world's classes.
+    share a task share its episodes. If given, ``episodes_per_task`` and ``seed`` replace those of ``protocol``, which
+    are 4 and ``EVALUATION_SEED`` by default, as in the commands. ``references``, by class, define the normalised score
+    and the return of broken episodes; the default is the references that the installation stores for the world's
+    classes.
 
-    Raises BidexError if the world resets by itself or lacks environments, a number is out of range, the protocol names
-    fewer tasks than all, or torch's default precision is not single.
+    Raises BidexError if the world resets by itself or has too few environments, if a number is out of range, if the
+    protocol limits the number of tasks, or if torch's default precision is not single.
     """
     protocol = protocol.changed(episodes_per_task=episodes_per_task, seed=seed)
     if protocol.tasks is not None:
@@ -63,7 +64,7 @@ def play_tasks(
 ) -> Episodes:  # fmt: skip
     """Play ``episodes_per_task`` episodes of every task, as ``evaluate`` does, and return arrays ``(episodes,)``.
 
-    An agent that has ``observe`` is shown each step with its reward, unless ``hidden_rewards``.
+    If the agent has ``observe``, it is called after each step with the reward, unless ``hidden_rewards`` is set.
 
     The arrays are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule),
     ``once`` (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world
@@ -89,7 +90,7 @@ def play_tasks(
 
 
 def joined_episodes(parts: Sequence[Episodes]) -> Episodes:
-    """Return the episodes of several results of ``play_tasks`` as one."""
+    """Join the episodes of several results of ``play_tasks`` into one result."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -137,7 +138,7 @@ def _play(
     playing: torch.Tensor,
     observe: Callable[[Timestep], None] | None,
 ) -> dict[str, torch.Tensor]:
-    """Play an episode in each environment of ``playing``; return results as ``play_tasks``, for these environments."""
+    """Play an episode in each environment of ``playing``; return the results of these, as ``play_tasks`` does."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
@@ -187,7 +188,10 @@ class ZeroAgent:
 
 
 class RandomAgent:
-    """An agent of uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
+    """An agent that draws uniform actions from the world's batched space, ``(num_envs, action)``.
+
+    The actions are the same on every device.
+    """
 
     @checked_arguments
     def __init__(self, action_space: Box, seed: Seed = 0):

@@ -1,4 +1,4 @@
-"""Portions of a world's tasks, of equal size, that fit its environments, for the meta-test.
+"""Division of a world's tasks into portions of equal size that fit in its environments, for the meta-test.
 
 Each adaptation (a trial of a task) takes one environment per rollout. The last portion is filled up with the first
 adaptations, which are played once more and not counted, so that every portion groups the environments in the same way.
@@ -23,10 +23,11 @@ def task_of_row(world: TaskWorld) -> Tensor:
 
 
 class Portions:
-    """Groups of adaptations, to the first ``tasks`` of each pool (None: all) in all trials, that are played together.
+    """Groups of adaptations that are played together.
 
-    ``rollouts`` is the number of episodes of each task in a shot; None stands for one episode in each environment of
-    the task, with all tasks at once. All numbers are at least 1. The world is not changed.
+    Each of the first ``tasks`` of each pool (None: all) has one adaptation in each trial. ``rollouts`` is the number of
+    episodes of each task in a shot; None stands for one episode in each environment of the task, with all tasks played
+    at once. All numbers are at least 1. The world is not changed.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
@@ -42,7 +43,7 @@ class Portions:
 
     @contextmanager
     def applied_to(self, worlds: Sequence[TaskWorld]) -> Iterator[Iterator[int]]:
-        """Yield an iterator over the portions' numbers that gives each portion's tasks to all worlds.
+        """Yield an iterator over the portions' numbers; each of its steps sets a portion's tasks in all worlds.
 
         Afterwards all worlds have their own pools again. Raises BidexError for a world whose tasks cannot be set, or
         whose pools have other lengths.

@@ -1,8 +1,9 @@
 """Reference returns, which define the normalised score and the return of episodes with broken physics.
 
-References were measured with moving bases, as in every suite. ``assets/references/`` holds returns of random actions
-and of zero actions (the better of which scores 0), of experts (``python -m tools.experts`` writes them), of witnesses
-in open-loop replay and of scripted policies. ``bidex-meta baseline`` measures all of them except experts.
+References were measured with moving bases, as in every suite. ``assets/references/`` holds mean returns of random
+actions, of zero actions, of experts, of witnesses in open-loop replay and of scripted policies. The better of random
+and zero actions scores 0. ``python -m tools.experts`` writes the returns of experts; ``bidex-meta baseline`` measures
+the others.
 """
 
 from dataclasses import dataclass, replace
@@ -69,12 +70,12 @@ def counted_returns(
 
 
 def load(kind: Kind) -> dict[str, Json]:
-    """Read the installed references by class, such as ``{"return": 0.49, "source": ...}``; empty without a file."""
+    """Read the installed references by class, each like ``{"return": 0.49, "source": ...}``; empty without a file."""
     return load_from(paths.assets_dir() / "references" / f"{kind}.json")
 
 
 def store(path: Path, classes: dict[str, Json], made: Json) -> None:
-    """Write references (``return`` and other measures, by class); the file's references of other classes stay.
+    """Write references (``return`` and other measures, by class); the file's references of other classes are kept.
 
     ``made`` describes the measurement and is stored with each class. Raises BidexError if the file does not hold
     references.
@@ -102,7 +103,7 @@ def load_from(path: Path) -> dict[str, Json]:
 
 
 def references() -> dict[str, Reference]:
-    """Return the references of every class with a return of random actions, without experts below the floor."""
+    """Return the references of each class that has a return of random actions; experts below the floor are left out."""
     experts = _returns("expert")
     zero = _returns("zero")
     known = {}

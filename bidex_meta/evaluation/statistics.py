@@ -16,7 +16,7 @@ Statistic = Callable[..., np.ndarray]
 """Maps one array of shape ``(resamples, n, ...)`` per sample to values of shape ``(resamples,)``."""
 
 NONE = "–"
-"""Stands in tables for a value that is not there."""
+"""Text in tables for a missing value."""
 
 
 RESAMPLES = 2000
@@ -136,7 +136,7 @@ def iqm_over_seeds(values: np.ndarray) -> Estimate:
 
 
 def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
-    """Return the interquartile mean of ``a`` minus that of ``b``, each (seeds, classes); both resample their seeds."""
+    """Return the interquartile mean of ``a`` minus that of ``b``, both (seeds, classes), with their seeds resampled."""
     return estimate(lambda a, b: _iqm_of_tables(a) - _iqm_of_tables(b), a, b)
 
 

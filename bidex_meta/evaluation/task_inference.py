@@ -65,7 +65,7 @@ def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
 def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
     """Estimate the share of unseen tasks that one final state can solve at best; 1 if nothing is hidden.
 
-    It is the most that a policy without knowledge of the hidden parts can reach if success counts at the end. The state
+    This is the highest success of a policy that does not know the hidden parts, if success counts at the end. The state
     is chosen on ``draws`` tasks and scored on others: the best of many states would look too good on the tasks that
     choose it.
     """
@@ -85,7 +85,7 @@ def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
 def listed_ceiling(task: TaskClass, tasks: np.ndarray) -> float:
     """Compute the largest share of the given tasks (n, size) that one final state solves; 1 if nothing is hidden.
 
-    The candidates are each task's own goal and the points midway between two goals, where the goals of listed tasks
+    The candidates are each task's own goal and the points midway between two goals, where the tolerances of these goals
     overlap most. All hidden parts of a task must be solved together, so goals that vary together stay together.
     """
     space = task.variation_space
@@ -108,7 +108,10 @@ def _solved(part: Hidden, values: Tensor, centre: Tensor) -> float:
 
 
 def distances(part: Hidden, values: Tensor, centre: Tensor) -> Tensor:
-    """Return distances (n,) of hidden values (n, k) from (k,) or (n, k): m, rad, or 0 and infinity for a sign."""
+    """Return distances (n,) of hidden values (n, k) from ``centre`` (k,) or (n, k), in m or rad.
+
+    For a sign the distance is 0 or infinity.
+    """
     if part.kind == "sign":
         return torch.where((values < 0.0) == (centre < 0.0), 0.0, math.inf)[:, 0]
     if part.kind == "orientation":
@@ -175,7 +178,7 @@ def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, T
 
 
 class _EachWith(TaskState):
-    """States of T steps (T, s), each combined with every one of k variations: (T k, ...), step by step."""
+    """States of T steps (T, s), each combined with each of k variations; values are (T k, ...), ordered by step."""
 
     def __init__(self, sensors: Tensor, scene: Scene, frozen: dict[str, Tensor], k: int) -> None:
         super().__init__(sensors, scene.sensors, {n: v.repeat(len(sensors), 1) for n, v in frozen.items()})

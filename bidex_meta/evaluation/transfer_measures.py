@@ -18,7 +18,7 @@ def area(steps: np.ndarray, success: np.ndarray, end: float) -> float:
     """Return the mean success over the environment steps 0 to ``end``, by the trapezoid rule.
 
     Evaluations are at rising ``steps`` (n,), n > 0, with ``success`` (n,) in [0, 1]. Success before the first
-    evaluation is taken to equal the first, and success after the last to equal the last.
+    evaluation is taken to equal the first, and success after the last evaluation to equal the last.
     """
     grid = np.unique(np.concatenate([[0.0, end], steps[steps < end]]))
     return float(np.trapezoid(np.interp(grid, steps, success), grid) / end)
@@ -35,7 +35,7 @@ def steps_to(steps: np.ndarray, success: np.ndarray, level: float = 0.5) -> int 
 
 
 def median_steps(counts: Sequence[int | None]) -> int | None:
-    """Return the median, the larger middle value of an even count; None counts as more steps than any number."""
+    """Return the median (the larger middle value if the count is even); None counts as larger than any number."""
     ranked = sorted(counts, key=lambda steps: np.inf if steps is None else steps)
     return ranked[len(ranked) // 2]
 
@@ -77,7 +77,7 @@ def over_seeds(of_seeds: list[float]) -> Json:
 
 
 def add_over_nothing(rows: Sequence[Json], measure: str) -> None:
-    """Add the difference from the same runs trained from scratch to each row; seeds of both are resampled."""
+    """Add to each row the difference from the row of the same runs from scratch; seeds of both are resampled."""
     alone = {(row["class"], row.get("demonstrations")): row for row in rows if row["from"] == NOTHING}
     for row in rows:
         other = alone.get((row["class"], row.get("demonstrations")), row)

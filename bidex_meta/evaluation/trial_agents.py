@@ -1,4 +1,4 @@
-"""Agents of one's own (``TrialAgent``) in the calls of the meta-test."""
+"""Adapter that gives a user's own agent (``TrialAgent``) the methods that the meta-test calls."""
 
 import copy
 
@@ -10,14 +10,14 @@ from bidex_meta.errors import BidexError, one_line
 
 
 def adapting(agent: TrialAgent | Agent) -> Agent:
-    """Return an agent in the calls of the meta-test: a copy of a ``TrialAgent``, any other agent as it is."""
+    """Return an agent with the meta-test's methods: a ``TrialAgent`` as a copy in an adapter, any other unchanged."""
     if isinstance(agent, TrialAgent) and not hasattr(agent, "adapt_action"):
         return AdaptingTrialAgent(_copied(agent))
     return agent  # pyright: ignore[reportReturnType]
 
 
 class AdaptingTrialAgent:
-    """A ``MetaLearningAgent`` made of a ``TrialAgent``: exploring episodes teach it, evaluations play on a copy."""
+    """A ``MetaLearningAgent`` made of a ``TrialAgent``: it learns in exploring episodes, copies act in evaluations."""
 
     def __init__(self, agent: TrialAgent) -> None:
         self._agent = agent
@@ -28,7 +28,7 @@ class AdaptingTrialAgent:
         """Do nothing: each environment learns from its own episodes."""
 
     def init(self) -> None:
-        """Forget all trials at the next ``reset``, which tells the number of environments."""
+        """Forget all trials at the next ``reset``, whose mask has the number of environments."""
         self._is_fresh = True
 
     def reset(self, env_mask: Tensor) -> None:

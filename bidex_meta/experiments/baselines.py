@@ -36,7 +36,7 @@ def baseline(
         episodes: Episodes of each task.
         seed: Seed of tasks, starts and actions.
         threads: Threads of the physics; None: one per core.
-        out: JSON file that takes the figures, beside those of other classes.
+        out: JSON file that the figures are written to; figures of other classes in it are kept.
 
     Raises BidexError for bad input, before anything is measured.
     """

@@ -1,4 +1,4 @@
-"""Cards of what is published, README.md with the hub's header in YAML, made from a folder alone."""
+"""Cards of published runs and data sets: README.md with the hub's header in YAML, made only from the folder's files."""
 
 import json
 
@@ -73,7 +73,7 @@ def _card(header: Json, title: str, use: str, facts: Json) -> str:
 
 
 def _cell(value: object) -> str:
-    """Format a value for a table of Markdown; names in metadata may be anybody's."""
+    """Format a value as a cell of a Markdown table; strangers may have chosen the names in metadata."""
     return one_line(value).replace("|", "\\|")
 
 

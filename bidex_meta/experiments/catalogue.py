@@ -1,4 +1,4 @@
-"""Tasks, hidden parts, algos and objects as rows, read without torch and mujoco."""
+"""Rows of the lists of tasks, hidden parts, learners and objects. Learners are read without torch and MuJoCo."""
 
 import ast
 import importlib.util

@@ -32,12 +32,15 @@ def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
 
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
-    """Return how a run's record differs from this installation and the run's own worlds (``worlds`` if known)."""
+    """Return the differences between a run's record and this installation with the run's worlds.
+
+    ``worlds`` are the run's worlds; None: they are opened from the run's config.
+    """
     return differences(versions_of(folder), conditions(worlds or open_worlds(folder.config().to_json())))
 
 
 def say_differences(folder: RunFolder) -> None:
-    """Say in one line how a run's record differs from this installation and its suite, if it does."""
+    """Log in one line how a run's record differs from this installation and the run's suite, if it does."""
     try:
         found = differences_of(folder)
     except BidexError:
@@ -47,7 +50,7 @@ def say_differences(folder: RunFolder) -> None:
 
 
 def check_worlds_of(folder: RunFolder, worlds: Worlds, mend: str) -> None:
-    """Say how a run's record differs, and raise BidexError, with ``mend``, if its worlds are no longer the same."""
+    """Log how a run's record differs; raise BidexError, with the advice ``mend``, if the run's worlds have changed."""
     found = differences_of(folder, worlds)
     of_worlds = [difference for difference in found if difference.is_of_worlds]
     if of_worlds:

@@ -1,4 +1,4 @@
-"""A control of adaptation: a policy adapts to a held-out task's own data, and to data of other tasks."""
+"""Control experiment of adaptation: a policy adapts to a held-out task's own data, and to data of other tasks."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,15 +22,15 @@ from bidex_meta.worlds import open_worlds
 
 @dataclass(frozen=True)
 class ControlResult:
-    """Result of a control over all runs."""
+    """Result of the control experiment over all runs."""
 
-    runs: list[str]  # their folders
+    runs: list[str]  # the runs' folders
     title: str  # learner and suite
     shots: int
     trials: int
     rollouts: int  # episodes of each task in a shot
-    episodes: dict[str, int]  # of an arm, by class
-    classes: dict[str, dict[str, Json]]  # by class and arm, as of ``arms``
+    episodes: dict[str, int]  # evaluation episodes of one arm, by class
+    classes: dict[str, dict[str, Json]]  # results by class and arm, from ``arms``
 
     def to_json(self) -> Json:
         """Return the result with plain values, ready for JSON."""
@@ -48,7 +48,7 @@ def control_runs(
     folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
     seed: int, device: str, engine: str
 ) -> ControlResult:  # fmt: skip
-    """Play all arms of runs that differ only in the seed.
+    """Play all arms of the control, own data and data of other tasks, for runs that differ only in the seed.
 
     Args:
         folders: Runs of a learner that adapts, on a suite whose classes are in both splits.

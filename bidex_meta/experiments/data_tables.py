@@ -42,7 +42,7 @@ def description(dataset: Dataset) -> Json:
 
 
 def origin_lines(found: Json) -> list[str]:
-    """Return lines of text about a description's sizes and origin."""
+    """Return lines of text about sizes and origin, from the result of :func:`description`."""
     policies = found.get("policies", [])
     acted = ", ".join(f"{policy.get('algo') or 'uniform'} ({policy.get('actions')} actions)" for policy in policies)
     left_out = found.get("left_out", {})
@@ -56,7 +56,7 @@ def origin_lines(found: Json) -> list[str]:
 
 
 def class_row(slot: Json) -> Json:
-    """Return a row of text about one class of a description."""
+    """Return a row of text about one class, from the entry ``classes`` of :func:`description`."""
     return {
         "class": slot["name"],
         "episodes": slot["episodes"],
@@ -71,7 +71,7 @@ def class_row(slot: Json) -> Json:
 
 
 def coverage_lines(spread: Json) -> list[str]:
-    """Return lines of text about a description's ``coverage``."""
+    """Return lines of text about the entry ``coverage`` of :func:`description`."""
     groups = ", ".join(f"{name} {value:.3g}" for name, value in spread["observation_std"].items())
     at_bounds = f"{100 * spread['action_at_bounds']:.1f} % at a bound"
     return [

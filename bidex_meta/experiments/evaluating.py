@@ -49,7 +49,7 @@ class PlayedTasks:
     """Seed of the episodes' starts."""
     policy: Evaluation
     random: Evaluation | None
-    """A random policy on the same tasks, if that was asked for."""
+    """The evaluation of a random policy on the same tasks, if it was requested."""
 
     @property
     def success(self) -> float:
@@ -76,7 +76,7 @@ class RunEvaluation:
     """Environment steps that the policy was trained for."""
     own: PlayedTasks
     others: PlayedTasks | None
-    """The evaluation on tasks that the run was not trained on, if that was asked for."""
+    """The evaluation on tasks that the run was not trained on, if it was requested."""
     conditions: Conditions
 
     @property
@@ -105,12 +105,12 @@ class RunMetaTest:
     """The result of :func:`meta_test`."""
 
     run: RunFolder | None
-    """The run; None for an agent of the caller's."""
+    """The run; None for the caller's own agent."""
     algo: str
     """Name of the learner, or of the agent's class."""
     worlds: Worlds
     steps: int | None
-    """Environment steps that the learner was meta-trained for; None for an agent of the caller's."""
+    """Environment steps that the learner was meta-trained for; None for the caller's own agent."""
     seed: int
     splits: dict[str, MetaEvaluation]
     """Results before and after adaptation by split: ``train``, ``test`` or ``others``."""
@@ -141,19 +141,19 @@ class FinalEvaluation:
     """The evaluation at the end of training."""
 
     episodes: Few | None = None
-    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
-    that adapt play --rollouts episodes."""
+    """Episodes of each task in the final evaluation. None: 4, or 1 if a task has a fixed start (metaworld/...); for
+    learners that adapt, the number of --rollouts."""
     other_tasks: Switch = False
     """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
     others."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
-    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
-    on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 2.
-    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
-    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
-    hidden_rewards: Switch = False  # That evaluation is also played with its rewards hidden.
+    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks (on
+    ML20, tasks of fifteen train classes and of five unseen classes). others: tasks of the train classes that the run
+    was not trained on."""
+    shots: Shots | None = None  # Adaptation rounds of the final evaluation, one after the other. None: 2.
+    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, but at most 40.
+    tasks: Count | None = None  # Tasks of each class in the final evaluation, the first of its pool. None: 5.
+    hidden_rewards: Switch = False  # Also repeat the final evaluation's episodes with hidden rewards.
 
     def check(self, config: AnyConfig) -> None:
         """Raise BidexError for a bad value, or for an option that the learner of a resolved config does not support."""
@@ -173,7 +173,7 @@ class FinalEvaluation:
                 )
 
     def play(self, run: RunFolder, config: AnyConfig) -> "RunEvaluation | RunMetaTest":
-        """Evaluate a run on the device of its training, and write its ``evaluation.json``."""
+        """Evaluate a run on the device that it was trained on, and write its ``evaluation.json``."""
         device = launch().own_device(config.device)
         if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
             return meta_test(
@@ -205,24 +205,24 @@ def evaluate(
     engine: str = "auto",
     save: bool = False,
 ) -> RunEvaluation:
-    """Evaluate a run's policy, by its mean action, with the same number of episodes of every task.
+    """Evaluate the mean action of a run's policy, with the same number of episodes of every task.
 
     Args:
         run: The run's folder.
-        split: ``train``, the tasks that it was trained on (with ``tasks_per_class`` 0, tasks that training never
-            draws), or a meta suite's ``test`` tasks.
+        split: ``train``: the tasks that the run was trained on (with ``tasks_per_class`` 0, tasks that training never
+            draws); ``test``: the test tasks of a meta suite.
         checkpoint: ``last``, ``best`` or a file.
-        random: Whether a random policy plays the same tasks.
-        other_tasks: Whether the policy also plays the same number of tasks that no run was trained on.
-        episodes: Episodes of each task; None: 4, or 1 where a task fixes its start.
+        random: Whether a random policy is also evaluated on the same tasks.
+        other_tasks: Whether the policy is also evaluated on the same number of tasks that no run was trained on.
+        episodes: Episodes of each task; None: 4, or 1 if a task has a fixed start.
         num_envs: Environments stepped together, a multiple of the number of tasks; None: one per task.
         seed: Seed of the episodes' starts; training does not use the default.
-        randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
+        randomisation: A TOML file with the randomisation of the worlds (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
         save: Whether the result is written to the run's ``evaluation.json``.
 
-    Raises BidexError for a run without such a checkpoint or split, and for learners that adapt (:func:`meta_test`).
+    Raises BidexError for a run without such a checkpoint or split, and for learners that adapt: call :func:`meta_test`.
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
@@ -272,22 +272,22 @@ def meta_test(
     """Evaluate an agent before and after it adapts to tasks.
 
     Args:
-        agent: A run's folder, of a learner that adapts; or an agent, ``TrialAgent`` or ``MetaLearningAgent``.
-        suite: For an agent: name or file of a suite that hides its goals. A run has its own.
+        agent: The folder of a run whose learner adapts; or your own agent, a ``TrialAgent`` or ``MetaLearningAgent``.
+        suite: For an agent: name or file of a suite that hides its goals. A run has its own suite.
         split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), or ``auto`` for
             train and test.
         checkpoint: For a run: ``last``, ``best`` or a file.
         shots: Adaptation rounds, one after the other; None: 2.
-        rollouts: Episodes of each task in a shot; None: as in training, 40 at most, else 10.
+        rollouts: Episodes of each task in a shot; None: as in training, but at most 40; 10 for an agent.
         episodes: Evaluation episodes of each task; None: the number of rollouts.
-        tasks: Tasks of each class, the first of its pool; None: 5.
-        trials: Number of adaptations to each task, each from the unadapted agent and with new episodes; None: as many
-            as give five or more per class.
+        tasks: Number of tasks of each class, the first ones of the class's pool; None: 5.
+        trials: Number of adaptations to each task, each from the unadapted agent and with new episodes; None: enough
+            for five adaptations per class.
         num_envs: Maximum number of environments stepped together; None: 1024.
         seed: Seed of the episodes' starts; training does not use the default.
         task_seed: For an agent: seed that draws the tasks, as in ``Benchmark(suite, task_seed)``; None: 0.
         hidden_rewards: Whether the evaluation episodes are also played with their rewards hidden.
-        randomisation: A TOML file by which the worlds are randomised (docs/randomisation.md).
+        randomisation: A TOML file with the randomisation of the worlds (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
         save: Whether the result is written to the run's ``evaluation.json``; for an agent, call ``result.save(path)``.
@@ -341,7 +341,7 @@ def _worlds_of(suite: str, seed: int, device: str, engine: str, randomisation: s
 
 
 def _randomised(worlds: Worlds) -> Json | None:
-    """Return the randomisation of some worlds; None without one."""
+    """Return the randomisation of worlds as a dict; None if there is none."""
     if worlds.randomisation is None:
         return None
     return asdict(worlds.randomisation)
@@ -352,7 +352,7 @@ def _opened(run: RunFolder | str | Path) -> RunFolder:
 
 
 def _set_up(folder: RunFolder, device: str, engine: str, randomisation: str | Path | None) -> tuple[AnyConfig, Worlds]:
-    """Return the run's config with the device and engine to evaluate with, and its worlds."""
+    """Return the run's config with the device and engine to evaluate with, and the run's worlds."""
     stored = folder.config()
     device = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=engine)

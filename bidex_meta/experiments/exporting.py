@@ -23,9 +23,9 @@ from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.worlds import open_worlds
 
 TOLERANCE = 1e-5
-"""Largest allowed difference of an action from torch's."""
+"""Largest allowed difference between an action of the file and torch's action."""
 ROWS = 256
-"""Random observations of the check; the export itself uses another number."""
+"""Number of random observations in the check; the export itself uses another number."""
 _SHAPE = dict[str, Any]
 
 
@@ -35,11 +35,12 @@ class Export:
 
     path: Path
     size: int
-    """Bytes of the file."""
+    """Size of the file, bytes."""
     gap: float
-    """Largest difference of an action from torch's in float32."""
+    """Largest difference between the file's actions and torch's actions in float32."""
     gap_as_played: float
-    """Largest difference from the policy as it computes on this machine, which may be in bfloat16."""
+    """Largest difference between the file's actions and the policy's actions on this machine, which may use
+    bfloat16."""
 
 
 def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last") -> Export:

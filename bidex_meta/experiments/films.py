@@ -1,4 +1,4 @@
-"""Draw a picture or a film of a policy at work into a file."""
+"""Draw a picture or a film of an acting policy into a file."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ class Film:
 
     out: Path
     seed: int = 0
-    steps: int | None = None  # None: none for a picture, one episode for a film, with ``tiled`` the longest one
+    steps: int | None = None  # None: 0 for a picture, one episode for a film (if ``tiled``, the longest)
     tiled: bool = False
-    large: bool = False  # with ``tiled``: one environment at a time large beside all
-    every: int | None = None  # steps per frame; None: 1, with ``tiled`` 2
-    width: int | None = None  # pixels, of a tile with ``tiled``; None: 640, with ``tiled`` 240
+    large: bool = False  # if ``tiled``: also show one environment at a time enlarged
+    every: int | None = None  # steps per frame; None: 1, or 2 if ``tiled``
+    width: int | None = None  # pixels, of a tile if ``tiled``; None: 640, or 240 if ``tiled``
     height: int | None = None  # None: three quarters of the width
     camera: str | None = None
     points: bool = False  # also draw the environment's point cloud
@@ -51,7 +51,10 @@ class Film:
         video.check_films()
 
     def write(self, agent: Agent, world: PooledWorld, rows: Sequence[int]) -> None:
-        """Let an agent act in a world (mode DISABLED) and draw some environments, without ``tiled`` the first one."""
+        """Let an agent act in a world (mode DISABLED) and draw the environments ``rows``.
+
+        Without ``tiled`` only the first environment is drawn.
+        """
         if self.points:
             world = with_clouds(world)
         if self.steps is not None:

@@ -16,17 +16,17 @@ from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, refuse_links
 from bidex_meta.utils.files import absolute, exists, is_file, portable, read_json
 
 FOLDER = "folder:"
-"""Begins a name that is no repository of the Hugging Face Hub but a folder of this machine."""
+"""Prefix of a name that is a folder of this machine, not a repository of the Hugging Face Hub."""
 DATASETS = "datasets/"
-"""Begins the name of a data set's repository, as in the hub's addresses."""
+"""Prefix of the name of a data set's repository, as in the hub's addresses."""
 OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "metrics.jsonl", "policy.onnx", "checkpoints/*.pt")
 OF_DATA = ("data/metadata.json", "data/*.hdf5")
 SUITES = "*.toml"
-"""Suite files of the user's own; the file is published with the run that was trained on the suite."""
+"""Pattern of users' own suite files; such a file is published with the run that was trained on the suite."""
 CARD = "README.md"
 _METADATA = f"data/{part_files.METADATA}"
 Files = Mapping[str, Path | bytes]
-"""Published files by their path within the folder: a file, or its content."""
+"""Published files by their path within the folder; a value is a file's path, or the file's content."""
 
 
 def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) -> dict[str, Path]:
@@ -47,7 +47,7 @@ def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) 
 
 
 def checked(folder: Path) -> RunFolder | Dataset:
-    """Return the run or the data set in a folder, after reading everything that is published of it.
+    """Return the run or the data set in a folder, after reading all files that are published.
 
     Raises BidexError if ``bidex-meta evaluate`` or ``bidex-meta data info`` would raise it.
     """
@@ -70,7 +70,7 @@ def checked(folder: Path) -> RunFolder | Dataset:
 
 
 def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes]:
-    """Return the files of a checked folder as published: without paths of this machine, with a user's suite file."""
+    """Return a checked folder's files for publication, without paths of this machine and with a user's suite file."""
     content: dict[str, Path | bytes] = dict(files)
     for name in files.keys() & {"config.json", "versions.json", "evaluation.json"}:
         found = read_json(files[name], "a file of a run")
@@ -87,9 +87,9 @@ def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder beside ``path``, which is renamed to it once all within has succeeded.
+    """Yield an empty folder next to ``path``, and rename it to ``path`` when the block has succeeded.
 
-    Files that a killed process left are deleted. Raises BidexError if ``path`` is not empty.
+    Files that a killed process left there are deleted. Raises BidexError if ``path`` is not empty.
     """
     if exists(path) and not (path.is_dir() and not any(path.iterdir())):
         raise BidexError(f"{path} exists and is not empty. Name another, or delete it.")
@@ -141,7 +141,7 @@ def library() -> Any:
 
 
 def called(function: str, name: str, **options: Any) -> Any:
-    """Call the library for a repository (``datasets/NAME`` of a data set); raise its errors as one line."""
+    """Call a function of the library for a repository (``datasets/NAME`` for data sets); raise errors as one line."""
     if name.startswith(DATASETS):
         kind = "dataset"
     else:

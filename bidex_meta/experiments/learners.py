@@ -48,7 +48,8 @@ ALGOS: dict[str, str] = {
 USUAL_SETTINGS = (
     "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "updates_per_step",
 )  # fmt: skip
-"""Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those of its learner."""
+"""Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those that the learner
+has."""
 
 
 @dataclass(frozen=True)
@@ -60,18 +61,18 @@ class LearnerKind:
     presets: Mapping[str, Any]  # configs by name, all of one dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
-        """Return the autoreset mode of the world that the learner trains on, for fields of its config."""
+        """Return the autoreset mode of the learner's training world; ``config`` has fields of the learner's config."""
         config_type = type(next(iter(self.presets.values())))
         return self.make.autoreset_mode(config_type(**config))
 
 
 def learner_class(name: str) -> type[Learner]:
-    """Return the class of a learner by its name; names and errors as of :func:`learner_kind`."""
+    """Return the class of a learner by its name; names and errors are those of :func:`learner_kind`."""
     return learner_kind(name).make
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
-    """Return the learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; else raise BidexError.
+    """Return a learner by its name in ``ALGOS``, ignoring case, or by ``package.module:Class``; else raise BidexError.
 
     A learner may have special presets for a single ``task``.
     """
@@ -91,7 +92,10 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 
 
 def _from_elsewhere(name: str) -> type[Learner]:
-    """Return a learner by ``package.module:Class``, with defaults of :class:`Learner` and its module's ``PRESETS``."""
+    """Return a user's own learner by ``package.module:Class``.
+
+    Attributes that the class does not define come from :class:`Learner`, and presets from ``PRESETS`` in its module.
+    """
     make, module = outside_class(name, "--algo")
     if issubclass(make, Learner):
         bases = (make,)

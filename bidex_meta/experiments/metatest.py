@@ -17,7 +17,7 @@ from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
-# episodes of a task in a shot where the config has none; the most taken from it
+# default episodes of a task in a shot, if the config sets no number; the largest number taken from a config
 _ROLLOUTS = 10
 _MOST_ROLLOUTS = 40
 _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
@@ -28,14 +28,15 @@ class Options:
     """Options of a meta-test or an evaluation: its tasks, episodes and environments."""
 
     episodes: Few | None = None
-    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
-    many as --rollouts."""
+    """Episodes of each task; None: 4, or 1 if a task has a fixed start (metaworld/...); for learners that adapt, the
+    number of --rollouts."""
     shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, at most 40, else 10.
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, but at most 40; else 10.
     tasks: Few | None = None  # Number of tasks of each class to adapt to, the first of its pool; None: 5.
     trials: Few | None = None
-    """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or as many as
-    give five adaptations per class, because the episodes of one adaptation show nothing about other adaptations."""
+    """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or enough for
+    five adaptations per class. Several are needed because the episodes after one adaptation show nothing about other
+    adaptations."""
     num_envs: Environments | None = None
     """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
     class). For learners that adapt, the maximum number, which bounds memory but does not alter the protocol; None:
@@ -143,10 +144,11 @@ def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Return the number of environments with which the largest number of adaptations is played at once.
+    """Return the number of environments that allows the largest number of simultaneous adaptations.
 
-    There are ``adaptations`` (tasks times trials) per class. Each takes ``rollouts`` environments, or several rounds in
-    fewer environments. ``limit`` is the maximum number of environments, but each class gets at least one.
+    There are ``adaptations`` (tasks times trials) per class. Each adaptation takes ``rollouts`` environments, or
+    several rounds in fewer environments. ``limit`` is the maximum number of environments, but each class gets at least
+    one.
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:

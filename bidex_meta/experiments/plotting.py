@@ -15,7 +15,7 @@ from bidex_meta.utils.arguments import checked_arguments
 def plot(runs: Sequence[RunFolder | StoredRun | str | Path], out: str | Path) -> Path:
     """Draw return and success of every task against environment steps into ``out``, and return its path.
 
-    Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs. The ending of ``out``
+    Runs that differ only in the seed are one line, with the 95 % bootstrap interval over runs. The suffix of ``out``
     decides the format (``.png``, ``.svg``, ``.pdf``). Raises BidexError if a run has no metrics or ``out`` cannot be
     written.
     """

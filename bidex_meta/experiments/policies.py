@@ -27,8 +27,8 @@ def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> t
     Differences between the run's record and this installation or the run's suite are printed, unless they were
     ``noted`` before.
 
-    ``which`` is ``last`` (the newest), ``best`` (its state only holds the policy), or a file, by its path or by its
-    name in the run's folder of checkpoints.
+    ``which`` is ``last`` (the newest), ``best`` (its state has only the policy), or a file: a path, or a name in the
+    run's folder of checkpoints.
     """
     loaded = _loaded(folder, which)
     if not noted:

@@ -61,31 +61,33 @@ class RecordConfig:
     """A data set to record, for example ``RecordConfig("random", task="CatchUnderarm", size=10_000)``."""
 
     kind: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(RUNS))]
-    """random: uniform actions; medium, expert: the policy of one run; medium-expert: of two runs, half each; replay:
-    the transitions that `bidex-meta run --record N` stored; demonstrations: successful replays of the class's witness,
-    a stored reference solution (see --starts)."""
+    """random: uniform actions; medium, expert: the policy of one run; medium-expert: the policies of two runs, half of
+    the data each; replay: the transitions that `bidex-meta run --record N` stored; demonstrations: successful replays
+    of the class's witness, a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders. The kind decides how many."""
-    suite: str | None = None  # random: suite to play, a name or path of a TOML file; otherwise the run's own is played.
-    task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
-    base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
+    suite: str | None = None  # random: suite to act in, a name or a TOML file; else the run's own suite.
+    task: str | None = None  # random: class to act in, instead of a suite; demonstrations: class of the witness.
+    base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class defines it.
     size: Steps = 0
-    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4; a few more, since episodes are whole."""
+    """Number of transitions; 0: 1e6 (medium-expert: 2e6, demonstrations: 2e4). A few more are stored, because episodes
+    are whole."""
     checkpoint: str = "last"  # Which policy of a run: last, best or a file.
     actions: Literal["sampled", "mean"] = "sampled"
-    """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
+    """sampled: drawn from the policy's distribution, if the policy has one; mean: the policy's mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
     """Standard deviation of Gaussian noise on the actions of a witness, or of a policy without a distribution."""
     starts: Literal["witness", "tasks"] = "witness"
-    """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
-    class, from their starts, where it succeeds less often but shows more."""
+    """demonstrations: with witness, replay the witness in its own task, from its own start with shifted objects. With
+    tasks, replay it in all tasks of the class, from their starts: it succeeds less often, but the data are more
+    varied."""
     script: Switch = False
-    """demonstrations, --starts tasks: play a scripted policy instead of the witness, computed from each start
-    (about a second for 500 steps): eight classes have one, and it succeeds more often."""
+    """demonstrations, --starts tasks: use a scripted policy instead of the witness. The script computes actions from
+    each start (about a second for 500 steps) and succeeds more often. Eight classes have one."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
     num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
-    seed: Seed = 0  # Seed of starts and actions, and of random's tasks (a run keeps its own tasks).
+    seed: Seed = 0  # Seed of starts and actions; for random also of tasks (a run keeps its own tasks).
     out: Path | None = None  # Folder of the data set; None: NAME/KIND-v0 in the folder of BIDEX_DATA, else in data/.
     device: str = "auto"  # auto, cpu or cuda:N.
     engine: Literal["auto", "c", "warp"] = "auto"  # Physics; auto: the one that is fast on the device.
@@ -101,11 +103,11 @@ class _Collection:
 
     source: Worlds
     name: str  # kind in the data set's name
-    plan: Json  # what decides its content; it has ``kind``, ``size`` and ``num_envs``
-    policies: list[Json]  # who acts, for the metadata
+    plan: Json  # settings that decide the content, such as ``kind``, ``size`` and ``num_envs``
+    policies: list[Json]  # policies that act, for the metadata
     world: Callable[[], PooledWorld]
-    episode_share: float  # mean length of an episode as a share of the time limit, at least
-    collect: Callable[[PooledWorld, DatasetWriter], None]  # plays in the world until the writer has all transitions
+    episode_share: float  # lower bound of the mean episode length, as a share of the time limit
+    collect: Callable[[PooledWorld, DatasetWriter], None]  # acts in the world until the writer has all transitions
 
 
 @checked_arguments
@@ -131,7 +133,7 @@ def record(config: RecordConfig) -> Dataset:
 
 @checked_arguments
 def say_estimate(config: RecordConfig) -> None:
-    """Log how much disk and memory a recording takes at most, without a recording."""
+    """Log the maximum disk space and memory that a recording takes, without recording anything."""
     kind = _checked(config)
     if kind == "replay":
         raise BidexError("The transitions of a replay are stored already. Leave --estimate out.")
@@ -211,7 +213,7 @@ def _announce(collection: _Collection, world: PooledWorld, name: str) -> int:
 
 
 def _episodes(settings: RecordConfig, kind: str) -> _Collection:
-    """Return the collection of episodes of uniform actions, or of runs' policies."""
+    """Return the collection of episodes with uniform actions, or with the policies of runs."""
     config = _source_config(settings)
     source = open_worlds(config)
     # Sums depend on how torch splits them over threads, so a resumed collection keeps its number of threads.

@@ -1,4 +1,4 @@
-"""Runs as one HTML page, which contains its pictures and films, so that it needs no network."""
+"""Report of runs as one HTML page, which contains all pictures and films and so needs no network."""
 
 import base64
 import json
@@ -100,7 +100,7 @@ def _run(run: Run, name: str) -> Json:
 
 
 def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
-    """Return tables of the groups' final evaluations, and why runs are missing; ``short`` has the groups' names."""
+    """Return tables of final evaluations, or why there are none; ``short`` maps runs' paths to names of groups."""
     evaluated = [run for run in runs if run.evaluated]
     found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
     try:
@@ -148,9 +148,9 @@ def _cell(value: object) -> str:
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
-    """Yield run, file and content of the newest film of each kind (the name before ``_<step>``).
+    """Yield run, file and content of the newest film of each kind (the file's name before ``_<step>``).
 
-    The content is a data address of a video or, for WebP, of an image; None if the film is too large.
+    The content is a data URL of a video (of an image for WebP), or None if the film is too large.
     """
     room = FILM_BYTES
     for run in runs:
@@ -167,7 +167,7 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
 
 
 def _picture(draw: Callable[[], Any]) -> str | None:
-    """Return a figure as the data address of an image; None if there is nothing to draw."""
+    """Return a figure as the data URL of an image; None if there is nothing to draw."""
     try:
         return _data(plots.svg(draw()), "image/svg+xml")
     except BidexError:

@@ -1,4 +1,4 @@
-"""A run's config, resolved and checked: names as they are written, the preset's values, sizes that suit the device."""
+"""Resolves and checks a run's config: complete names, the preset's values, sizes that suit the device."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ _WIDTH = 1200  # numbers that a step of one environment holds at most: two obser
 def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     """Return a config with every value filled in, as ``config.json`` holds it.
 
-    A value that is None, ``"auto"`` or left out of ``learner`` gets what suits the suite, the learner and the device.
-    Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes nothing.
-    ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
+    A value that is None, ``"auto"`` or left out of ``learner`` gets a value that suits the suite, the learner and the
+    device. Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes
+    nothing. ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
     """
     dataset = run_data.whole_paths(config.dataset)
     datasets = run_data.open_datasets(dataset)
@@ -136,7 +136,7 @@ def _check_names(config: AnyConfig) -> None:
 
 
 def _written(name: str | None) -> str | None:
-    """Return a name as a config holds it: the whole path of a file."""
+    """Return a name as a config stores it: the absolute path of a file, any other name unchanged."""
     if name is not None and Path(name).suffix in (".toml", ".xml"):
         return str(absolute(name))
     return name

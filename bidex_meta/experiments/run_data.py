@@ -1,4 +1,4 @@
-"""Data sets of ``bidex-meta run``: what it learns from (--dataset) or imitates (--demonstrations), and metadata."""
+"""Data sets that ``bidex-meta run`` learns from (--dataset) or imitates (--demonstrations), and their metadata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,13 +27,17 @@ _FORM = ("suite", "task", "base", "object", "points", "touch")
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
     """Return our entry in a data set's metadata, with the items of ``more``, ready for JSON.
 
-    ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
-    ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``touch``, whether observations show
-    touch sensors; ``tasks``, names of the slots; ``instructions``, what the class of each slot asks for;
-    ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
-    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
-    ({class: {random, zero, expert}}, unscaled returns), ``versions``, ``commit``, and ``gymnasium_id`` of the same
-    environment, None of a suite or an altered class.
+    ``policies`` describe the policies that acted, in the order of ``Episode.policy``. The entry has:
+
+    - ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``; the others are None
+    - ``points``: number of points of a cloud; ``touch``: whether observations show touch sensors
+    - ``tasks``: names of the slots; ``instructions``: instruction of each slot's class
+    - ``reward_scales``: factor of the reward by slot; ``rules``: the suite's rules; ``hides_goals``
+    - ``observation_groups``: name and index ranges of each group
+    - ``kind`` (``random``, ``medium``, ...), ``policies``, and ``seed`` of the tasks
+    - ``references``: {class: {random, zero, expert}}, unscaled returns
+    - ``versions`` and ``commit``
+    - ``gymnasium_id`` of the same environment; None for a suite or an altered class
     """
     alone = source.class_name
     versions = collect_versions()
@@ -71,7 +75,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
     """Return data sets in the form that a config stores: paths of folders are made absolute.
 
-    A run may be resumed from another working folder.
+    This is needed because a run may be resumed from another working folder.
     """
     return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 

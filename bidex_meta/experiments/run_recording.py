@@ -1,4 +1,4 @@
-"""Recording of a training's transitions (``RunConfig.record``): a collector around its world."""
+"""Recording of a run's transitions (``RunConfig.record``) by a collector around the world."""
 
 from pathlib import Path
 
@@ -32,7 +32,10 @@ def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollecto
 
 
 def begin(collector: RunCollector, folder: Path, fresh: bool) -> None:
-    """Set the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
+    """Set the data set's folder within the run's folder.
+
+    A ``fresh`` run opens the folder here; otherwise loading the checkpoint opens it.
+    """
     collector.folder = folder / "replay"
     if fresh:
         collector.open(collector.folder)

@@ -54,7 +54,7 @@ def _takes(kind: LearnerKind) -> bool:
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
-    """Return the first teacher that knows a class, by the class's name in ``source.task_classes()``.
+    """Return the first teacher that knows each class, by the class's name in ``source.task_classes()``.
 
     Raises BidexError for a run that cannot teach here.
     """
@@ -77,7 +77,7 @@ def _scripted(source: Worlds) -> set[str]:
 
 
 def _known_to(name: str, source: Worlds) -> set[str]:
-    """Return the classes that the policy of a run has learned, in the same form."""
+    """Return the classes of ``source`` that a run's policy has learned, with equal observations and actions."""
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")

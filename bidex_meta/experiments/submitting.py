@@ -1,4 +1,4 @@
-"""Entries of the leaderboard, verified by playing the runs."""
+"""Entries of the leaderboard, verified by evaluating the runs again."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -60,9 +60,9 @@ class SubmittedRun:
 
     folder: RunFolder
     config: RunConfig[Json]
-    state: Json  # of its checkpoint
+    state: Json  # the policy's part of the run's checkpoint
     steps: int
-    weights: str  # their digest
+    weights: str  # digest of the policy's weights
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,11 @@ class Check:
     classes: Sequence[Agreement]
     """Recorded and repeated success by class, part, shot and run."""
     different: Sequence[str]
-    """Names of other fields of the entry that are not those of the runs."""
+    """Names of the entry's other fields whose values are not those of the runs."""
 
     @property
     def outcome(self) -> str:
-        """Return the worst outcome of ``bidex_meta.evaluation.agreement``."""
+        """Return the worst outcome over all fields, one of those of ``bidex_meta.evaluation.agreement``."""
         outcomes = {each.outcome for each in self.classes}
         if self.different or DIFFERS in outcomes:
             return DIFFERS
@@ -87,17 +87,18 @@ def submit(
     folders: Sequence[RunFolder], out: Path, *, name: str | None, tuning: tuple[int, int], episodes: int | None,
     device: str
 ) -> Path:  # fmt: skip
-    """Play runs on their own and on new tasks, write the leaderboard's entry, and return its path.
+    """Evaluate runs on their own and on new tasks, write the leaderboard's entry, and return the entry's path.
 
     Runs of learners that adapt play a meta-test of three episodes per trial. The seed of all starts and of the new
     tasks comes from the digests of the policies.
 
     Args:
-        folders: Runs that differ in the seed alone.
+        folders: Runs that differ only in the seed.
         out: Folder of the entries.
         name: The runs' name on the leaderboard; None: the algorithm.
-        tuning: Number of settings that were tried, and of seeds of each.
-        episodes: Episodes of each task, after each adaptation if there are any; None: 1, with adaptation 10.
+        tuning: Number of settings that were tried, and number of seeds per setting.
+        episodes: Episodes of each task; for learners that adapt, after each adaptation. None: 1, or 10 for learners
+            that adapt.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 
     Raises BidexError for runs that cannot form one entry, and if there is an entry of this name or of equal weights.
@@ -125,7 +126,7 @@ def submit(
 
 
 def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
-    """Play the runs of an entry again, by the entry's seed, and compare.
+    """Evaluate the runs of an entry again, with the entry's seed, and compare the results.
 
     Raises BidexError if the runs are not those of the entry.
     """
@@ -154,18 +155,18 @@ def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
 def submit_agent(
     file: Path, out: Path, *, name: str | None, track: AdaptationTrack | None, tuning: tuple[int, int]
 ) -> Path:  # fmt: skip
-    """Write the leaderboard's entry of a meta-test of somebody's agent, and return its path.
+    """Write the leaderboard's entry of a meta-test of somebody's agent, and return the entry's path.
 
-    The agent is not here, so nothing is verified.
+    We do not have the agent, so its results are not verified.
 
     Args:
         file: The meta-test, as ``meta_test(agent, suite).save(file)`` writes it.
         out: Folder of the entries.
-        name: The agent's name on the leaderboard; None: its class.
-        track: The kind of its training.
-        tuning: Number of settings that were tried, and of seeds of each.
+        name: The agent's name on the leaderboard; None: the name of its class.
+        track: The track of the agent's training, ``reward-only`` or ``privileged``.
+        tuning: Number of settings that were tried, and number of seeds per setting.
 
-    Raises BidexError for another evaluation, without a track, and if there is an entry of this name.
+    Raises BidexError if ``file`` is not a meta-test, if there is no track, or if there is an entry of this name.
     """
     found = read_evaluation(file, "meta_test(agent, suite).save(file)")
     if not isinstance(found, MetaTestEvaluation):
@@ -189,7 +190,7 @@ def submit_agent(
 
 
 def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
-    """Return the track of runs, from their learner's class and what they learned from; None if nobody can tell."""
+    """Return the track of runs, from their learner's class and their sources; None if it cannot be known."""
     if Capability.ADAPTS not in learner_class(runs[0].config.algo).capabilities:
         return MULTI_TASK
     privileged = [_was_privileged(run.config) for run in runs]
@@ -203,8 +204,8 @@ def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
 def _was_privileged(config: RunConfig) -> bool | None:
     """Return whether a run, or the run that it started from, had more than the rewards of its own episodes.
 
-    That is what the learner's class states, teachers, data sets, or a suite that shows the goals. The result is None if
-    the run that it started from is not here.
+    More means privileges that the learner's class states, teachers, demonstrations, data sets, or a suite that shows
+    its goals. The result is None if the run that it started from cannot be found.
     """
     seen = set[str]()
     while True:
@@ -226,7 +227,7 @@ def _was_privileged(config: RunConfig) -> bool | None:
 def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[SubmittedRun]:
     """Return runs with their policies; raise BidexError if the runs cannot form one entry.
 
-    ``shipped``: the runs must have trained on a suite that everybody has, not on a suite file.
+    With ``shipped``, the runs must have been trained on a shipped suite, not on a suite file.
     """
     configs = [folder.config() for folder in folders]
     for folder, config in zip(folders, configs, strict=True):
@@ -263,7 +264,7 @@ def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[Sub
 
 
 def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, device: str) -> Json:
-    """Play runs and return the content of their entry, without its name, tuning and seal."""
+    """Evaluate runs and return the content of their entry, without name, tuning and seal."""
     first = runs[0].config
     if episodes is None:
         episodes = _EPISODES if track == MULTI_TASK else _EPISODES_OF_TRIALS
@@ -341,7 +342,7 @@ def _part(played: Sequence[_Played], episodes: int) -> Json:
 
 
 def stated(runs: Sequence[SubmittedRun]) -> Json:
-    """Return what the folders of runs state, and nobody can verify."""
+    """Return facts that the runs' folders state, but nobody can verify."""
     rows = [_facts(run) for run in runs]
     return {
         "seeds": [run.config.seed for run in runs], "hours": [row[0] for row in rows],
@@ -350,7 +351,7 @@ def stated(runs: Sequence[SubmittedRun]) -> Json:
 
 
 def receipt(runs: Sequence[SubmittedRun]) -> Json:
-    """Return the digests of the runs that are played, and the commit of the code that plays."""
+    """Return the digests of the evaluated runs, and the commit of the code that evaluates them."""
     return {
         "weights": [run.weights for run in runs],
         "config": [content_digest(portable(run.config.to_json())) for run in runs],
@@ -371,14 +372,14 @@ def _facts(run: SubmittedRun) -> tuple[float, str, str | None]:
 
 
 def commit_of(git: Json | None) -> str | None:
-    """Return a commit in short, with + if files differed from it; None without one."""
+    """Return a commit's first ten digits, with + if files differed from the commit; None without a commit."""
     if not git or not git.get("commit"):
         return None
     return git["commit"][:10] + "+" * bool(git.get("dirty"))
 
 
 def new_path(path: Path) -> Path:
-    """Return the path of an entry; raise BidexError if there is one, or if it cannot be written."""
+    """Return the path of a new entry; raise BidexError if the file exists, or cannot be written."""
     if exists(path):
         raise BidexError(f"There is {path} already. Give another --name, or delete it.")
     check_writable(path)
@@ -386,6 +387,6 @@ def new_path(path: Path) -> Path:
 
 
 def write_entry(path: Path, content: Json) -> None:
-    """Write the file of an entry, and its folder if there is none."""
+    """Write the file of an entry; make its folder if that is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)

@@ -40,7 +40,7 @@ _FACTS = ("suite", "algorithm", "train_tasks", "steps", "start", "scratch", "see
 
 @dataclass(frozen=True)
 class _Transfer:
-    """A run, and the runs that learned the held-out classes; both dictionaries are class -> runs in order of seed."""
+    """A run, and the runs that learned the held-out classes; both dictionaries map a class to runs, sorted by seed."""
 
     run: SubmittedRun
     seeds: list[int]
@@ -49,7 +49,7 @@ class _Transfer:
 
     @property
     def played(self) -> list[SubmittedRun]:
-        """Return the runs that began with the run's policy, class by class."""
+        """Return the runs that started from the run's policy, class by class."""
         return [run for runs in self.transferred.values() for run in runs]
 
 
@@ -57,14 +57,14 @@ def submit_transfer(
     folder: RunFolder, transfer: Path, out: Path, *, name: str | None, tuning: tuple[int, int], episodes: int,
     device: str
 ) -> Path:  # fmt: skip
-    """Play the policies of a finished transfer on new tasks, write the leaderboard's entry, and return its path.
+    """Evaluate the policies of a finished transfer on new tasks, write the leaderboard's entry, and return its path.
 
     Args:
         folder: The run that was transferred.
         transfer: The folder of `bidex-meta transfer`, with runs of a million steps on every held-out class.
         out: Folder of the entries.
         name: The run's name on the leaderboard; None: the algorithm.
-        tuning: Number of settings that were tried, and of seeds of each.
+        tuning: Number of settings that were tried, and number of seeds per setting.
         episodes: Episodes of each task.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 
@@ -84,7 +84,7 @@ def submit_transfer(
 
 
 def check_transfer(path: Path, folder: RunFolder, transfer: Path, device: str) -> Check:
-    """Play the policies of an entry again, by the entry's seed, and compare.
+    """Evaluate the policies of an entry again, with the entry's seed, and compare the results.
 
     Raises BidexError if the policies are not those of the entry.
     """
@@ -144,7 +144,7 @@ def _policies(of_seeds: Mapping[int, RunFolder]) -> list[SubmittedRun]:
 
 
 def _played(found: _Transfer, episodes: int, device: str) -> Json:
-    """Play all policies and return the content of the entry, without its name, tuning and seal."""
+    """Evaluate all policies and return the content of the entry, without name, tuning and seal."""
     stored = found.run.config
     seed = evaluation_seed(run.weights for run in found.played)
     config = stored.to_json()

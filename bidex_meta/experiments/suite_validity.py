@@ -1,4 +1,4 @@
-"""Measures of a suite: if there is something to learn about its tasks."""
+"""Measures of whether there is something to learn about the tasks of a suite."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
@@ -28,7 +28,7 @@ _NOTHING = ("uniform", "zero", "held")  # policies that have learned nothing
 
 
 def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
-    """Measure if there is something to learn about the tasks of worlds; return a row per class.
+    """Measure whether there is something to learn about the tasks of ``worlds``; return a row per class.
 
     ``runs`` are folders of runs whose policies know the tasks. Raises BidexError for worlds without hands.
     """
@@ -39,7 +39,7 @@ def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
 
 
 def blind_share(slot: Slot, worlds: Worlds) -> float:
-    """Return the success that a policy can have at best without knowing which of the suite's tasks it plays."""
+    """Return the highest possible success of a policy that does not know which of the suite's tasks it is in."""
     if worlds.suite is not None and any(entry.name == slot.name and entry.tasks for entry in worlds.suite.classes):
         return listed_ceiling(slot.task_class, slot.tasks)
     return blind_ceiling(slot.task_class, seed=worlds.seed)
@@ -76,7 +76,7 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
 
 
 def _witnesses(world: World) -> OpenLoopReplay:
-    """Return an agent that replays, in all tasks, the witnesses of version 1's task 0 of a world's classes."""
+    """Return an agent that replays each class's witness, which was found for task 0 of version 1, in all tasks."""
     known = {name: load_witness(plain_name(name)) for name in _with_witness(world)}
     return OpenLoopReplay(known, list(world.task_names), world.task_id, world.action_size)
 
@@ -104,7 +104,7 @@ def _identified(slot: Slot, worlds: Worlds) -> Json:
 
 
 def _results(worlds: Worlds, world: World, runs: Sequence[Path]) -> dict[str, dict[str, ClassResult]]:
-    """Return the results by class and policy, for each class that a policy plays."""
+    """Return the results by class and policy, for each class that a policy can act in."""
     scripted = _scripted(world)
     agents: dict[str, tuple[Agent, Collection[str]]] = {
         "uniform": (RandomAgent(world.action_space, worlds.seed), world.task_names),

@@ -19,7 +19,7 @@ from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Seed, Text, check_fields, parse
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
-"""Flags of a run that no override sets: other entries of the file do, or the sweep."""
+"""Flags of a run that overrides must not set, because other entries of the file or the sweep set them."""
 _NO_FLAGS = ("task_seed", "record_share", "processes")
 """Fields of a resolved config that ``bidex-meta run`` fills in itself."""
 _LISTS = ("dataset", "demonstrations", "teacher")
@@ -60,18 +60,18 @@ class _File(_Shared):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a plan. It trains in a separate process: ``bidex-meta run`` with the words of this run."""
+    """A run of a plan. It trains in a separate process: ``bidex-meta`` with the words of ``begin`` or ``resume``."""
 
     path: Path
-    """The run's folder, which need not be there yet."""
+    """The run's folder, which need not exist yet."""
     given: AnyConfig
     """The values that were given. The rest is resolved on the machine that trains."""
     arm: str
-    """The name in tables of this run and of the same run with other seeds."""
+    """The name, in tables, of this run together with the runs that differ only in the seed."""
     final: FinalEvaluation = USUAL_EVALUATION
     """The evaluation at the end of the run."""
     config: AnyConfig = field(default=None, compare=False)  # pyright: ignore[reportAssignmentType]
-    """``given``, resolved and checked on this machine by ``bidex_meta.experiments.sweeping.resolved``."""
+    """``given``, resolved and checked on this machine by ``bidex_meta.experiments.sweeping.states_of``."""
 
     @property
     def name(self) -> str:
@@ -139,7 +139,7 @@ class SweepPlan:
     folder: Path
     """The folder of the runs' folders."""
     runs: Sequence[PlannedRun]
-    """The runs in their order; a run that starts from another stands behind it."""
+    """The runs in their order; a run that starts from another run comes after that run."""
     slurm: JsonObject = field(default_factory=dict)
     """Parameters of submitit's executor."""
     source: str = "sweep"
@@ -148,9 +148,10 @@ class SweepPlan:
     @classmethod
     @checked_arguments
     def of(cls, folder: str | Path, configs: Mapping[str, RunConfig]) -> "SweepPlan":
-        """Plan a run for each config, by the names of the runs' folders. Each run trains with one thread by default.
+        """Plan a run for each config, with one thread by default.
 
-        Raises BidexError for a name that no folder can have.
+        ``configs`` maps the name of each run's folder to its config. Raises BidexError for a name that no folder can
+        have.
         """
         runs = []
         for name, config in configs.items():
@@ -163,7 +164,7 @@ class SweepPlan:
     @classmethod
     @checked_arguments
     def read(cls, file: str | Path, root: str | Path = "runs") -> "SweepPlan":
-        """Read a study file (docs/sweeps.md): all arms with the first seed, then with the second.
+        """Read a study file (docs/sweeps.md); the plan has all arms with the first seed, then with the second, etc.
 
         ``root`` is the folder that contains the study's folder. Raises BidexError if the file is wrong, or if two of
         its runs have the same name. Values that ``bidex-meta run`` refuses are refused by ``bidex_meta.sweep``.
@@ -306,5 +307,5 @@ def _text(value: Json) -> str:
 
 
 def _named(value: Json) -> str:
-    """Return a value as a part of a folder's name: data sets and paths have slashes."""
+    """Return a value as a part of a folder's name, with hyphens instead of slashes and other special characters."""
     return re.sub(rf"[^{_IN_NAMES}]+", "-", _text(value).strip("/"))

@@ -45,7 +45,7 @@ class State(NamedTuple):
     step: int
     """Environment steps that were logged."""
     goal: int
-    """Environment steps to train for; the steps of the run if time, a return or a score ended the run."""
+    """Environment steps to train for; if time, a return or a score ended the run, the steps that it reached."""
     seconds: float
     """Seconds of training so far."""
     why: str
@@ -78,7 +78,7 @@ def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = No
 
     Args:
         plan: ``SweepPlan.of(folder, configs)``, or ``SweepPlan.read(file)`` for a study file.
-        workers: Runs at a time, each on its own core; None: 1, or one for each of ``cores``.
+        workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
         cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
 
     Raises BidexError for bad values in any run, before the first one begins, and if another sweep works in the folder.
@@ -95,7 +95,7 @@ def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = No
 
 
 def submit_plan(plan: SweepPlan, executor: Literal["slurm", "local"]) -> dict[str, str]:
-    """Submit the runs that can begin to submitit's executor; return the jobs' ids by the runs' names."""
+    """Submit to submitit's executor the runs that can begin now; return the jobs' ids by the runs' names."""
     states = states_of(plan)
     unfinished = {state.run.path for state in states if state.state != "done"}
     idle = [state.run for state in states if state.state in ("left", "failed")]
@@ -116,7 +116,7 @@ def _alone_in(plan: SweepPlan) -> contextlib.AbstractContextManager[None]:
 def states_of(plan: SweepPlan) -> list[State]:
     """Resolve and check the configs of all runs, and return the runs' progress.
 
-    Raises BidexError for bad values, and if a run's folder holds a run of another config.
+    Raises BidexError for bad values, and if a run's folder has a run with another config.
     """
     configs: dict[str, AnyConfig] = {}  # seeds share a config
     runs = []
@@ -140,7 +140,7 @@ def _resolved(run: PlannedRun) -> AnyConfig:
 
 
 def state_of(run: PlannedRun) -> State:
-    """Return the progress of a run whose config is known; raise BidexError if its folder holds another config's run."""
+    """Return the progress of a run with resolved config; raise BidexError if its folder has another config."""
     last: JsonObject = {"step": 0}
     evaluated = False
     if exists(run.folder.config_path):
@@ -167,10 +167,10 @@ def state_of(run: PlannedRun) -> State:
 
 
 def hours_left(states: Sequence[State]) -> list[float]:
-    """Return the hours that each run still trains, or NaN if no run has a known speed.
+    """Return the hours that each run still has to train, or NaN if no run has a known speed.
 
-    The speed is that of the run itself if known, otherwise the mean over the runs on its suite, otherwise the mean over
-    all runs.
+    The assumed speed is the run's own speed if known, otherwise the mean over the runs on its suite, otherwise the mean
+    over all runs.
     """
     speeds = [(state.run.subject, state.speed) for state in states if state.speed]
     hours = []
@@ -199,7 +199,7 @@ class Job:
         self.process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> bool:
-        """Begin or resume the run and wait for its end; return False if a signal stopped the run before.
+        """Begin or resume the run and wait for its end; return False if a signal stopped the run earlier.
 
         If the run failed, BidexError is raised with the last line of the run's log.
         """
@@ -232,7 +232,7 @@ class Job:
         return done
 
     def stop(self) -> None:
-        """Tell the run to save and end, without waiting for its end."""
+        """Signal the run to save and end, without waiting for its end."""
         self.stopped = True
         if self.process is not None:
             self.process.send_signal(_STOP)
@@ -331,10 +331,11 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
 
 
 def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonObject) -> dict[str, Any]:
-    """Submit runs to submitit's executor ``slurm``, or ``local``: processes of this machine, all at once.
+    """Submit runs to submitit's executor ``slurm``, or to ``local``, which starts all at once as local processes.
 
     ``parameters`` are the executor's; the defaults are a time of one day and one processor. Jobs print into
-    ``out/jobs/``. Returns submitit's jobs by name, without the runs whose job of an earlier start waits or runs.
+    ``out/jobs/``. Returns submitit's jobs by name. Runs that still have a waiting or running job from an earlier call
+    are not submitted again and are left out.
     """
     try:
         import submitit
@@ -364,7 +365,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
-    """Return a core per worker, from those requested (``1``, ``0,2-3``); None if the system cannot bind processes."""
+    """Return a core per worker, of those ``asked`` for (``0,2-3``); all are None if processes cannot be bound."""
     linux = sys.platform == "linux"
     usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable
@@ -383,7 +384,7 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
 
 
 def _signal_of(code: int) -> int | None:
-    """Return the batch system's signal that ended a run, which may have saved; None after any other end."""
+    """Return the batch system's signal that ended a run, from the exit code; None if the run ended otherwise."""
     if code == 0:  # an unfinished run that exits with 0 has saved at SIGTERM
         return signal.SIGTERM
     number = -code if code < 0 else code - 128

@@ -1,6 +1,7 @@
 """Training from a config to a run folder: config, folder, world, learner, training, in this order.
 
-Of several processes (torchrun) each has a world and a learner. Process 0 alone writes, logs and calls back.
+With several processes (torchrun), each has its own world and learner. Only process 0 writes, logs and calls
+``on_event``.
 """
 
 import contextlib
@@ -46,7 +47,7 @@ class Event:
     step: int
     """Environment steps so far, over all environments of all processes."""
     metrics: Mapping[str, float]
-    """Metrics of an iteration by tag (docs/metrics.md); empty of the other events."""
+    """Metrics of an iteration by tag (docs/metrics.md); empty for other events."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -70,19 +71,19 @@ def train(
 ) -> RunFolder:
     """Train a learner, from the last checkpoint of ``resume`` if that is given, and return the run's folder.
 
-    Lines about what happens are logged by the logger ``bidex_meta`` at level INFO. Several processes must call this
-    with equal arguments.
+    The logger ``bidex_meta`` logs the progress at level INFO. If there are several processes, all must call this
+    function with equal arguments.
 
     Args:
-        config: What to train; values that are left out are resolved (``bidex_meta.experiments.run_config``). None: the
-            config of ``resume``.
+        config: Config of the run; values that are left out are resolved (``bidex_meta.experiments.run_config``). None:
+            the config of ``resume``.
         run_dir: A new folder for the run; None: runs/SUITE/ALGO/DATE_seedSEED.
-        resume: A run to continue. Of its config, only the entries that the fields' help names may change.
+        resume: A run to continue. Only fields of its config that have the metadata ``MAY_CHANGE`` may change.
         on_event: Called when training starts, after each iteration, and when training has ended.
         show_progress: Whether a table, or a line every few seconds, is printed on stderr.
 
-    Raises BidexError for bad input, before anything is written; Stopped if a signal ended the training, which has saved
-    then; FloatingPointError if the training diverged; LostProcess if another process is gone.
+    Raises BidexError for bad input, before anything is written; Stopped if a signal ended the training, after the run
+    has saved; FloatingPointError if the training diverged; LostProcess if another process is gone.
     """
     distributed.init_from_environment()
     folder = None
@@ -188,7 +189,7 @@ def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
 def _begin(
     config: AnyConfig, old: RunFolder | None, new: Path | None, loaded: Checkpoint | None, held: contextlib.ExitStack
 ) -> _Run:
-    """Make the world, the learner and the folder; process 0's folder is that of all processes."""
+    """Make the world, the learner and the folder; all processes use the folder of process 0."""
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
     set_up_torch(config.threads, config.deterministic)
     kind = learner_kind(config.algo, config.task)
@@ -221,7 +222,7 @@ def _begin(
 
 
 def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
-    """Return the learner with its data and teachers; a fresh one with the weights that it shall start from."""
+    """Return the learner with data and teachers; a ``fresh`` one gets the policy of ``config.start_from``, if any."""
     sources = _sources(config, worlds, world)
     # A learner from elsewhere that takes no sources need not have the argument.
     if sources == NO_SOURCES:
@@ -336,7 +337,7 @@ def _nothing_left(config: AnyConfig, steps: int, minutes: float) -> str:
 
 
 def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | None:
-    """Return what says by the metrics whether the training ends early; None if nothing does."""
+    """Return a function that says if an iteration's metrics end the training; None if the config sets no such limit."""
     if config.stop_at_return is None and config.stop_at_success is None and config.stop_at_score is None:
         return None
 
@@ -350,7 +351,7 @@ def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | Non
 
 
 def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
-    """Log that another process is gone, and what is left; only the first process that notices does so."""
+    """Log that another process is gone, and which checkpoint is left; only the first process that notices logs this."""
     missing = distributed.report_loss()
     if missing is None:
         return

@@ -1,4 +1,4 @@
-"""Plan a transfer: a suite file per held-out class, the class's demonstrations, and a run per cell."""
+"""Plan a transfer: a suite file and demonstrations per held-out class, and a run per cell of the tables."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -38,12 +38,12 @@ _PATIENCE = 3  # most rounds of a script
 
 @dataclass(frozen=True)
 class Cell:
-    """One run of a table."""
+    """One run, which belongs to a cell of a table."""
 
     run: PlannedRun
     task: str  # the held-out class
-    arm: str  # what it starts from
-    demonstrations: int | None  # None: by reinforcement
+    arm: str  # name of the start: a run, or from scratch
+    demonstrations: int | None  # number of episodes; None: by reinforcement
 
 
 class Arm(NamedTuple):
@@ -51,11 +51,11 @@ class Arm(NamedTuple):
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy
-    network: JsonObject  # the values of its learner's config that decide the network
+    network: JsonObject  # the values of the learner's config that decide the network
 
 
 def arms_of(folders: Sequence[RunFolder]) -> list[Arm]:
-    """Return the first run, a fresh policy with the first run's network, and the other runs."""
+    """Return the arms: the first run, a fresh policy with the first run's network, and the other runs."""
     arms = []
     for folder in folders:
         values = folder.config().learner_values
@@ -213,7 +213,7 @@ def _is_complete(folder: Path) -> bool:
 
 
 def evaluate_every(steps: int, config: AnyConfig) -> int:
-    """Return the iterations between evaluations: 100 evaluations in all, or one after each iteration."""
+    """Return the number of iterations between evaluations, for 100 evaluations of a run; at least 1."""
     iteration = config.num_envs * config.learner_values["rollout_steps"]
     return max(1, steps // (_EVALUATIONS * iteration))
 
@@ -222,7 +222,7 @@ def cells_of(
     config: AnyConfig, final: FinalEvaluation, file: Path, name: str, arms: Sequence[Arm], out: Path, steps: int,
     counts: Sequence[int], dataset: Dataset | None
 ) -> Iterator[Cell]:  # fmt: skip
-    """Yield the cells of a class and of a config's seed.
+    """Yield the cells of a class, with the seed of ``config``.
 
     For each arm there is a cell per count of demonstrations, then one by reinforcement. Without a data set there are
     only the cells without demonstrations; with 0 steps there are none by reinforcement.

@@ -7,7 +7,7 @@ from bidex_meta.runs.atomic import Json
 
 
 def reinforcement_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[str]]]:
-    """Return columns and rows of a table of runs by reinforcement of ``end`` steps."""
+    """Return columns and rows of a table of runs that learned by reinforcement for ``end`` steps."""
     columns = [*(f"at {int(at):,} (%)" for at in rows[0]["at"]), "at the end (%)", "return", "area (%)"]
     table = []
     for row in rows:
@@ -22,7 +22,7 @@ def reinforcement_table(rows: Sequence[Json], end: int) -> tuple[list[str], list
 
 
 def demonstrations_table(rows: Sequence[Json]) -> tuple[list[str], list[list[str]]]:
-    """Return columns and rows of a table of runs from demonstrations."""
+    """Return columns and rows of a table of runs that learned from demonstrations."""
     table = []
     for row in rows:
         measures = [_text(row["success"]), _text(row["return"], 1.0), _text(row["over_nothing"], form="+.1f")]

@@ -30,7 +30,7 @@ from bidex_meta.worlds import Worlds, open_worlds
 USUAL_RUN: RunConfig = RunConfig(
     algo="ppo", preset="laptop", logger="none", num_envs=256, learner={"demonstration_cloning": 5000}
 )
-"""The config of a run of a transfer, without suite, seed, steps, start and network."""
+"""Default config of the runs of a transfer; the transfer sets suite, seed, steps, start and network."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class TransferResult:
     folder: Path
     """The folder of the runs, ``transfer.json`` and the figures."""
     reinforcement: tuple[JsonObject, ...]
-    """A row per class and start of the runs by reinforcement."""
+    """A row per class and start, for runs that learned by reinforcement."""
     demonstrations: tuple[JsonObject, ...]
-    """A row per class, start and number of demonstrations."""
+    """A row per class, start and number of demonstrations, for runs that learned from demonstrations."""
     failures: int
     """Runs that failed or were stopped in this call; the rows leave them out."""
 
@@ -70,15 +70,15 @@ def transfer(
     Args:
         run: A run on a suite with held-out classes, whose policy is measured.
         out: The folder of the runs, the tables and the figures.
-        start_from: Other runs to start from, on observations of the same form.
-        classes: Held-out classes; none: all of the run's suite.
-        steps: Environment steps of a run by reinforcement; 0: no such runs.
-        demonstrations: Numbers of episodes to learn from; none: no such runs.
-        data: Data sets of demonstrations, in place of those that the classes' scripts play.
-        seeds: Runs of each kind, with seeds 0, 1, ...
-        config: The config of every run, of the learner ``ppo``, without suite, seed, steps and start.
+        start_from: Other runs to start from; their observations must have the same form.
+        classes: Held-out classes; empty: all held-out classes of the run's suite.
+        steps: Environment steps of each run that learns by reinforcement; 0: no such runs.
+        demonstrations: Numbers of demonstrated episodes that runs learn from; empty: no such runs.
+        data: Data sets of demonstrations, which replace episodes of the classes' scripts.
+        seeds: Number of runs of each kind; their seeds are 0, 1, ...
+        config: The config of every run, whose learner is ``ppo``; suite, seed, steps and start are set here.
         final: The evaluation at the end of every run.
-        workers: Runs at a time, each on its own core; None: 1, or one for each of ``cores``.
+        workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
         cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
 
     Raises BidexError for bad input, before anything is written. A run that fails is logged and counted in the result.
@@ -126,7 +126,7 @@ def _cells(
     config: AnyConfig, final: FinalEvaluation, worlds: Worlds, classes: Sequence[str], arms: Sequence[Arm], out: Path,
     steps: int, counts: Sequence[int], data: Sequence[str], seeds: int
 ) -> list[Cell]:  # fmt: skip
-    """Return all runs, seeds outermost; write suite files, and record missing demonstrations."""
+    """Return all runs, those of the first seed first; write suite files, and record missing demonstrations."""
     for folder in ("suites", "data", "runs"):
         (out / folder).mkdir(exist_ok=True)
     files = {name: suite_file(worlds, name, out / "suites") for name in classes}

@@ -42,7 +42,7 @@ class Verification:
     steps: int
     """Environment steps that the policy was trained for."""
     conditions: Sequence[str]
-    """How the conditions of both evaluations differ, one text each."""
+    """Differences between the conditions of the two evaluations, one text for each."""
     classes: Sequence[Agreement]
 
     def count(self, outcome: str) -> int:
@@ -51,7 +51,7 @@ class Verification:
 
     @property
     def agrees(self) -> bool:
-        """Whether no class differs beyond its intervals."""
+        """Return whether no class differs beyond its intervals."""
         return self.count(DIFFERS) == 0
 
     def to_json(self) -> Json:
@@ -74,9 +74,10 @@ def verify(
 
     Args:
         run: The run's folder.
-        evaluation: A file that ``bidex-meta evaluate --json`` wrote of the run; None: its ``evaluation.json``.
-        device: ``auto``, ``cpu`` or ``cuda:N``; auto: the device of the evaluation if it is here, else the CPU.
-        engine: ``auto``, ``c`` or ``warp``; None: the engine of the evaluation, on another device ``auto``.
+        evaluation: A file that ``bidex-meta evaluate --json`` wrote for the run; None: the run's ``evaluation.json``.
+        device: ``auto``, ``cpu`` or ``cuda:N``; auto: the device of the evaluation if this machine has it, else the
+            CPU.
+        engine: ``auto``, ``c`` or ``warp``; None: the engine of the evaluation, or ``auto`` on another device.
         num_envs: Environments stepped together; None: the number of the evaluation.
 
     Raises BidexError if the evaluation or its checkpoint is missing or damaged.
@@ -163,7 +164,7 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
 def _again(
     folder: RunFolder, config: AnyConfig, worlds: Worlds, recorded: Evaluated, num_envs: int | None, state: Json
 ) -> dict[str, ClassSummary]:
-    """Return the results of the recorded evaluation, made again."""
+    """Repeat the recorded evaluation, and return its results by class."""
     load = partial(policy_of, folder, state, config.device)
     seed = recorded.seed or 0
     adapts = Capability.ADAPTS in learner_kind(config.algo).make.capabilities
@@ -201,7 +202,7 @@ def _again(
 
 
 def recorded_conditions(evaluation: Evaluated, versions: Versions, config: AnyConfig) -> Conditions:
-    """Return the conditions of a recorded evaluation; entries that it lacks are those of the run's training."""
+    """Return the conditions of a recorded evaluation; missing entries are taken from the run's training."""
     recorded = evaluation.conditions
     return replace(
         recorded,
@@ -215,7 +216,7 @@ def recorded_conditions(evaluation: Evaluated, versions: Versions, config: AnyCo
 
 
 def others(then: Conditions, now: Conditions) -> list[str]:
-    """Return a text for each difference of recorded and present conditions; the last names what was not recorded."""
+    """Return a text for each difference between recorded and present conditions, and one for unrecorded conditions."""
     texts = list(map(str, differences(then, now)))
     for name in ("device", "engine", "threads"):
         recorded = getattr(then, name)

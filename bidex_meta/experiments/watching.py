@@ -1,4 +1,4 @@
-"""Watching a learner while it learns: evaluations, the best policy, films. Training does not depend on them."""
+"""Evaluations, films and the best policy of a learner during training. They do not influence the training."""
 
 import math
 import random
@@ -45,7 +45,7 @@ def check(config: AnyConfig, worlds: Worlds) -> None:
 
 
 class Watch:
-    """Evaluates or films every N iterations; it is called after each iteration. Resumed runs continue the count."""
+    """Function to call after each iteration; it evaluates or films every N iterations, counted over all resumes."""
 
     def __init__(
         self, config: AnyConfig, kind: LearnerKind, worlds: Worlds, folder: RunFolder, learner: Learner,
@@ -135,7 +135,10 @@ class Watch:
 
 
 def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
-    """Return the tasks per class and the episodes per task of an evaluation during training, by the pools' names."""
+    """Return the number of tasks per class and of episodes per task in an evaluation during training.
+
+    ``pools`` has the names of each class's tasks.
+    """
     tasks = min(TASKS, max(map(len, pools.values())))
     return tasks, math.ceil(_LEAST / (tasks * len(pools)))
 
@@ -168,7 +171,7 @@ def _metrics(found: Evaluation) -> dict[str, float]:
 
 
 def _better(found: dict[str, float], best: dict[str, float]) -> bool:
-    """Return whether a result is better: by success, then by score (by return if there is no score)."""
+    """Return whether a result is better than ``best``: by success, then by score (by return if there is no score)."""
     if "Eval/score" in found and "Eval/score" in best:
         second = "Eval/score"
     else:

@@ -1,7 +1,8 @@
-"""Meta-World's interface on the classes of this benchmark: change the import and the names, keep the code.
+"""Meta-World's interface for the classes of this benchmark: Meta-World code needs only other imports and names.
 
-docs/metaworld.md lists the differences and the speed. Importing this module fixes Meta-World's own
-environments in this process, which MuJoCo 4 breaks (``library.mended``), and makes `Benchmark` one of Meta-World's.
+docs/metaworld.md lists the differences and the speed. MuJoCo 4 breaks Meta-World's own environments; importing this
+module fixes them in this process (``library.mended``). It also registers `Benchmark` as a subclass of Meta-World's
+class of that name.
 """
 
 from contextlib import suppress

@@ -1,7 +1,7 @@
-"""Adapters between here and Meta-World's evaluation, for agents and worlds in both directions (docs/metaworld.md).
+"""Adapters of agents and worlds between this benchmark's and Meta-World's evaluation (docs/metaworld.md).
 
-The agents' protocols have the same names and order of calls (``bidex_meta/agents.py``); Meta-World uses NumPy arrays,
-does not say which environments share a task, and calls ``reset`` only before and during evaluation.
+The agents' protocols have the same names and order of calls (``bidex_meta/agents.py``). However, Meta-World uses NumPy
+arrays, does not say which environments share a task, and calls ``reset`` only before and during evaluation.
 """
 
 from collections import namedtuple
@@ -118,7 +118,7 @@ class FromMetaWorld:
         return torch.as_tensor(self._agent.eval_action(_array(obs)), device=obs.device)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Start new episodes in a bool mask (num_envs,); only evaluation resets reach the agent."""
+        """Start new episodes in a bool mask (num_envs,) of environments; only resets for evaluation reach the agent."""
         self._begun = env_mask
         self._over = ~env_mask
 
@@ -149,7 +149,7 @@ class FromMetaWorld:
 
 
 class MetaWorldEnvs(VectorEnv):
-    """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
+    """A world with NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
     Raises BidexError unless the world's autoreset mode is DISABLED, because success may end episodes and this class
     then starts new ones.
@@ -184,8 +184,8 @@ class MetaWorldEnvs(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Advance every environment by actions (num_envs, a) in [-1, 1].
 
-        Returns observations (num_envs, d), the next episode's if one ended; rewards, terminated, truncated, and
-        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). If success counts
+        Returns observations (num_envs, d), which are of the next episode if one ended; rewards, terminated, truncated,
+        and info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). If success counts
         at the end of an episode, ``success`` is false before the last step and ``terminate_on_success`` has no effect.
         """
         obs, reward, terminated, truncated, info = self.world.step(actions)  # type: ignore[arg-type]

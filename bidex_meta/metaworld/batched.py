@@ -35,12 +35,12 @@ class MetaWorldWorld(ForeignWorld):
 
     ``suite`` is a key of ``suite.METAWORLD_SUITES``.
 
-    Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are its "v2" in
-    [0, 10]; an episode is 500 steps, ended only by the time limit. Starts are part of Meta-World's tasks: an episode
-    depends only on its task and actions. A task's variation is its number among the class's fifty tasks. ``seed``
-    determines Meta-World's tasks, and which tasks are drawn until ``reset(seed=...)`` is called; other keywords are
-    those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments than classes, or if
-    Meta-World is not installed.
+    Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are Meta-World's
+    "v2" rewards in [0, 10]; an episode has 500 steps and ends only at the time limit. Starts are part of Meta-World's
+    tasks: an episode depends only on its task and actions. A task's variation is its number among the class's fifty
+    tasks. ``seed`` determines Meta-World's tasks, and which tasks are drawn until ``reset(seed=...)`` is called; other
+    keywords are those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments than
+    classes, or if Meta-World is not installed.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset; raise BidexError for others."""
+        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset; raise BidexError for bad numbers."""
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:
@@ -119,7 +119,7 @@ class MetaWorldWorld(ForeignWorld):
     def load_state_dict(self, state: State) -> None:
         """Restore a ``state_dict``; raises BidexError if its suite, seed or size differs.
 
-        Each running episode is played again from its start, exactly: Meta-World keeps part of its state in Python.
+        Each running episode is replayed exactly from its start, because Meta-World keeps part of its state in Python.
         """
         fits(state, self.state_dict())
         self.set_tasks(state["pools"])
@@ -143,9 +143,9 @@ def evaluate_all_tasks(
 ) -> Evaluation:
     """Run ``evaluate`` over all tasks of all classes, in batches of the world's number of environments.
 
-    An environment takes about 10 MB, too much for one for each of MT10's 500 tasks. A policy without noise plays every
-    episode of a task identically, so one episode is enough. ``world`` is a ``MetaWorldWorld`` in autoreset mode
-    DISABLED; this function changes its pools.
+    An environment takes about 10 MB, which is too much for an environment per task: MT10 has 500 tasks. A policy
+    without noise plays every episode of a task identically, so one episode is enough. ``world`` is a ``MetaWorldWorld``
+    in autoreset mode DISABLED; this function changes its pools.
     """
     protocol = Protocol(seed=seed, episodes_per_task=episodes_per_task)
     check_world(world)

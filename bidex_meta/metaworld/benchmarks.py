@@ -1,8 +1,8 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
 As in Meta-World, `MT1` and `ML1` take any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
-`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. Hands move, as in every suite;
-`seed` chooses the tasks (None stands for 0).
+`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. The hands' bases move, as in every
+suite. `seed` chooses the tasks (None stands for 0).
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _ENV_NAMES = [versioned_name(name, rules) for rules, name in product((V1, V2), r
 
 
 class MT1(Benchmark):
-    """One class with its goal visible, 50 tasks."""
+    """One class with visible goals and 50 tasks."""
 
     ENV_NAMES: ClassVar[list[str]] = _ENV_NAMES
 
@@ -30,7 +30,7 @@ class MT1(Benchmark):
 
 
 class ML1(Benchmark):
-    """One class with its goal hidden: 50 tasks for training, 50 other tasks for testing."""
+    """One class with hidden goals, 50 tasks for training and 50 other tasks for testing."""
 
     ENV_NAMES: ClassVar[list[str]] = _ENV_NAMES
 
@@ -40,7 +40,7 @@ class ML1(Benchmark):
 
 
 class CustomMT(Benchmark):
-    """Some classes with their goals visible, 50 tasks each."""
+    """Several classes with visible goals and 50 tasks each."""
 
     @checked_arguments
     def __init__(self, envs: Sequence[str], seed: int | None = None) -> None:
@@ -48,7 +48,7 @@ class CustomMT(Benchmark):
 
 
 class CustomML(Benchmark):
-    """Disjoint classes for training and testing (else BidexError), goals hidden, 50 tasks each."""
+    """Different classes for training and testing (else BidexError), with hidden goals and 50 tasks each."""
 
     @checked_arguments
     def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:

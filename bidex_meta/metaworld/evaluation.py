@@ -34,7 +34,7 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Envs, *args: in
 
 @contextmanager
 def known_to_metaworld(envs: Envs) -> Iterator[None]:
-    """Add the classes of ``envs`` to the names in `metaworld.evaluation` (a copy: other modules share its dict)."""
+    """Add the classes of ``envs`` to the names in `metaworld.evaluation`, in a copy, because modules share the dict."""
     before = vars(library)[_CLASSES]
     ours = {str(name): type(str(name), (), {}) for name in envs.get_attr("task_name")}
     setattr(library, _CLASSES, {**before, **ours})

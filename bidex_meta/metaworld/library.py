@@ -24,8 +24,8 @@ _BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNIN
 def mended() -> ModuleType:
     """Return Meta-World's module with its environments fixed; raise ModuleNotFoundError if it is not installed.
 
-    Meta-World 3.0.0 sets the hand's weld by eleven numbers for a whole row of ``eq_data``, which is twelve wide since
-    MuJoCo 3.17, so no environment could be made. The fix writes the numbers to the first eleven entries.
+    Meta-World 3.0.0 sets the hand's weld by writing eleven numbers to a whole row of ``eq_data``. Since MuJoCo 3.17 a
+    row has twelve entries, so no environment could be made. The fix writes the numbers to the first eleven entries.
     """
     import_module("metaworld.sawyer_xyz_env").SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
     return import_module("metaworld")
@@ -71,7 +71,7 @@ class Single:
         self._env = _library().ALL_V3_ENVIRONMENTS[name]()
 
     def start(self, task: object) -> np.ndarray:
-        """Begin an episode of a task; returns the observation, (39,), float64, its last three entries the goal."""
+        """Begin an episode of a task; return the observation (39,), float64, whose last three entries are the goal."""
         self._env.set_task(task)
         return self._env.reset()[0]
 

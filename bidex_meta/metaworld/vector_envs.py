@@ -32,7 +32,7 @@ _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 def make_mt_envs(
     name: str, seed: int | None = None, num_tasks: Few | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
-    """Make environments that show their goals and draw a task at each reset: one, or one per class of a suite.
+    """Make environments that show goals and draw a task at each reset: one of a class, or one per class of a suite.
 
     `seed` chooses the tasks (None: 0), the starts and the task draws (None: random); `num_tasks` is the size
     of the one-hot that `use_one_hot=True` appends, by default the number of classes. Options: `vector_strategy`,
@@ -59,9 +59,9 @@ def make_ml_envs(
     """Make environments of a class or meta suite with hidden goals, each with an equal share of its class's tasks.
 
     `meta_batch_size` is the number of environments, split evenly over the classes, by default one per class;
-    `total_tasks_per_cls` is the number of each class's tasks that they share, by default all. `seed` and options as in
-    `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or a size that does not divide
-    evenly.
+    `total_tasks_per_cls` is the number of each class's tasks that they share, by default all. `seed` and options are as
+    in `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or a size that does not
+    divide evenly.
     """
     if _is_class(name):
         benchmark = ML1(name, seed)
@@ -80,9 +80,9 @@ def make_split(
 ) -> VectorEnv:
     """Make the environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
-    `task_seed` chooses the tasks, `seed` the starts and the task draws. For the ids of ML1 `env_name` replaces the
-    suite by this class in the id's version, as in Meta-World; with another suite it raises BidexError. Options are
-    those of `make_mt_envs` or `make_ml_envs`.
+    `task_seed` chooses the tasks, `seed` the starts and the task draws. With the ids of ML1, `env_name` is the class to
+    use, in the id's version, as in Meta-World. With another suite, BidexError is raised if `env_name` is given. Options
+    are those of `make_mt_envs` or `make_ml_envs`.
     """
     if env_name is None:
         benchmark = Benchmark(suite, task_seed)
@@ -126,9 +126,9 @@ def make_custom(
 ) -> VectorEnv:
     """Make the environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
 
-    Classes of `envs_list` show their goals; the other classes hide their goals: `train_envs` play, or with
-    `split="test"` `test_envs`. `num_envs` is ignored, as in Meta-World. Options are those of `make_mt_envs` or
-    `make_ml_envs`.
+    Classes in `envs_list` show their goals. Classes in `train_envs` and `test_envs` hide their goals: the environments
+    are of `train_envs`, or of `test_envs` with `split="test"`. `num_envs` is ignored, as in Meta-World. Options are
+    those of `make_mt_envs` or `make_ml_envs`.
     """
     if envs_list is not None:
         return _multi_task(CustomMT(envs_list, seed), seed, **options)
@@ -195,12 +195,12 @@ def make_env(
     reward_alpha: float = 0.001,
     **options: Option,
 ) -> gymnasium.Env:
-    """Make one environment in Meta-World's wrappers, by Meta-World's keywords; the environment draws its tasks.
+    """Make one environment in Meta-World's wrappers, from Meta-World's keywords; it draws its tasks from ``tasks``.
 
-    `seed` determines starts and task draws (None: random); `use_one_hot` appends the one-hot of `env_id`
-    among `num_tasks`, `recurrent_info_in_obs` the last action, the last reward (divided by 10 if normalised) and
-    whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
-    turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
+    `seed` determines starts and task draws (None: random); `use_one_hot` appends the one-hot of `env_id` among
+    `num_tasks`. `recurrent_info_in_obs` appends the last action, the last reward (divided by 10 if normalised) and
+    whether the episode ended. With `task_select`, `"random"` draws a task at each reset, and `"pseudorandom"` takes the
+    tasks in turn when `sample_tasks()` is called. Other options are those of `SuiteEnv`.
     """
     wrappers = mended().wrappers  # not needed by the package's other names
     single = recipe.make_class()(**options)

@@ -37,7 +37,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 
 
 def temporary_name(path: Path) -> Path:
-    """Return an unused name in the folder of ``path``: a rename is atomic only within one file system.
+    """Return an unused name in the folder of ``path``, because a rename is atomic only within one file system.
 
     ``open`` creates the file with the umask's mode; ``tempfile`` would ignore the umask and use mode 0600.
     """
@@ -46,7 +46,7 @@ def temporary_name(path: Path) -> Path:
 
 @contextlib.contextmanager
 def room_for(folder: Path, size: int, count: int) -> Iterator[None]:
-    """Reserve disk space for ``count`` files of ``size`` bytes in a folder until its leftovers are removed.
+    """Reserve disk space in a folder for ``count`` files of ``size`` bytes, until ``remove_leftovers`` is called there.
 
     Raises BidexError if the disk, a quota or a limit of the process does not grant this space.
     """
@@ -90,13 +90,13 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Raise BidexError for links among a run's own files: writing through them would change foreign files."""
+    """Raise BidexError for links among a run's own files, because writing through a link would change other files."""
     for path in (path for path in paths if path.is_symlink()):
         raise BidexError(f"{path} is a link, and what a run writes stays in its folder. Put a folder or file there.")
 
 
 def check_writable(path: Path) -> None:
-    """Raise BidexError, before long work, if ``path`` is no file or could not be written after the work.
+    """Raise BidexError, before long work, if ``path`` exists but is not a file, or cannot be written.
 
     Reasons are a long name, missing permission or a full disk. Missing parent folders are allowed and not created.
     """
@@ -123,7 +123,7 @@ def check_writable(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Force a folder's names to the disk: without this a power cut may lose a rename."""
+    """Force a folder's list of files to the disk; without this a power cut may lose a rename."""
     # Windows cannot open folders, and needs no such call.
     if os.name == "posix":
         descriptor = os.open(folder, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``; written atomically, read without any code.
+"""Checkpoints ``step_<N>.pt``, ``last.pt`` and ``best.pt``; written atomically, read without executing code.
 
 Each file has a format number and a digest of all its numbers and tensors: ``torch.load`` checks no checksum, so it
 would load a flipped bit as another weight.
@@ -33,7 +33,7 @@ class Checkpoints:
     """The checkpoints of one run."""
 
     folder: Path  # created by the first ``save``
-    keep: Whole = 3  # number of ``step_<N>.pt`` that stay: several, so that one damaged file does not end the run
+    keep: Whole = 3  # number of ``step_<N>.pt`` that are kept: several, in case one is damaged
 
     @property
     def last(self) -> Path:
@@ -47,7 +47,7 @@ class Checkpoints:
 
     @checked_arguments
     def save(self, state: State, step: Whole) -> None:
-        """Write ``step_<step>.pt`` and ``last.pt`` after ``step`` environment steps, then delete the oldest."""
+        """Write ``step_<step>.pt`` and ``last.pt`` after ``step`` environment steps, then delete the oldest ones."""
         path = self.folder / f"step_{step}.pt"
         self._write(path, {"step": step, "state": state})
         self._follow(path)
@@ -66,7 +66,8 @@ class Checkpoints:
     def finish(self, step: int) -> None:
         """Complete a :meth:`save` that was killed.
 
-        ``step`` is the loaded checkpoint's. If a newer checkpoint exists, which is then damaged, all files stay.
+        ``step`` is the step of the loaded checkpoint. If a newer checkpoint exists, it is damaged, and all files are
+        kept.
         """
         if not self.folder.is_dir():
             return
@@ -87,7 +88,7 @@ class Checkpoints:
         write_atomic(path, lambda file: _torch().save(content, file))
 
     def _follow(self, newest: Path) -> None:
-        """Copy the newest checkpoint to ``last.pt``, then delete the oldest."""
+        """Copy the newest checkpoint to ``last.pt``, then delete the oldest ones."""
         with newest.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
@@ -107,7 +108,7 @@ class Checkpoints:
 
     @checked_arguments
     def load_one(self, path: Path) -> tuple[State, int]:
-        """Load one given checkpoint as ``load`` returns it; raises BidexError if it is missing or unreadable."""
+        """Load one given checkpoint, in the form of ``load``; raises BidexError if it is missing or unreadable."""
         if not is_file(path):
             there = ", ".join(sorted(path.name for path in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
@@ -208,7 +209,7 @@ def _check_archive(file: IO[bytes]) -> None:
 
 
 def weights_digest(policy: State) -> str:
-    """Return 32 hexadecimal digits of a policy's tensors, which identify copies of one run.
+    """Return a digest of a policy's tensors, 32 hexadecimal digits, which is equal for copies of one run.
 
     Numbers are rounded to half precision, in which published policies are stored.
     """

@@ -67,7 +67,7 @@ class ClassSummary(msgspec.Struct, frozen=True, kw_only=True):
     episodes: Whole | None = None
     tasks: Few | None = None
     unstable: Whole | None = None  # episodes that ended because the physics broke
-    solved: list[Whole] | None = None  # successful episodes of each task, by rising number of the task
+    solved: list[Whole] | None = None  # successful episodes of each task, in ascending order of task number
 
 
 Classes = Annotated[dict[str, ClassSummary], Meta(min_length=1)]
@@ -88,7 +88,7 @@ class Gains:
 
     classes: dict[str, dict[str, Estimate | None]]
     aggregate: dict[str, Estimate | None]
-    """Mean over classes. Returns of different classes have different scales: of several classes quote the score."""
+    """Mean over classes. Returns have a different scale in each class, so for several classes quote the score."""
 
     def to_json(self) -> Json:
         """Return the gains, ready for JSON."""
@@ -108,7 +108,7 @@ class SplitSummary:
     before: Summary
     after: Summary
     gain: Gains | None = None
-    by_shot: Annotated[list[Summary], Meta(min_length=1)]  # after 0, 1, ..., ``shots`` shots
+    by_shot: Annotated[list[Summary], Meta(min_length=1)]  # results after 0, 1, ..., ``shots`` shots
     rewards_shown: bool = False  # agents saw the rewards of these episodes; before 0.3.0 they did not
     hidden_by_shot: list[Summary] | None = None  # the same episodes played with their rewards hidden
 
@@ -147,7 +147,7 @@ class PolicyEvaluation:
     run: Text | None = None
     steps: Whole | None = None  # environment steps that the policy was trained for
     split: Text = "train"
-    seed: Seed | None = None  # of the episodes' starts
+    seed: Seed | None = None  # seed of the episodes' starts
     policy: Summary
     random: Summary | None = None  # The results of a random policy on the same tasks.
     return_above_random: dict[str, Estimate] | None = None
@@ -162,20 +162,20 @@ class PolicyEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares: those of the classes."""
+        """Return the results that a verification compares: the results by class."""
         return self.policy.classes
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetaTestEvaluation:
-    """The evaluation of a learner, or of an agent of the caller's, before and after it adapts."""
+    """The evaluation of a learner, or of a user's own agent, before and after it adapts."""
 
     run: Text | None = None
-    agent: Text | None = None  # class of an agent that is no run
-    suite: Text | None = None  # that the agent played; a run's is in its config
-    task_seed: Seed | None = None  # that drew the agent's tasks
+    agent: Text | None = None  # class of an agent that is not a run
+    suite: Text | None = None  # suite of the agent's meta-test; a run's suite is in its config
+    task_seed: Seed | None = None  # seed that drew the agent's tasks
     steps: Whole | None = None  # environment steps that the learner was meta-trained for
-    seed: Seed | None = None  # of the episodes' starts
+    seed: Seed | None = None  # seed of the episodes' starts
     splits: Annotated[dict[str, SplitSummary], Meta(min_length=1)]
     conditions: Conditions = Conditions()
     randomisation: Json | None = None
@@ -187,7 +187,7 @@ class MetaTestEvaluation:
 
     @property
     def results(self) -> dict[str, ClassSummary]:
-        """Return the results after adaptation by class and split, since ML1's splits have the same class."""
+        """Return the results after adaptation by class and split, because ML1's splits have the same class."""
         rows = {}
         for split, part in self.splits.items():
             for name, row in part.after.classes.items():
@@ -196,7 +196,7 @@ class MetaTestEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares: by class, split, shot, and rewards if they were hidden."""
+        """Return the results that a verification compares, by class, split and shot, also those with hidden rewards."""
         rows = {}
         for split, part in self.splits.items():
             for text, shots in (("", part.by_shot), (", rewards hidden", part.hidden_by_shot or ())):
@@ -246,5 +246,5 @@ def evaluation_json(evaluation: Evaluated) -> Json:
 
 
 def _without_none(content: Json) -> Json:
-    """Return the entries of the first level that are known."""
+    """Return the content without those entries of the first level that are None."""
     return {name: value for name, value in content.items() if value is not None}

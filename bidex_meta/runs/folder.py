@@ -155,13 +155,13 @@ class RunFolder:
 
     @checked_arguments
     def finish(self, step: Whole | None) -> None:
-        """Clean up a locked folder after a killed process; ``step`` is the loaded checkpoint's."""
+        """Clean up a locked folder after a killed process; ``step`` is the step of the loaded checkpoint."""
         remove_leftovers(self.path)
         if step is not None:
             self.checkpoints.finish(step)
 
     def check_own(self) -> None:
-        """Raise BidexError, before anything is built, if a part is a link or the folder cannot be written."""
+        """Raise BidexError, before anything is built, if an entry is a link or the folder cannot be written."""
         refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
         for folder in (self.path, self.checkpoints_path):
             if folder == self.path or folder.exists():
@@ -171,7 +171,7 @@ class RunFolder:
     def locked(self, message: str | None = None) -> Iterator[None]:
         """Keep other processes from training here; the lock ends with its process, and leaves no file.
 
-        Raises BidexError, with this message, if another process holds the lock.
+        Raises BidexError, with ``message``, if another process holds the lock.
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
@@ -231,7 +231,7 @@ def _is_of_a_start(entry: Path) -> bool:
 
 
 def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:
-    """Return the default folder of a run, by its config and the present time."""
+    """Return the default folder of a run, from its config and the present time."""
     # A suite may be a path to a TOML file, task and algo package.module:Class.
     subject = name_with_object(short_name(Path(config.suite or str(config.task)).stem), config.object)
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")

@@ -23,7 +23,8 @@ _TAIL = 65_536
 class MetricsWriter:
     """Appends to ``metrics.jsonl`` in the run folder, and to a logger of ``bidex_meta.runs.writers``.
 
-    In a resumed run both drop the points after ``resume_step``, the checkpoint's step, since they are logged again.
+    In a resumed run, the points after ``resume_step``, the step of the checkpoint, are dropped from both, because they
+    are logged again.
     """
 
     @checked_arguments
@@ -64,7 +65,10 @@ def read_metrics(path: Path) -> list[Json]:
 
 @checked_arguments
 def last_rows(path: Path) -> list[Json]:
-    """Return the last readable lines of a ``metrics.jsonl`` without reading all of it; errors as ``read_metrics``."""
+    """Return the last readable lines of a ``metrics.jsonl`` without reading it all.
+
+    Errors are those of ``read_metrics``.
+    """
     with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         rows = [_row(line) for line in file.read().split(b"\n") if line.strip()]
@@ -73,9 +77,9 @@ def last_rows(path: Path) -> list[Json]:
 
 @checked_arguments
 def training_seconds(rows: Sequence[Json]) -> float:
-    """Return the wall time of the training, over all resumes, by the lines of a ``metrics.jsonl``.
+    """Return the wall time of the training, s, over all resumes, from the lines of a ``metrics.jsonl``.
 
-    For runs that did not yet log the time it is the time of the iterations, without the time of checkpoints.
+    Older runs did not log the training time. For them the result is the time of the iterations, without checkpoints.
     """
     logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
     unlogged = []
@@ -112,7 +116,10 @@ def _keep(path: Path, lines: Sequence[bytes]) -> None:
 
 
 def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
-    """Return every line that is not empty with its numbers by name (None if unreadable); the file may be missing."""
+    """Return each non-empty line, with a dict of its numbers (None if unreadable).
+
+    With ``missing``, the file need not exist.
+    """
     if missing and not exists(path):
         return []
     lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")

@@ -26,8 +26,8 @@ class Curve:
     """A metric against environment steps; arrays (points,)."""
 
     steps: np.ndarray  # environment steps, rising
-    mean: np.ndarray  # the metric, over several runs their mean
-    low: np.ndarray | None  # lower end of the interval over runs; None of a single run
+    mean: np.ndarray  # the metric; its mean if there are several runs
+    low: np.ndarray | None  # lower end of the interval over runs; None for a single run
     high: np.ndarray | None  # upper end
 
 
@@ -44,7 +44,7 @@ _MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
 
 
 def draw_learning(groups: Sequence[Group]) -> "Figure":
-    """Draw return and success of every task against environment steps, a line for each group of runs.
+    """Draw return and success of every task against environment steps, with one line per group of runs.
 
     Each task has its own panels, because returns differ by orders of magnitude. Evaluations during training are dashed.
     Raises BidexError if no episode has ended yet.
@@ -70,7 +70,10 @@ def draw_learning(groups: Sequence[Group]) -> "Figure":
 
 
 def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
-    """Draw metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
+    """Draw metrics against environment steps, with one panel per metric and one line per group of runs.
+
+    ``tags`` maps the tag of each metric to the label of its panel.
+    """
     figure = _figure(5.2 * len(tags), 3.0)
     labels = [label for label, _ in groups]
     for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
@@ -84,7 +87,7 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
 def draw_panels(
     panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
 ) -> "Figure":
-    """Draw a metric, labelled ``title``, against environment steps, with one panel per name, all on one scale.
+    """Draw a metric, labelled ``title``, against environment steps, with one panel per name and a shared vertical axis.
 
     ``unit`` is the size of one unit of ``Curve.steps``, and the unit's name.
     """
@@ -100,7 +103,7 @@ def draw_panels(
 
 
 def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> "Figure":
-    """Draw groups' numbers next to each other, as points with intervals, a panel for each title."""
+    """Draw the values of groups as points with intervals, with one panel per title."""
     figure = _figure(5.2 * len(panels), 1.2 + 0.45 * max(len(bars) for bars in panels.values()))
     for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
         for number, (_, value, interval) in enumerate(bars):
@@ -118,7 +121,7 @@ def draw_adaptation(evaluation: Evaluated, where: object) -> "Figure":
     """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
 
     Bands are the 95 % bootstrap intervals over episodes. Raises BidexError if the evaluation is not a meta-test;
-    ``where`` names its source.
+    ``where`` is its file, for the message.
     """
     if not isinstance(evaluation, MetaTestEvaluation):
         again = f"Write one: bidex-meta evaluate RUN --shots 3 --json > {where}"
@@ -185,7 +188,7 @@ def _task_panels(blocks: Sequence[Sequence[str]]) -> "tuple[Figure, list[list[tu
 
 
 def save(figure: "Figure", out: Path, metadata: Mapping[str, str] | None = None) -> None:
-    """Write a figure, in the format of the file's ending, with ``metadata``; raises BidexError for another ending."""
+    """Write a figure with ``metadata`` in the format of the file's suffix; raises BidexError for an unknown suffix."""
     known = figure.canvas.get_supported_filetypes()
     ending = out.suffix[1:].lower()
     if ending not in known:
@@ -240,5 +243,5 @@ def _add_legend(figure: "Figure", labels: Sequence[str]) -> None:
 
 
 def _plain(name: str) -> str:
-    """Return a user's name, escaped so that matplotlib sees no formula."""
+    """Return a user's name, escaped so that matplotlib does not take a dollar sign for a formula."""
     return name.replace("$", r"\$")

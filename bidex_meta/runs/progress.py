@@ -59,13 +59,13 @@ class Progress:
             self._live = None
 
     def start(self) -> None:
-        """Begin the display; speed counts from here."""
+        """Begin the display; speed is measured from this moment."""
         self._start_time = time.monotonic()
         if self._live is not None:
             self._live.start()
 
     def update(self, metrics: Mapping[str, float], step: int) -> None:
-        """Show an iteration's metrics; earlier values stay, because an iteration may end no episode.
+        """Show an iteration's metrics; earlier values stay visible, because in some iterations no episode ends.
 
         Raises BrokenPipeError if the reader has ended or the terminal is gone; later output is discarded.
         """
@@ -166,7 +166,7 @@ def counted(items: Iterable[Item], total: int, subject: str) -> Iterator[Item]:
 
 
 def _lines(parts: Iterable[str], width: int) -> list[str]:
-    """Join parts to lines of at most ``width``; no part is broken."""
+    """Join parts into lines of at most ``width``; no part is broken."""
     lines: list[str] = []
     for part in parts:
         joined = f"{lines[-1]}  {part}" if lines else part

@@ -20,7 +20,7 @@ _ENGINES = ("mujoco", "mujoco-warp", "metaworld")
 Value = str | int
 Record = Versions | Conditions
 Subject = tuple[str | None, ...]
-"""The subject that runs are trained on: two runs of one subject have the same worlds, if nobody changed the worlds."""
+"""Suite, class, object and base of a run. Runs with equal subjects have the same worlds, unless versions differ."""
 
 
 class Difference(NamedTuple):
@@ -40,7 +40,7 @@ class Difference(NamedTuple):
 
 
 def differences(then: Record, now: Record) -> list[Difference]:
-    """Return the entries of both records whose values differ; packages that ``now`` lacks do not count."""
+    """Return the entries whose values differ between two records; packages that ``now`` does not have are ignored."""
     before = _values(then)
     differing = []
     for name, value in _values(now).items():
@@ -52,7 +52,7 @@ def differences(then: Record, now: Record) -> list[Difference]:
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
     """Return for each run the entries that differ between runs of the same subject; usually none.
 
-    Runs with different entries must not be pooled. Both the training and the evaluation count.
+    Runs with different entries must not be pooled. Entries of the training and of the evaluation are compared.
     """
     records = [dict(_of_worlds(run)) for run in runs]
     seen: dict[tuple[Subject, str], set[Value]] = defaultdict(set)

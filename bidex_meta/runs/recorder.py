@@ -22,8 +22,8 @@ from bidex_meta.utils.validation import Seconds, Whole
 class Recorder:
     """The record of a training run. Use it as a context manager, so that files are closed and the terminal is restored.
 
-    ``total_steps`` and ``total_seconds`` are for the progress display, which ``show_progress`` turns on;
-    ``resume_step`` is of the checkpoint that the run continues from.
+    ``total_steps`` and ``total_seconds`` are for the progress display, which ``show_progress`` turns on.
+    ``resume_step`` is the step of the checkpoint that the run continues from.
     """
 
     on_log: Callable[[Mapping[str, float], int], None] | None = None
@@ -58,7 +58,7 @@ class Recorder:
         self._checkpoints.save(state, step)
 
     def film(self, name: str, frames: Iterable[np.ndarray], fps: float, step: int) -> Path:
-        """Write ``videos/<name>_<step>.mp4`` and log it; frames ``(height, width, 3)``, uint8, both even."""
+        """Write ``videos/<name>_<step>.mp4`` and log it; frames are ``(height, width, 3)``, uint8, of even sizes."""
         path = self._videos / f"{name}_{step}.mp4"
         pictures = list(frames)
         write_video(path, pictures, fps)

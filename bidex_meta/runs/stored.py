@@ -49,7 +49,7 @@ class _Content(TypedDict):
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run of a study's file, created by :func:`read_study`; methods as those of :class:`RunFolder`."""
+    """A run of a study's file, created by :func:`read_study`; methods are those of :class:`RunFolder`."""
 
     path: Path  # ``FILE:RUN``, which names it in messages and on the command line.
     content: Json
@@ -61,7 +61,7 @@ class StoredRun:
 
     @property
     def evaluation_path(self) -> Path:
-        """Return the name of the run: its file also holds the evaluation."""
+        """Return the path of the run, because its file also holds the evaluation."""
         return self.path
 
     @property
@@ -80,11 +80,11 @@ class StoredRun:
         return self.content["arm"]
 
     def config(self) -> RunConfig[Json]:
-        """Return the resolved config, in which paths of own suites and of other runs are reduced to names."""
+        """Return the resolved config, in which paths of users' suites and of other runs are reduced to names."""
         return config_of(self.content["config"], f"{self.path}: config")
 
     def metrics(self) -> list[Json]:
-        """Return means over intervals of about equal length, at the ends of the intervals."""
+        """Return rows of metrics: means over intervals of about equal length in steps, at the ends of the intervals."""
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
 
@@ -128,7 +128,7 @@ def open_runs(path: Path) -> list[Run]:
 
 
 def read_study(file: Path) -> list[StoredRun]:
-    """Read all runs of a study's file, in its order. Raises BidexError if it is damaged or holds no run."""
+    """Read all runs of a study's file, in the file's order. Raises BidexError if it is damaged or holds no run."""
     contents = read_json(file, "a study's runs")
     if not isinstance(contents, dict) or not contents:
         raise BidexError(f"{file}: expected a table of runs by name. Collect them again.")

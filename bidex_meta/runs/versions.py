@@ -1,4 +1,4 @@
-"""``versions.json``, the environment that a result depends on in addition to its config: packages, machine, commit."""
+"""``versions.json``: packages, machine and commit, on which a result depends in addition to the run's config."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""Pictures and films from rendered frames. PNG and WebP need nothing extra, MP4 the extra ``video``."""
+"""Pictures and films from rendered frames. PNG and WebP need no extra package; MP4 needs the extra ``video``."""
 
 import errno
 import io
@@ -50,7 +50,10 @@ def check_films() -> None:
 
 
 def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
-    """Encode frames ``(height, width, 3)``, uint8, in a Pillow format with its options; several form an animation."""
+    """Encode frames ``(height, width, 3)``, uint8, in a Pillow format with its options.
+
+    Except in PNG, several frames form an animation.
+    """
     out = io.BytesIO()
     pictures = (Image.fromarray(frame) for frame in frames)
     if kind == "PNG":
@@ -80,8 +83,8 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float) -> Non
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; return the frame count.
 
-    Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError if imageio-ffmpeg is missing,
-    and OSError if the file cannot be written; an earlier file then stays.
+    Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError if imageio-ffmpeg is missing, and
+    OSError if the file cannot be written; an earlier file is then kept.
     """
     check_films()
     import imageio
@@ -104,7 +107,10 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
 
 def _whole(path: Path) -> bool:
-    """Return whether an MP4 ends in its frame table, which is written last: imageio does not report ffmpeg's exit."""
+    """Return whether an MP4 is complete, that is, ends in its frame table, which is written last.
+
+    This check is needed because imageio does not report ffmpeg's exit status.
+    """
     with path.open("rb") as file:
         end = file.seek(0, 2)
         offset = 0

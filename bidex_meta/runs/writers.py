@@ -41,7 +41,7 @@ class Writer:
 
 
 def make_writer(logger: str, folder: Path, resume_step: int | None = None) -> Writer:
-    """Make the writer of a logger in ``LOGGERS``; raises BidexError if it is unknown or not installed."""
+    """Make the writer of a logger in ``LOGGERS``; raises BidexError if the logger is unknown or not installed."""
     if logger not in LOGGERS:
         raise unknown_name("logger", logger, LOGGERS)
     return LOGGERS[logger](folder, resume_step)
@@ -94,8 +94,8 @@ class TensorBoardWriter(Writer):
 class WandbWriter(Writer):
     """A run of Weights & Biases; the project is ``WANDB_PROJECT``, or ``bidex-meta``.
 
-    The run folder holds its id, so that a resumed run continues it. Environment steps are the metric ``env_steps``,
-    because W&B steps may only increase, and a resumed run begins before the last step.
+    The run folder holds the id of the W&B run, so that a resumed run continues the same W&B run. Environment steps are
+    the metric ``env_steps``, because W&B steps may only increase, and a resumed run begins before the last logged step.
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:

@@ -1,1 +1,1 @@
-"""The training loop and its processes; knows no learner."""
+"""The training loop and its processes, independent of any particular learner."""

@@ -22,10 +22,11 @@ _JOIN_SECONDS = 10.0
 
 
 class Attendance(threading.Thread):
-    """Counts up in torchrun's store twice a second, to show the other processes of ``count`` that this process lives.
+    """Thread that counts up in torchrun's store twice a second, which shows the other processes that this one is alive.
 
-    This process may wait in a collective operation for a lost process. If a signal asked this process to end, it is
-    still waiting after 12 seconds and another process is missing, the thread calls ``on_loss`` and ends the process.
+    ``count`` is the number of processes. This process may hang in a collective operation that waits for a lost process.
+    If a signal has asked this process to end, and after 12 seconds it still hangs and another process is missing, the
+    thread calls ``on_loss`` and ends this process.
     """
 
     def __init__(self, store: Any, rank: int, count: int):
@@ -83,7 +84,7 @@ class Attendance(threading.Thread):
                 os._exit(1)
 
     def _missing(self) -> list[int]:
-        """Return the processes that neither count up nor have reported."""
+        """Return the numbers of the processes that neither count up nor have reported their end."""
         before = self._beats()
         time.sleep(_LISTEN_SECONDS)
         silent = [i for i, (a, b) in enumerate(zip(before, self._beats(), strict=True)) if a == b and i != self._rank]
@@ -100,9 +101,9 @@ class Attendance(threading.Thread):
 
 
 def end_patiently() -> None:
-    """Leave ten seconds between SIGTERM and the end of the process, unless another handler takes over.
+    """Leave ten seconds between SIGTERM and the end of the process, unless another handler is set later.
 
-    As soon as one process is gone, torchrun sends SIGTERM to all others, just when they report the loss.
+    As soon as one process is gone, torchrun sends SIGTERM to all others, which need this time to report the loss.
     """
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""One run in several processes, started by torchrun and joined by torch.distributed: sums, broadcasts, agreement.
+"""Sums, broadcasts and agreement of the processes of one run, started by torchrun and connected by torch.distributed.
 
 Each process steps its own world. In a single process every function here returns its input, and nothing is sent.
 """
@@ -58,9 +58,10 @@ def own_seed(seed: int) -> int:
 
 
 def init_from_environment() -> None:
-    """Join the processes that torchrun announces in the environment; do nothing in a single process.
+    """Join the processes that torchrun lists in the environment variables; do nothing in a single process.
 
-    Tensors on the CPU travel by gloo, tensors on CUDA devices by NCCL. Raises LostProcess if a process does not join.
+    Gloo sends tensors on the CPU, and NCCL sends tensors on CUDA devices. Raises LostProcess if a process does not
+    join.
     """
     global _attendance
     if "MASTER_ADDR" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) == 1 or _joined():
@@ -78,7 +79,7 @@ def init_from_environment() -> None:
 
 
 def shut_down() -> None:
-    """Leave the other processes once all have called this."""
+    """Leave the group of processes once all of them have called this function."""
     if _joined():
         with _collective():
             dist.barrier()
@@ -96,8 +97,8 @@ def _end_threads() -> None:
 def _leave() -> None:
     """End all threads in a process that ends without :func:`shut_down`.
 
-    A thread that asks for the interpreter after it is gone (the attendance's, gloo's own) is unwound through C++ that
-    may not throw: "terminate called without an active exception".
+    The threads of the attendance and of gloo may need the interpreter after it has ended. Such a thread is unwound
+    through C++ code that must not throw, and the process dies with "terminate called without an active exception".
     """
     _end_threads()
     # With NCCL this might wait for a process that is lost.
@@ -113,18 +114,18 @@ def report_loss() -> list[int] | None:
 
 
 def on_loss(function: Callable[[], None]) -> None:
-    """Set a function that is called before a process ends because it waits for a lost process and cannot stop."""
+    """Set the function that is called before this process is ended because it hangs, waiting for a lost process."""
     if _attendance is not None:
         _attendance.on_loss = function
 
 
 def all_sum(x: Tensor) -> Tensor:
-    """Sum ``x`` over the processes; it has the same shape in all of them."""
+    """Sum ``x`` over the processes; ``x`` has the same shape in all of them."""
     return _reduced(x, dist.ReduceOp.SUM)
 
 
 def all_max(x: Tensor) -> Tensor:
-    """Return the maximum of each entry of ``x`` over the processes; it has the same shape in all of them."""
+    """Return the maximum of each entry of ``x`` over the processes; ``x`` has the same shape in all of them."""
     return _reduced(x, dist.ReduceOp.MAX)
 
 
@@ -153,7 +154,8 @@ def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tens
 def sum_gradients(parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
     """Sum the gradients over the processes, in place, and return the sum of ``numbers`` (n,), in one operation.
 
-    For the gradient of a mean over all samples, each process divides its loss by the samples of all processes.
+    For the gradient of a mean over all samples, each process divides its loss by the number of samples of all
+    processes.
     """
     if world_size() == 1:
         return numbers
@@ -180,7 +182,7 @@ def any_process(flag: bool) -> bool:
 
 
 def share(value: Value) -> list[Value]:
-    """Return the values of all processes to all processes. The values are small and can be pickled."""
+    """Return the values of all processes, in every process; values must be small and picklable."""
     if world_size() == 1:
         return [value]
     values = [value] * world_size()
@@ -190,7 +192,7 @@ def share(value: Value) -> list[Value]:
 
 
 def gather(state: State) -> list[State] | None:
-    """Return the states of all processes in process 0, tensors on the CPU; return None in the others."""
+    """Return the states of all processes, with tensors on the CPU, in process 0; return None in the other processes."""
     if world_size() == 1:
         return [state]
     data = io.BytesIO()
@@ -205,9 +207,10 @@ def gather(state: State) -> list[State] | None:
 
 
 def together(function: Callable[[], Value]) -> Value:
-    """Return ``function()`` in all processes, or end all of them.
+    """Call ``function()`` in all processes and return its result, or end all processes.
 
-    After a BidexError in any process, the first such process raises it and all others raise SystemExit.
+    If the function raises BidexError in some processes, the first of these raises it again and all other processes
+    raise SystemExit.
     """
     error = None
     value = None

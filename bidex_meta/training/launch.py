@@ -1,4 +1,4 @@
-"""The way this process was started: alone, or by torchrun as one of several that share a run."""
+"""The way this process was started: as the only one, or by torchrun as one of several that share a run."""
 
 import logging
 import os
@@ -17,12 +17,12 @@ def say(text: str) -> None:
 
 @dataclass(frozen=True)
 class Launch:
-    """This process among those of the run, as torchrun describes it in the environment."""
+    """Rank of this process and number of processes of the run, from torchrun's environment variables."""
 
-    rank: int = 0  # process 0 alone writes and prints
+    rank: int = 0  # only process 0 writes and prints
     count: int = 1  # on all machines
-    local_rank: int = 0  # on its machine
-    local_count: int = 1  # on its machine
+    local_rank: int = 0  # rank among the processes of the same machine
+    local_count: int = 1  # number of processes on the same machine
 
     def own_device(self, device: str) -> str:
         """Return the device of this process.
@@ -44,13 +44,13 @@ def launch() -> Launch:
 
 
 BATCH_SIGNALS = tuple(signal.Signals[name] for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
-"""Sent by batch systems before the time of a job is up; Windows has none of these."""
+"""Signals that batch systems send before the time of a job is up; Windows has neither."""
 
 
 def notices() -> tuple[signal.Signals, ...]:
-    """Return the signals beside SIGINT and SIGTERM that ask a process to end, without those that it ignores.
+    """Return the signals other than SIGINT and SIGTERM that ask a process to end; signals that it ignores are left out.
 
-    SIGHUP comes when the terminal closes (``nohup`` ignores it), the others are ``BATCH_SIGNALS``. Each signal may come
+    SIGHUP comes when the terminal closes (``nohup`` ignores it). The others are ``BATCH_SIGNALS``. Each signal may come
     several times: from the terminal and its shell, or from the batch system and the job that it runs.
     """
     if os.name == "posix":
@@ -61,7 +61,7 @@ def notices() -> tuple[signal.Signals, ...]:
 
 
 def resume_command(path: Path, processes: int) -> str:
-    """Return the command that continues a run of this number of processes."""
+    """Return the command that continues the run in folder ``path`` with this number of processes."""
     if processes == 1:
         return f"bidex-meta run --resume {path}"
     here = launch()

@@ -19,12 +19,12 @@ AutoresetMode = Literal["SAME_STEP", "DISABLED"]
 State = dict[str, Any]
 """A part of a checkpoint: tensors, numbers, texts, None, and dicts and lists of these."""
 Parts = dict[str, Any]
-"""What goes into a checkpoint, by name: modules, optimisers, generators, tensors, and dicts and lists of these."""
+"""Contents of a checkpoint by name: modules, optimisers, generators, tensors, and dicts and lists of these."""
 
 
 @dataclass(frozen=True)
 class LearnerConfig(Checked):
-    """Base of the learners' configs: fields are checked by their annotations, their docstrings are the flags' help."""
+    """Base of learners' configs. Fields are checked against their annotations; their docstrings are help of flags."""
 
     @property
     def algo(self) -> str:
@@ -36,7 +36,7 @@ class LearnerConfig(Checked):
         return 0
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Return the maximum bytes of experience (such as a replay) in a checkpoint; arguments as in ``bytes_held``."""
+        """Return the maximum bytes of experience (a replay) in a checkpoint; arguments are as in ``bytes_held``."""
         return 0
 
 
@@ -47,12 +47,12 @@ class Sources:
     data: Any = None
     """Transitions of data sets (``bidex_meta.data.joined.Joined``), for offline learners."""
     demonstrations: Any = None
-    """Transitions to imitate (``Joined``) while learning by playing."""
+    """Transitions (``Joined``) that the learner imitates while it also learns from its own experience."""
     teachers: Any = None
     """Policies (``bidex_meta.witness.teachers.Teachers``) that label the states that the learner visits."""
 
     def check(self, learner: str, *taken: str, needed: str | None = None) -> None:
-        """Raise BidexError for a source that is not ``taken``, or if the ``needed`` one is missing."""
+        """Raise BidexError if there is a source that is not among ``taken``, or if the ``needed`` source is missing."""
         for name, value in vars(self).items():
             if value is not None and name not in taken:
                 raise BidexError(f"{learner}: learns from no {name}. Leave them out of its sources.")
@@ -64,37 +64,41 @@ NO_SOURCES = Sources()
 
 
 class Capability(StrEnum):
-    """A capability of a learner's class, which the commands and the training rely on."""
+    """A capability of a learner's class, on which the commands and the training loop rely."""
 
     ADAPTS = auto()
-    """Its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
-    explores by its own generator, seeded equally by each call. The meta-test reads ``max_adapt_steps`` (longest episode
-    of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, if there."""
+    """The learner's policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`. The
+    agent explores with its own generator, which every call of ``load_policy`` seeds equally. The meta-test reads two
+    fields of the learner's config, if present: ``max_adapt_steps`` (the longest episode of adaptation) and
+    ``tasks_per_class`` (tasks of each class in a meta-batch)."""
     ADAPTS_INDEPENDENTLY = auto()
     """Each environment adapts only from its own episodes, even if several environments play the same task."""
     OFFLINE = auto()
-    """It learns from data sets (``Sources.data``) and never steps the world."""
+    """The learner learns from data sets (``Sources.data``) and never steps the world."""
     IMITATES = auto()
-    """It may take demonstrations and teachers while it learns by playing (``Sources``)."""
+    """The learner can use demonstrations and teachers (``Sources``) in addition to its own experience."""
     TAUGHT = auto()
-    """It learns only from teachers (``Sources.teachers``): it plays, and they label the states that it visits."""
+    """The learner learns only from teachers (``Sources.teachers``): it acts, and they label the states that it
+    visits."""
     DISCOUNTS_BY_CLASS = auto()
-    """It learns with a discount per class, if the world has these (``world.gammas``)."""
+    """The learner uses a separate discount for each class, if the world has them (``world.gammas``)."""
 
 
 class Learner(ABC):
     """Base of all learners, which train on a world in the mode that :meth:`autoreset_mode` returns.
 
-    ``config`` is an instance of the dataclass of its presets. ``seed`` seeds everything random, including the world's
-    first reset. Learners with capability ``OFFLINE``, ``IMITATES`` or ``TAUGHT`` take a fourth argument, ``sources``.
+    ``config`` is an instance of the dataclass of the learner's presets. ``seed`` seeds everything random, including the
+    world's first reset. Learners with capability ``OFFLINE``, ``IMITATES`` or ``TAUGHT`` take a fourth argument,
+    ``sources``.
     """
 
     name: ClassVar[str] = "learner"
     """The learner's name in messages."""
     presets: ClassVar[Mapping[str, Any]] = {}
-    """Configs by name, all of one dataclass. ``auto``: ``laptop`` on a CPU, ``paper`` on a GPU, else the first."""
+    """Configs by name, all of one dataclass. A run with the preset ``auto`` uses ``laptop`` on a CPU and ``paper`` on a
+    GPU; without these two it uses the first preset."""
     task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """Presets for learning a single task class, by class; they replace presets of the same name."""
+    """Presets for learning a single task class, by class; they replace the presets of the same name in ``presets``."""
     capabilities: ClassVar[frozenset[Capability]] = frozenset()
     """Capabilities that commands and training rely on."""
     privileges: ClassVar[tuple[str, ...]] = ()
@@ -104,7 +108,7 @@ class Learner(ABC):
     environments_per_class: int | None = None
     """Default number of environments of each class on a CPU; None: the default of the suite."""
     env_steps: int
-    """Environment steps so far, over all environments of all processes; offline: updates."""
+    """Environment steps so far, over all environments of all processes; for offline learners, updates so far."""
 
     @abstractmethod
     def __init__(self, world: "VectorWorld", config: Any, seed: int):
@@ -117,14 +121,14 @@ class Learner(ABC):
 
     @classmethod
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
-        """Estimate the memory; see :meth:`LearnerConfig.bytes_held`."""
+        """Estimate the memory of the learner, bytes; see :meth:`LearnerConfig.bytes_held`."""
         if isinstance(config, LearnerConfig):
             return config.bytes_held(num_envs, width)
         return 0
 
     @classmethod
     def bytes_stored(cls, config: Any, num_envs: int, width: int) -> int:
-        """Return the most bytes of experience in a checkpoint; see :meth:`LearnerConfig.bytes_stored`."""
+        """Return the maximum size of experience in a checkpoint, bytes; see :meth:`LearnerConfig.bytes_stored`."""
         if isinstance(config, LearnerConfig):
             return config.bytes_stored(num_envs, width)
         return 0
@@ -135,7 +139,7 @@ class Learner(ABC):
 
     @abstractmethod
     def state_dict(self) -> State:
-        """Return all that a resumed run needs besides the world's state; ``policy`` is :meth:`policy_state_dict`."""
+        """Return all that a resumed run needs besides the world's state; ``policy`` has :meth:`policy_state_dict`."""
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
@@ -148,7 +152,7 @@ class Learner(ABC):
     @classmethod
     @abstractmethod
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
-        """Return the agent of a checkpoint's entry ``learner.policy``, for a world of any number of environments."""
+        """Return the agent of ``learner.policy`` in a checkpoint; it can act in any number of environments."""
 
     def start_from(self, policy: State) -> None:
         """Start from the policy of another run's checkpoint instead of fresh weights."""

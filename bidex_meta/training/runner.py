@@ -1,6 +1,7 @@
-"""The training loop of every learner: iterate, log, save; and stop cleanly at a signal.
+"""The training loop of every learner: it iterates, logs and saves, and stops cleanly at a signal.
 
-Several processes (:mod:`bidex_meta.training.distributed`) do the same iterations and stop together; process 0 writes.
+Several processes (:mod:`bidex_meta.training.distributed`) do the same iterations and stop together. Only process 0
+writes files.
 """
 
 import math
@@ -26,7 +27,7 @@ from bidex_meta.world.contract import VectorWorld
 _SAVING_SHARE = 0.02
 _WITH_MOMENTS = 3
 _OF_AN_ENTRY = 1024  # bytes of an archive's entry: name, place and alignment
-_OF_A_STEP = 8  # numbers that a replay stores of a step beside observation and action
+_OF_A_STEP = 8  # numbers of a step that a replay stores in addition to observation and action
 
 
 def train(
@@ -44,27 +45,31 @@ def train(
 ) -> int:
     """Train until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
-    Both include those of a run that is resumed (``spent_seconds``). Time, which metrics get as ``Perf/training_time``,
-    counts from the first world step to the end of an iteration, with checkpoints; there is at least one iteration.
-    SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 (unless ignored), in any process, finishes the iteration, saves and
-    returns; so does a BrokenPipeError of ``record``, ``watch`` or ``enough``. After SIGINT or SIGTERM another one of
-    these two acts at once.
+    Both limits include the steps and the seconds (``spent_seconds``) of a run that is resumed. Time counts from the
+    first world step to the end of an iteration, including checkpoints; metrics contain it as ``Perf/training_time``.
+    There is at least one iteration. If any process receives SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2 (unless
+    ignored), all processes finish the iteration, save and return. A BrokenPipeError of ``record``, ``watch`` or
+    ``enough`` has the same effect. After SIGINT or SIGTERM, another SIGINT or SIGTERM acts at once.
 
     Args:
-        learner: On ``world``.
-        world: Its state is saved beside the learner's.
-        total_steps: Environment steps in all.
-        record: Receives metrics and checkpoints; in process 0 only, as ``watch`` and ``last``.
-        total_seconds: Training time in all.
-        spent_seconds: Training time of a resumed run before.
-        checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took (a
-            replay makes them large). 0 saves after every iteration. One more is always saved at the end.
-        watch: Evaluates the learner after each iteration without changing it; adds metrics, and no training time.
-        enough: Whether metrics of an iteration end the training, by process 0's; None in no process or in all.
-        last: Metrics of the iteration before a resumed run: where they were enough, nothing is trained.
+        learner: Learner that trains on ``world``.
+        world: World whose state is saved together with the learner's.
+        total_steps: Total number of environment steps.
+        record: Receives metrics and checkpoints. Only process 0 passes ``record``, ``watch`` and ``last``.
+        total_seconds: Total training time, s.
+        spent_seconds: Training time that a resumed run has had so far, s.
+        checkpoint_seconds: Shortest time between two checkpoints, s. It is lengthened to 50 times the duration of the
+            last save, because a replay makes checkpoints large. 0 saves after every iteration. A last checkpoint is
+            always saved at the end.
+        watch: Evaluates the learner after each iteration without changing it, and returns metrics. Its time does not
+            count as training time.
+        enough: Returns whether the metrics of an iteration end the training; process 0 decides. It is None in all
+            processes or in none.
+        last: Metrics of the last iteration of the run that is resumed. If ``enough`` accepts them, nothing is trained.
 
-    Returns the number of the signal that ended the training early (SIGPIPE where nobody reads the output, SIGTERM where
-    another process got it), else 0. Raises LostProcess where another process is gone; checkpoints stay as they are.
+    Returns the number of the signal that ended the training early, else 0. The number is that of SIGPIPE if nobody
+    reads the output, and that of SIGTERM if another process received the signal. Raises LostProcess if another process
+    is gone; existing checkpoints are kept.
     """
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
         return 0  # it was stopped between its last iteration and the end of its evaluation
@@ -128,7 +133,8 @@ def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None
 def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
     """Return the state of a run: ``{"learner": ..., "env": ...}``; all processes must call this function.
 
-    Process 0 gets its own state and, under ``others``, the entries that differ in each of the others; they get None.
+    Process 0 gets its own state and, under ``others``, the entries of each other process that may differ from its own.
+    The other processes get None.
     """
     state = {"learner": learner.state_dict(), "env": world.state_dict()}
     if world_size() == 1:
@@ -141,9 +147,10 @@ def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
 
 
 def checkpoint_bytes(learner: Learner, world: VectorWorld, config: object, steps: int) -> int:
-    """Return the bytes that a checkpoint of a training takes at most, for ``steps`` environment steps in all.
+    """Return the maximum size of a run's checkpoint, bytes, after ``steps`` environment steps.
 
-    ``config`` is the learner's. Optimisers begin empty, and Adam's have two moments for each weight later.
+    ``config`` is the learner's config. Optimisers begin empty, but Adam later stores two moments for each weight, so
+    the learner's tensors count three times.
     """
     width = _numbers(world.single_observation_space) + _numbers(world.single_action_space) + _OF_A_STEP
     own = _WITH_MOMENTS * _tensor_bytes(learner.state_dict()) + _tensor_bytes(world.state_dict())
@@ -166,7 +173,8 @@ def _tensor_bytes(state: object) -> int:
 def resume(learner: Learner, world: VectorWorld, state: State) -> None:
     """Restore a :func:`checkpoint` written by the same number of processes.
 
-    On the CPU, with the same number of threads, training continues bit for bit.
+    On the CPU, with the same number of threads, training continues bit for bit. Raises BidexError for another number of
+    processes.
     """
     parts = [state, *state.get("others", [])]
     if len(parts) != world_size():
@@ -177,7 +185,7 @@ def resume(learner: Learner, world: VectorWorld, state: State) -> None:
 
 
 class _Stop(threading.Event):
-    """A request to stop, and the first signal that brought it."""
+    """A request to stop, and the first signal that requested it."""
 
     number: int = signal.SIGTERM
 
@@ -189,9 +197,10 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator["_Stop"]:
-    """Turn signals that ask for the end into a set event; the first SIGINT or SIGTERM restores the two's old handlers.
+    """Yield an event that is set by signals that ask the process to end.
 
-    The other signals may come twice, and SIGTERM after them, all for one reason: they never break off an iteration.
+    The first SIGINT or SIGTERM restores the old handlers of these two, so that the second acts at once. The other
+    signals never break off an iteration, because they may come twice, or be followed by SIGTERM, for the same reason.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():

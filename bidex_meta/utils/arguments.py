@@ -1,7 +1,7 @@
 """Arguments of public functions, checked against the functions' own annotations.
 
-``@checked_arguments`` stands above a function, a constructor or a dataclass. A call with an argument that its
-annotation does not allow raises BidexError: the name, what was expected and what came.
+``@checked_arguments`` decorates a function, a constructor or a dataclass. A call with an argument that its annotation
+does not allow raises BidexError, with the argument's name, the expected type and the value.
 """
 
 import functools
@@ -37,7 +37,7 @@ from bidex_meta.utils.validation import MOST
 Target = TypeVar("Target", bound=Callable[..., object])
 
 _MOST_ELEMENTS = 1000
-"""Elements of a collection that are looked at: enough to see that it holds something else."""
+"""Number of elements of a collection that are checked: enough to find a wrong type."""
 _WORDS: dict[object, str] = {
     bool: "True or False",
     int: "a whole number",
@@ -52,9 +52,9 @@ _WORDS: dict[object, str] = {
 def checked_arguments(target: Target) -> Target:
     """Check the arguments of every call of a function, or of a dataclass, against their annotations.
 
-    ``int`` stands for any whole number, NumPy's too; ``float`` for any real number except NaN; neither for True and
-    False. A protocol stands for whatever has its attributes. ``Annotated`` adds bounds. Up to 1,000 elements of a
-    collection are checked. ``Any`` and missing annotations allow everything.
+    ``int`` allows any whole number, including NumPy's. ``float`` allows any real number except NaN. Neither allows True
+    or False. A protocol allows any object that has the protocol's attributes. ``Annotated`` adds bounds. Up to 1,000
+    elements of a collection are checked. ``Any`` and missing annotations allow everything.
     """
     if isinstance(target, type):
         target.__init__ = checked_arguments(target.__init__)  # type: ignore[misc]
@@ -86,9 +86,9 @@ def checked_arguments(target: Target) -> Target:
 
 
 def check_attributes(kind: type, base: type, name: str) -> None:
-    """Raise BidexError for the first attribute of a class that is not of its annotation in ``base``.
+    """Raise BidexError for the first attribute of a class that does not fit its annotation in ``base``.
 
-    Properties are left alone: they are known of instances only.
+    Properties are not checked, because only instances have their values.
     """
     for attribute, hint in get_type_hints(base, include_extras=True).items():
         value = inspect.getattr_static(kind, attribute, None)

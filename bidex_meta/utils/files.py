@@ -1,6 +1,6 @@
-"""Reads files that others may have written or damaged: opened, bounded, parsed and checked, errors on one line.
+"""Reading of files that others may have written or damaged: sizes and contents are checked, errors take one line.
 
-No file is read that is larger than its kind can be, and no function waits for a writer.
+A file that is larger than its kind allows is not read, and no function waits for the writer of a pipe.
 """
 
 import json
@@ -16,18 +16,19 @@ from bidex_meta.errors import BidexError, one_line, shortened
 
 Json = Any
 JsonObject = dict[str, Any]
-"""Content of a file of JSON or TOML."""
+"""Content of a JSON or TOML file."""
 MOST_TEXT = 64_000_000
-"""Bytes of a file of JSON or TOML: far above the largest evaluation."""
+"""Maximum size of a JSON or TOML file, bytes; far above the largest file of an evaluation."""
 _DATA_SETS = ("dataset", "demonstrations", "drawn_from")
 """Entries that name data sets."""
 _DEEPEST = 64
 _LARGEST = 2**63 - 1
-"""Larger whole numbers are no count, step or seed of ours, and Python takes long for some thousand digits."""
+"""Largest whole number in a file: our counts, steps and seeds are smaller, and Python is slow for thousands of
+digits."""
 
 
 def expanded(path: str | Path) -> Path:
-    """Replace ``~`` and ``~name`` in a path; raises BidexError for an unknown user or without a home folder."""
+    """Replace ``~`` and ``~name`` in a path; raises BidexError if the user is unknown or has no home folder."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -35,7 +36,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def absolute(path: str | Path) -> Path:
-    """Return a path from the root on, ``~`` replaced and links followed; raises BidexError if links form a circle."""
+    """Return the absolute path, with ``~`` replaced and links followed; raises BidexError if links form a circle."""
     try:
         return expanded(path).resolve()
     except (RuntimeError, OSError) as error:
@@ -45,7 +46,7 @@ def absolute(path: str | Path) -> Path:
 def portable(content: Json) -> Json:
     """Return content for publication: absolute paths are cut to their last part, which drops this machine's folders.
 
-    Data sets keep two parts (``CatchUnderarm/random-v0``), because these are their names.
+    Paths of data sets keep two parts (``CatchUnderarm/random-v0``), because together they are the data set's name.
     """
     return _portable(content, 1)
 
@@ -61,7 +62,7 @@ def _portable(content: Json, parts: int) -> Json:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is a regular file; False, not an error, for a path that cannot be one."""
+    """Return whether a path is a regular file; return False, without an error, for a path that cannot exist."""
     with suppress(OSError, ValueError):
         return path.is_file()
     return False
@@ -111,7 +112,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Return a file's content as text; raises BidexError as :func:`open_regular`, or if it is not UTF-8."""
+    """Return a file's content as text; raises BidexError like :func:`open_regular`, or if the content is not UTF-8."""
     try:
         return read_bytes(path, what).decode()
     except UnicodeDecodeError as error:
@@ -121,13 +122,14 @@ def read_text(path: Path, what: str) -> str:
 def read_json(path: Path, what: str) -> Json:
     """Return the content of a JSON file.
 
-    Raises BidexError as :func:`read_text`, or if it is not JSON, is nested too deep or has a number beyond 64 bits.
+    Raises BidexError like :func:`read_text`, or if the content is not JSON, is nested too deeply or has a number beyond
+    64 bits.
     """
     return _parsed(path, what, "JSON", json.loads)
 
 
 def read_toml(path: Path, what: str) -> JsonObject:
-    """Return the content of a TOML file; raises BidexError as :func:`read_json`."""
+    """Return the content of a TOML file; raises BidexError like :func:`read_json`."""
     return _parsed(path, what, "TOML", tomllib.loads)
 
 

@@ -1,7 +1,7 @@
-"""The choice of how MuJoCo draws (a screen, otherwise EGL, otherwise OSMesa), made before the first picture.
+"""Choice of MuJoCo's drawing backend before the first picture: a screen, otherwise EGL, otherwise OSMesa.
 
-MuJoCo chooses at import, only by ``MUJOCO_GL``, and its import fails if the variable names a missing library. Most runs
-draw nothing and must not fail on that.
+MuJoCo itself chooses when it is imported, only by the environment variable ``MUJOCO_GL``. The import fails if the
+variable names a missing library. Most runs draw nothing and must not fail for that reason.
 """
 
 import os
@@ -25,7 +25,7 @@ _impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine 
 
 
 def set_aside_what_is_missing() -> None:
-    """Remove ``MUJOCO_GL`` from the environment if MuJoCo's import would fail with it; drawing then raises."""
+    """Remove the variable ``MUJOCO_GL`` if MuJoCo's import would fail with it; drawing then raises BidexError."""
     global _impossible
     asked = _asked()
     if not sys.platform.startswith("linux") or "mujoco" in sys.modules or asked in {"", *_OTHERS}:
@@ -41,7 +41,7 @@ def has_screen() -> bool:
 
 @cache
 def prepare() -> None:
-    """Ensure that ``mujoco.Renderer`` works; raises BidexError if ``MUJOCO_GL``, or every backend, cannot draw."""
+    """Ensure that ``mujoco.Renderer`` works; raises BidexError if the backend in ``MUJOCO_GL``, or every one, fails."""
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
@@ -108,9 +108,9 @@ def _load(backend: str, gl_context: Any) -> None:
 
 
 def _try(context: Any) -> None:
-    """Create a context.
+    """Create a drawing context and release it.
 
-    MuJoCo must not meet a context that failed: it would not draw with the next one either.
+    MuJoCo must not get a context that fails, because MuJoCo would then not draw with the next one either.
     """
     with warnings.catch_warnings():  # GLFW's are what the caller is told
         warnings.simplefilter("ignore")

@@ -1,7 +1,7 @@
 """Batched rotations on torch tensors, quaternions (x, y, z, w).
 
-Sums over the three or four components are written out term by term: a library reduction may add in another order for
-another batch size, and the numbers of an environment must not depend on how many there are.
+Sums over the three or four components are written out term by term. The order in which a library's reduction adds may
+depend on the batch size, but an environment's results must not depend on the number of environments.
 """
 
 import math
@@ -25,7 +25,7 @@ def check_precision() -> None:
 
 
 def constant(values: Sequence[float] | Sequence[Sequence[float]], like: Tensor) -> Tensor:
-    """Return fixed numbers, or nested tuples of them, as a tensor of another one's dtype and device, read-only.
+    """Return fixed numbers, or nested tuples of numbers, as a read-only tensor with the dtype and device of ``like``.
 
     The tensor is copied to the device once: a copy in every step would make the host wait for the device.
     """
@@ -33,7 +33,7 @@ def constant(values: Sequence[float] | Sequence[Sequence[float]], like: Tensor) 
 
 
 def indices(values: Sequence[int], like: Tensor) -> Tensor:
-    """Return fixed indices, int64, on the device of a tensor, read-only; they are copied there once."""
+    """Return fixed indices as a read-only int64 tensor on the device of ``like``; they are copied there only once."""
     return _constant(tuple(values), torch.int64, like.device)
 
 
@@ -61,7 +61,8 @@ _PRODUCT_SIGNS = (1, 1, 1, 1, 1, -1, 1, -1, 1, 1, -1, -1, -1, 1, 1, -1)
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Return the Hamilton product a b of (x, y, z, w) quaternions. Shapes (..., 4), broadcast.
 
-    The product handles whole columns at a time: 9 operations instead of 33. For few rows their number decides the time.
+    Whole columns are multiplied at a time, in 9 operations instead of 33. For few rows the number of operations decides
+    the time.
     """
     turned = b.index_select(-1, indices(_PRODUCT, b)) * constant(_PRODUCT_SIGNS, b)
     of_w, of_x, of_y, of_z = turned.unflatten(-1, (4, 4)).unbind(-2)
@@ -124,11 +125,11 @@ def roll_pitch_yaw(q: Tensor) -> Tensor:
 
 
 def random_orientation(u0: Tensor, u1: Tensor) -> Tensor:
-    """Return the turn by pi u0 about x times the turn by pi u1 about y, from draws (n,) in [-1, 1].
+    """Return the rotation by pi u0 about x times the rotation by pi u1 about y, from draws (n,) in [-1, 1].
 
-    Source: docs/figures.md, start noise. Returns quaternions (x, y, z, w), (n, 4), rounded to single precision: sines
-    of a vector unit and of its scalar tail may differ in the last bit of double precision, and a start must not depend
-    on its position in a batch.
+    Source: docs/figures.md, start noise. Returns quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
+    In double precision, sines that a CPU computes as vectors and those that it computes one by one at the end of a
+    batch may differ in the last bit, but a start must not depend on its position in the batch.
     """
     a = 0.5 * math.pi * u0
     b = 0.5 * math.pi * u1
@@ -142,7 +143,7 @@ def random_orientation(u0: Tensor, u1: Tensor) -> Tensor:
 def quaternion_from_rpy(rpy: Sequence[float]) -> tuple[float, float, float, float]:
     """Return the quaternion (w, x, y, z) of R = Rz(yaw) Ry(pitch) Rx(roll); angles in rad.
 
-    It works on plain numbers, for scene poses.
+    The function works on plain numbers, for poses in scenes.
     """
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * a), math.sin(0.5 * a)) for a in rpy)
     return (
@@ -173,6 +174,6 @@ def quaternion_product(
 def may_look(device: torch.device) -> bool:
     """Return whether reading a tensor's values costs nothing; on an accelerator the host would wait for the device.
 
-    Never while a network is exported, because its path may not depend on numbers.
+    The result is False while a network is exported, because the exported code must not branch on values.
     """
     return device.type == "cpu" and not torch.compiler.is_exporting()

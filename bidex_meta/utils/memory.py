@@ -15,16 +15,18 @@ import psutil
 from bidex_meta.errors import BidexError
 
 ROW_BYTES = 500_000
-"""Of an environment on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 each."""
+"""Memory of one environment on the CPU, bytes. We measured 0.39 MB on MT4 and 0.48 MB on MT20 with 1000
+environments."""
 POINT_BYTES = 100
-"""Of a point of an environment's cloud: calculated, in the observation, its copies in a step's info and sources."""
+"""Memory of one point of an environment's cloud, bytes; calculated from the observation, from its copies in the
+``info`` of a step and from the data that clouds are made of."""
 _ROOT = Path("/")  # holds proc and sys; tests give another folder
 
 
 def usable_cores() -> int:
     """Count the cores that this process may use, by its affinity and by the CPU quota of its control groups.
 
-    A quota of one and a half cores counts as two cores; one thread then waits for a part of the time.
+    A quota of one and a half cores counts as two cores; one of two threads then waits part of the time.
     """
     if sys.platform == "linux":
         cores = len(os.sched_getaffinity(0))
@@ -42,7 +44,8 @@ def available() -> int:
 def check_memory(needed: float, what: str, mend: str) -> None:
     """Raise BidexError if fewer than ``needed`` bytes are free.
 
-    ``what`` is the object that takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
+    ``what`` names the object that takes the memory (``"1,000 rows"``); ``mend`` is the advice at the end of the
+    message.
     """
     there = available()
     if needed > there:
@@ -50,7 +53,10 @@ def check_memory(needed: float, what: str, mend: str) -> None:
 
 
 def _free_of_groups() -> Iterator[int]:
-    """Yield what each limit on memory leaves free; the kernel gives pages of files back before it kills a process."""
+    """Yield the bytes that each memory limit leaves free.
+
+    Inactive pages of files count as free, because the kernel gives them back before it kills a process.
+    """
     names = (
         ("memory.max", "memory.current", "inactive_file"),  # version 2 of control groups
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
@@ -74,7 +80,8 @@ def _cpu_quotas() -> Iterator[float]:
 def _groups(controller: str) -> Iterator[Path]:
     """Yield the folders of this process's control groups of a controller, and of their parent groups.
 
-    Inside a container the path may be the host's path. Only its last group exists there, as the root folder.
+    Inside a container the path of a group may be that on the host. Only the path's last group then exists, as the root
+    folder.
     """
     root = _ROOT / "sys" / "fs" / "cgroup"
     for line in _text(_ROOT / "proc" / "self" / "cgroup").splitlines():

@@ -1,4 +1,4 @@
-"""The folders of data, `suites/` and `assets/`: inside the package in a wheel, beside it in a checkout."""
+"""The data folders `suites/` and `assets/`: they lie inside the package in a wheel, and next to it in a checkout."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Classes of the user's own by name: ``package.module:Class``, installed or in the working folder."""
+"""Import of users' own classes by name: ``package.module:Class``, which is installed or in the working folder."""
 
 import importlib
 import importlib.util
@@ -11,7 +11,7 @@ from types import ModuleType
 from bidex_meta.errors import BidexError
 
 _files: dict[str, str] = {}
-"""Files of the classes that were asked for, and the names they were asked for by."""
+"""Files of the imported users' classes, each with the flag and the name that the user gave, for messages."""
 
 
 def is_outside(name: object) -> bool:
@@ -25,7 +25,7 @@ def short_name(name: str) -> str:
 
 
 def name_with_object(name: str, thing: str | None) -> str:
-    """Return the name of a task class with another object: ``CatchUnderarm-block``; for a file without ``.xml``."""
+    """Return the name of a task class with another object, ``CatchUnderarm-block``; a file's ``.xml`` is left out."""
     # Names of the shelf are taken in any case, and written in one.
     if thing is None:
         return name
@@ -38,7 +38,7 @@ def name_without_object(name: str) -> str:
 
 
 def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
-    """Import a class of the user's own, ``package.module:Class``; return it and its module.
+    """Import a user's own class by its name, ``package.module:Class``; return the class and its module.
 
     ``role`` is for messages, e.g. ``--algo``. Raises BidexError if module or class do not exist, or the import raises.
     """
@@ -68,7 +68,7 @@ def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
 
 
 def own_fault(error: BaseException) -> str | None:
-    """Return message and location of an error raised in a user's own class or below it, or None for other errors."""
+    """Return message and location of an error from a user's own class or code that it calls; None for other errors."""
     at = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError):
         at.append((error.filename or "", error.lineno))

@@ -1,4 +1,4 @@
-"""The standard streams of the command line: closed streams, odd encodings and widths, streams without a reader."""
+"""Handling of the standard streams: closed streams, unusual encodings and widths, streams without a reader."""
 
 import contextlib
 import io
@@ -27,9 +27,9 @@ def open_missing() -> None:
 
 
 def print_anything() -> None:
-    """Make stdout and stderr replace the letters that their encoding lacks, instead of raising an error.
+    """Make stdout and stderr replace letters that their encoding does not have, instead of raising an error.
 
-    Otherwise a dash in a table ends hours of training in a traceback where the encoding is not UTF-8.
+    Otherwise, if the encoding is not UTF-8, a dash in a table would end hours of training with a traceback.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -1,7 +1,7 @@
 """Settings, flags and files, checked by msgspec against the annotations of dataclasses.
 
-:func:`check_fields` checks an instance, :func:`parse` makes one of what was read from a file. An error is one line with
-the field, what was expected and the value.
+:func:`check_fields` checks an instance; :func:`parse` makes an instance from the content of a file. An error is one
+line with the field, the expected values and the value that came.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more tha
 Pixels = Annotated[int, Meta(ge=1, le=16_384)]
 Port = Annotated[int, Meta(ge=1, le=65_535)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Width = Annotated[int, Meta(ge=1, le=65_536)]  # of a network's layer; so wide a one alone holds 17 GB
+Width = Annotated[int, Meta(ge=1, le=65_536)]  # of a network layer; two such layers in a row take 17 GB
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, max_length=64)]
 Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
-Point = tuple[Finite, Finite, Finite]  # a place in the world, metres
+Point = tuple[Finite, Finite, Finite]  # a position in the world frame, metres
 Positive = Annotated[float, Meta(gt=0.0, le=_LARGE)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
 Seconds = Annotated[float, Meta(ge=0.0)]  # may be infinite
@@ -50,7 +50,7 @@ Text = Annotated[str, Meta(min_length=1, max_length=4096, pattern=r"^[^\0]*$")]
 class Checked:
     """Base of a dataclass of settings: raises BidexError for fields that do not fit their annotations.
 
-    A class with conditions between fields checks them in its own ``__post_init__``, after this one.
+    A class with conditions between fields checks them in its own ``__post_init__``, after it has called this one.
     """
 
     def __post_init__(self) -> None:
@@ -60,8 +60,9 @@ class Checked:
 def check_fields(settings: object, name: str, as_flags: bool = False, unresolved: Collection[str] = ()) -> None:
     """Raise BidexError for the first field of a dataclass's instance that does not fit its annotation.
 
-    Fields whose annotation is no plain type (a path, a function) are not checked. Messages call the instance ``name``;
-    with ``as_flags`` they name the field as a flag of the command line. Fields in ``unresolved`` may be None.
+    Fields whose annotation is not a plain type (such as a path or a function) are not checked. Messages call the
+    instance ``name``; with ``as_flags`` they name the field as a flag of the command line. Fields in ``unresolved`` may
+    be None.
     """
     for field, hint in _hints(type(settings)).items():
         value = getattr(settings, field)
@@ -78,7 +79,7 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
 
 
 def check_rising(settings: object, name: str, *fields: str) -> None:
-    """Raise BidexError for the first pair of numbers that falls."""
+    """Raise BidexError for the first of the named fields, pairs of numbers, whose second number is the smaller one."""
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -88,8 +89,8 @@ def check_rising(settings: object, name: str, *fields: str) -> None:
 def parse(content: object, kind: type[Kind], where: str, exact: bool = False) -> Kind:
     """Return the content of a file (JSON or TOML) as an instance of a dataclass or another type.
 
-    Raises BidexError for the first entry that does not fit, with ``exact`` also for unknown names. ``where`` is the
-    file and the location in it.
+    Raises BidexError for the first entry that does not fit, and with ``exact`` also for unknown names. ``where``, the
+    file and the location in it, begins the message.
     """
     try:
         if exact:
@@ -102,7 +103,7 @@ def parse(content: object, kind: type[Kind], where: str, exact: bool = False) ->
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
     """Return an argument of any integer type as an int within bounds.
 
-    Raises BidexError if it is not an integer (1.0, True and "1" are not), or out of bounds.
+    Raises BidexError if the argument is not an integer (1.0, True and "1" are not integers), or is out of bounds.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -118,7 +119,7 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
 
 
 def true_or_false(name: str, value: object) -> bool:
-    """Return a truth value, Python's or NumPy's, as a bool; raises BidexError for any other value."""
+    """Return a Python or NumPy bool as a Python bool; raises BidexError for any other value."""
     if not isinstance(value, bool | np.bool_):
         raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
     return bool(value)
@@ -127,7 +128,7 @@ def true_or_false(name: str, value: object) -> bool:
 def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
     """Return an argument as an array of float64 numbers, always a copy.
 
-    Raises BidexError unless it is an array of real numbers with this number of dimensions.
+    Raises BidexError unless the argument is an array of real numbers with ``dimensions`` dimensions.
     """
     try:
         array = np.asarray(value)
@@ -192,7 +193,7 @@ def _refuse_unknown(content: object, kind: object, where: str, place: str = "") 
 
 
 def _message(error: msgspec.ValidationError, content: object, kind: object, field: str = "") -> str:
-    """Rewrite msgspec's complaint as ``place: expected ..., got ....``."""
+    """Rewrite msgspec's message as ``place: expected ..., got ....``."""
     complaint, found, path = str(error).rpartition(" - at `$")
     if not found:
         complaint = str(error)

@@ -1,7 +1,7 @@
-"""Signs of life of a command: a line on stderr whenever it has printed none for a while.
+"""Signs of life of a command: it prints a line on stderr whenever it has printed nothing for a while.
 
-``watched`` keeps a thread that looks at the clock; slow code notes its activity. Nothing is printed outside a
-``watched`` block.
+``watched`` runs a thread that checks the clock. Slow code calls ``note`` with its current activity. Nothing is printed
+outside a ``watched`` block.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ class _Watch:
         self.patience = _FIRST_SECONDS
 
     def look(self) -> None:
-        """Print a line if the last one is too old."""
+        """Print a line if the last line was printed too long ago."""
         now = self.clock()
         if self.what and now - self.told_at >= self.patience:
             if self.detail:
@@ -42,7 +42,7 @@ _watch: _Watch | None = None
 
 
 def note(what: str, detail: str = "") -> None:
-    """Note the command's current activity for the next sign of life; ``""`` stops the signs until the next note."""
+    """Set the command's current activity for the next sign of life; ``""`` stops the signs until the next call."""
     if _watch is None:
         return
     if what != _watch.what:
@@ -52,7 +52,7 @@ def note(what: str, detail: str = "") -> None:
 
 
 def told() -> None:
-    """Report that something was printed elsewhere."""
+    """Record that other code has printed a line, which delays the next sign of life."""
     if _watch is not None:
         _watch.told_at = _watch.clock()
         _watch.patience = _SECONDS
@@ -66,7 +66,7 @@ def tell(text: str) -> None:
 
 @contextlib.contextmanager
 def watched(what: str) -> Iterator[None]:
-    """Print signs of life while the block runs, at first of ``what``."""
+    """Print signs of life while the block runs; ``what`` is its first activity."""
     global _watch
     outer = _watch
     _watch = _Watch(what, time.monotonic)
