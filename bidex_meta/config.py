@@ -83,85 +83,90 @@ class RunConfig(Generic[LearnerSettings]):
     suite: Text | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: Text | None = None
-    """Train on this single task class instead of a suite; also package.module:Class of your own (docs/own-task.md)."""
+    """Train on this single task class instead of a suite: a name (see `bidex-meta list tasks`), or package.module:Class
+    for your own (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class itself does. In HandOver the bases are fixed, in
-    all other classes and in our suites they move."""
+    """With --task: moving or fixed bases of the hands. own: as the class defines it (HandOver has fixed bases, all
+    other classes moving ones). In our suites, all bases move."""
     points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
-    """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
-    original; docs/points.md); 0: the states, or as the suite's file says."""
+    """Number of points of the point cloud that replaces the objects' states in observations, as from a depth camera
+    (docs/points.md); the original uses 768. 0: states, unless the suite's file asks for points."""
     touch: Switch = False
-    """Observations also show touch sensors: normal forces at the fingertips and palms, 14 entries (docs/world.md)."""
+    """Add touch sensors to observations: 14 normal forces at fingertips and palms (docs/world.md)."""
     object: Text | None = None
-    """With --task: the object to throw in place of the class's own object: a name of the shelf or the path of an MJCF
-    file (docs/objects.md)."""
+    """With --task: throw this object instead of the class's own: a name from `bidex-meta list objects` or the path of
+    an MJCF file (docs/objects.md)."""
     tasks_per_class: Annotated[int, Meta(ge=0, le=MOST_TASKS)] | None = None
-    """With --suite: train tasks of each class; 0: a new task in each episode, or in each trial of a learner that
-    adapts (docs/own-suite.md); by default as the suite's file says."""
+    """With --suite: number of train tasks of each class. 0: draw a new task for each episode, or for each trial of a
+    learner that adapts (docs/own-suite.md). None: the number in the suite's file."""
     start_from: Text | None = None
-    """Begin with the policy of this run's last checkpoint (its network and observation statistics) instead of a new
-    policy."""
+    """Start training from the policy in the last checkpoint of this run (network and observation statistics). None: a
+    new policy."""
     algo: Text = "mtppo"
-    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
+    """Learner to train: a name (see `bidex-meta list algos`), or package.module:Class for your own
+    (docs/own-learner.md)."""
     preset: Text = "auto"
-    """Values of the learner's options that no flag sets. auto: metaworld for Meta-World's suites; v2 for version 2 if
-    the learner has it; else laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
+    """Named set of defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if
+    the learner has this preset; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     num_envs: Environments = UNRESOLVED
-    """Environments stepped together by each process, over all tasks."""
+    """Number of environments that each process steps together, over all tasks."""
     steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
-    """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
-    gradient updates."""
+    """Environment steps to train for, summed over all environments and processes; 2e7 is accepted. With --dataset:
+    number of gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
-    """Minutes to train for, summed over all resumes; training ends after --minutes or --steps, whichever is reached
-    first. Building the world and evaluations are not counted; in short runs they can take longer than training. None:
-    no limit."""
+    """Minutes to train for, summed over all resumes. Training ends after --minutes or --steps, whichever is reached
+    first. Building the world and evaluations do not count; in short runs they can take longer than training. None: no
+    limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations, one episode for up to ten tasks of each class (at least ten overall; learners
-    that adapt: after two shots on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect
-    training. None: never."""
+    """Evaluate every N iterations and keep the best policy as checkpoints/best.pt. Each evaluation plays one episode of
+    up to ten tasks per class (at least ten episodes overall); learners that adapt are tested on train tasks after two
+    shots. Evaluations do not affect training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
+    """Film one environment of each class every N iterations; films go into videos/ and to the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
-    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of acting, with --algo bc, bcq,
-    td3bc or iql, for the suite or task that it was recorded on. If given several times: from all of them."""
+    """Learn offline from this data set (a name from `bidex-meta data list`, or a folder) on the suite or task that it
+    was recorded on. Needs --algo bc, bcq, td3bc or iql. Repeat the flag to use several data sets."""
     task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
-    """Imitate this data set too (named as for --dataset; see `bidex-meta record demonstrations`), with a weight that
-    decays; with --algo mtppo and ppo (see --learner.demonstration-batch). If given several times: all of them."""
+    """With --algo mtppo and ppo: also imitate this data set, with a weight that decays (see `bidex-meta record
+    demonstrations` and --learner.demonstration-batch). Repeat the flag to use several data sets."""
     teacher: Several = ()
-    """With --algo dagger, icl, mtppo and ppo: the teacher that labels the states that the policy visits. scripts: the
-    scripts of all classes that have one; or the folder of a run on the same suite, or on one of its classes. If given
-    several times: each class takes the first teacher that knows it."""
+    """With --algo dagger, icl, mtppo and ppo: teacher that labels the states that the policy visits. scripts: the
+    scripted policies of all classes that have one; otherwise the folder of a run on the same suite or on one of its
+    classes. Repeat the flag for several teachers: each class takes the first teacher that knows it."""
     record: Steps = 0
-    """Keep about this many transitions of the training as the data set replay/ in the run's folder; they are whole
-    episodes of some of the environments (docs/data.md). 0: none."""
+    """Store about this number of training transitions as the data set replay/ in the run's folder, in whole episodes of
+    some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
     """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the mean return reaches this: in evaluations with --evaluate-every, otherwise in training."""
+    """Stop as soon as the mean return reaches this value, measured in evaluations with --evaluate-every, otherwise in
+    training. None: never."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as this fraction of the episodes succeeds, such as 0.8: in evaluations with --evaluate-every,
-    otherwise in training, where actions explore."""
+    """Stop as soon as this fraction of the episodes succeeds, such as 0.8, measured in evaluations with
+    --evaluate-every, otherwise in training, with exploration noise. None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
-    --evaluate-every."""
+    """Stop as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
+    --evaluate-every. None: never."""
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
     seed: Seed = 0
-    """Seed of tasks, starts and learner."""
+    """Seed that draws tasks and start states and initialises the learner."""
     device: Text = "auto"
-    """auto, cpu or cuda:N."""
+    """Device to train on: auto (a GPU if there is one), cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics engine: C MuJoCo (CPU only) or mujoco_warp (CPU or GPU); auto: the faster one on the device."""
+    """Physics engine: c (C MuJoCo, CPU only), warp (mujoco_warp, CPU or GPU), or auto (the faster one on the
+    device)."""
     deterministic: bool = False
-    """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
+    """Make a run on a GPU repeatable bit for bit, which slows physics and learning down. Runs on a CPU are always
+    repeatable."""
     threads: Threads = UNRESOLVED
-    """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
-    processes. A resumed run keeps its number."""
+    """CPU threads for torch and the physics in each process. None: the machine's cores divided by its number of
+    processes. A resumed run keeps its number of threads."""
 
     def __post_init__(self) -> None:
         check_fields(self, "run", as_flags=True, unresolved=_UNRESOLVED)

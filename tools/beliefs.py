@@ -36,10 +36,10 @@ def beliefs(
 
     Args:
         run: Folder of a run of icl.
-        shots: Exploring episodes.
-        tasks: Tasks of each class.
-        split: Test tasks, or others of the train classes.
-        out: File that takes the numbers too.
+        shots: Number of exploring episodes before the evaluated one.
+        tasks: Number of tasks of each class.
+        split: Tasks to play: test, or others (unseen tasks of the train classes).
+        out: JSON file to write the numbers to; None: only print them.
     """
     folder = RunFolder.open(run)
     if folder.config().algo != ICL.name:

@@ -47,10 +47,10 @@ def collect(
     """Add all runs, or none, to the file of a study, and print the runs' names.
 
     Args:
-        runs: Run folders, or the files of sweeps, of which the runs that have ended are taken.
-        into: The study's file of JSON, in which a run has the name of its folder.
-        out: Where a sweep's folder lies (`--out` of `bidex-meta sweep`).
-        arm: What tables call these runs; None: of a sweep its arms, else the folder's name without suite and seed.
+        runs: Run folders, or files of sweeps; only runs that have ended are taken from a sweep.
+        into: JSON file of the study; each run is stored under the name of its folder.
+        out: Parent of a sweep's folder (`--out` of `bidex-meta sweep`).
+        arm: Name of these runs in tables; None: the arm in the sweep, or the folder's name without suite and seed.
 
     Raises:
         BidexError: A run cannot be condensed, or it would replace another run.

@@ -24,9 +24,9 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
     Example: python -m tools.experts results/data/experts.json --out assets/references/expert.json
 
     Args:
-        runs: Runs of single classes, folders or files of results/data: a suite's policy is judged by these scores.
-        suite: Suite whose train classes are looked up.
-        out: File of references, written anew.
+        runs: Runs on single classes: run folders, or files in results/data. Scores of all policies refer to these runs.
+        suite: Suite whose train classes are listed.
+        out: File of references to replace; None: only print.
     """
     known = best_known(open_worlds({"suite": suite}).task_classes(), runs)
     for name, row in known.items():

@@ -49,9 +49,9 @@ def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 2
     """Write the page, and its pictures into ``images/tasks/`` beside it.
 
     Args:
-        out: The Markdown file.
-        width: Width of the pictures, pixels.
-        height: Height of the pictures, pixels.
+        out: Markdown file to write.
+        width: Width of the pictures in pixels.
+        height: Height of the pictures in pixels.
     """
     for name in registry.names():
         for view in VIEWS:

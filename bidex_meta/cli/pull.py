@@ -27,14 +27,17 @@ from bidex_meta.utils.files import absolute
 
 @dataclass(frozen=True)
 class PullFlags:
-    """Fetch what was pushed: `bidex-meta evaluate` plays a policy, `bidex-meta data info` describes a data set.
+    """Fetch a policy or a data set that `bidex-meta push` published.
+
+    `bidex-meta evaluate` then plays the policy, and `bidex-meta data info` describes the data set.
 
     Example: bidex-meta pull me/mt4-mtppo
     """
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """Repository of the Hugging Face Hub, of a data set datasets/OWNER/NAME; or folder:PATH."""
-    out: Path | None = None  # The new folder; None: pulled/NAME.
+    """Repository on the Hugging Face Hub: OWNER/NAME for a policy, datasets/OWNER/NAME for a data set; or
+    folder:PATH."""
+    out: Path | None = None  # Folder to create; None: pulled/NAME.
 
 
 def main(arguments: Sequence[str]) -> None:

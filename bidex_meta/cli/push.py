@@ -35,10 +35,11 @@ class PushFlags:
     Example: bidex-meta push runs/MT4/mtppo/2026-11-21_10-00-00_seed0 me/mt4-mtppo
     """
 
-    run: RunPath  # Folder of a run, or of a data set.
+    run: RunPath  # Folder of a run or of a data set.
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """Repository of the Hugging Face Hub, of a data set datasets/OWNER/NAME; or folder:PATH."""
-    private: Switch = False  # A repository that is made now is private.
+    """Repository on the Hugging Face Hub: OWNER/NAME for a policy, datasets/OWNER/NAME for a data set; or
+    folder:PATH."""
+    private: Switch = False  # Make the repository private if this command creates it.
 
 
 def main(arguments: Sequence[str]) -> None:

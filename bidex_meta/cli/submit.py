@@ -18,7 +18,7 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry of runs, which play their own tasks and equally many new tasks, or of a meta-test.
+    """Write a leaderboard entry for a meta-test or for runs, which play their own tasks and equally many new tasks.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
@@ -26,16 +26,19 @@ class SubmitFlags:
     verification.
     """
 
-    runs: RunPaths  # Run folders, a seed each.
-    tuning: str | None = None  # Settings that you tried before you chose these, times seeds of each; 1x1: no others.
-    check: Path | None = None  # Play the runs of this entry again and compare; writes nothing.
-    evaluation: Path | None = None  # Instead of runs: the file of a meta-test, from meta_test(agent, suite).save(FILE).
+    runs: RunPaths  # Run folders, one for each seed.
+    tuning: str | None = None
+    """Tuning effort: number of settings that you tried, times seeds per setting, such as 12x1; 1x1: no other
+    settings."""
+    check: Path | None = None  # Play the runs of this entry again and compare the results; nothing is written.
+    evaluation: Path | None = None
+    """File of a meta-test to submit instead of runs, written by meta_test(agent, suite).save(FILE)."""
     track: AdaptationTrack | None = None
-    """Training of the agent of --evaluation: reward-only (rewards of its own episodes) or privileged (also teachers,
-    hidden parts of tasks or rewards of other goals)."""
-    name: str | None = None  # Name on the leaderboard; None: the algorithm, or the agent's class.
-    out: Path = Path("results/leaderboard")  # Folder of entries.
-    episodes: Few | None = None  # Of each task; None: 1, of learners that adapt 10 after each shot.
+    """With --evaluation: data that the agent was trained on. reward-only: rewards of its own episodes; privileged: also
+    teachers, hidden parts of tasks or rewards of other goals."""
+    name: str | None = None  # Name on the leaderboard; None: the algorithm, or the class of the agent.
+    out: Path = Path("results/leaderboard")  # Folder of leaderboard entries to write to.
+    episodes: Few | None = None  # Episodes of each task; None: 1, and for learners that adapt 10 after each shot.
     device: Device = "auto"
 
 

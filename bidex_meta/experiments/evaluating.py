@@ -141,19 +141,25 @@ class FinalEvaluation:
     """The evaluation at the end of training."""
 
     episodes: Few | None = None
-    """Episodes of each task in the final evaluation. None: 4, or 1 if a task fixes its start (metaworld/...); learners
-    that adapt play --rollouts episodes."""
+    """Episodes of each task in the final evaluation. None: 4, or 1 if tasks fix their start (metaworld/...); for
+    learners that adapt, the value of --rollouts."""
     other_tasks: Switch = False
-    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
-    others."""
+    """In the final evaluation, also play an equal number of tasks that the run was not trained on. For learners that
+    adapt, use --split others instead."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks, on ML20
-    those of fifteen train and five unseen classes. others: tasks of the train classes that the run was not trained
-    on."""
-    shots: Shots | None = None  # Adaptation rounds of that evaluation, one after the other. None: 2.
-    rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, 40 at most.
-    tasks: Count | None = None  # Tasks of each class in that evaluation, the first of its pool. None: 5.
-    hidden_rewards: Switch = False  # That evaluation is also played with its rewards hidden.
+    """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks; on ML20
+    these are fifteen train classes and five unseen ones. others: tasks of the train classes that the run was not
+    trained on."""
+    shots: Shots | None = None
+    """For learners that adapt: adaptation rounds in the final evaluation, one after the other. None: 2."""
+    rollouts: Few | None = None
+    """For learners that adapt: episodes of each task in one adaptation round of the final evaluation. None: as in
+    training, at most 40."""
+    tasks: Count | None = None
+    """For learners that adapt: number of tasks of each class in the final evaluation, taken from the start of its pool.
+    None: 5."""
+    hidden_rewards: Switch = False
+    """For learners that adapt: repeat the evaluation episodes of the final evaluation with their rewards hidden."""
 
     def check(self, config: AnyConfig) -> None:
         """Raise BidexError for a bad value, or for an option that the learner of a resolved config does not support."""

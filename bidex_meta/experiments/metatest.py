@@ -28,20 +28,26 @@ class Options:
     """Options of a meta-test or an evaluation: its tasks, episodes and environments."""
 
     episodes: Few | None = None
-    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
-    many as --rollouts."""
-    shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, at most 40, else 10.
-    tasks: Few | None = None  # Number of tasks of each class to adapt to, the first of its pool; None: 5.
+    """Evaluation episodes of each task. None: 4, or 1 if tasks fix their start (metaworld/...); for learners that
+    adapt, the value of --rollouts."""
+    shots: Shots | None = None
+    """For learners that adapt: adaptation rounds of --rollouts episodes, one after the other. None: 2."""
+    rollouts: Few | None = None
+    """For learners that adapt: episodes of each task in one adaptation round. None: as in training, at most 40; 10 if
+    training does not define it."""
+    tasks: Few | None = None
+    """For learners that adapt: number of tasks of each class to adapt to, taken from the start of its pool. None: 5."""
     trials: Few | None = None
-    """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or as many as
-    give five adaptations per class, because the episodes of one adaptation show nothing about other adaptations."""
+    """For learners that adapt: number of adaptations to each task, each from the unadapted policy and with new
+    episodes. None: enough for at least five adaptations per class (1 with five tasks or more)."""
     num_envs: Environments | None = None
-    """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
-    class). For learners that adapt, the maximum number, which bounds memory but does not alter the protocol; None:
+    """Environments stepped together, a multiple of the number of tasks. None: one per task (metaworld/...: 5 per
+    class). For learners that adapt: the maximum number, which bounds memory and does not change the protocol; None:
     1024."""
-    seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
-    hidden_rewards: Switch = False  # Learners that adapt also play the evaluation episodes with their rewards hidden.
+    seed: Seed = EVALUATION_SEED
+    """Seed of the start states of the evaluation episodes. Training never uses the default seed."""
+    hidden_rewards: Switch = False
+    """For learners that adapt: also play the evaluation episodes with their rewards hidden."""
 
     def refuse_adaptation(self, algo: str) -> None:
         """Raise BidexError if an option is given that only concerns adaptation."""

@@ -61,35 +61,41 @@ class RecordConfig:
     """A data set to record, for example ``RecordConfig("random", task="CatchUnderarm", size=10_000)``."""
 
     kind: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(RUNS))]
-    """random: uniform actions; medium, expert: the policy of one run; medium-expert: of two runs, half each; replay:
-    the transitions that `bidex-meta run --record N` stored; demonstrations: successful replays of the class's witness,
-    a stored reference solution (see --starts)."""
+    """Policy to record. random: uniform actions; medium, expert: the policy of one run; medium-expert: the policies of
+    two runs, half of the data each; replay: the transitions stored by `bidex-meta run --record N`; demonstrations:
+    successful replays of the class's witness, a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
-    """Run folders. The kind decides how many."""
-    suite: str | None = None  # random: suite to play, a name or path of a TOML file; otherwise the run's own is played.
-    task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
-    base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
+    """Run folders: one for medium, expert and replay, two for medium-expert, none for random and demonstrations."""
+    suite: str | None = None
+    """With random: suite to play, a name or the path of a TOML file. The other kinds play the suite of the run."""
+    task: str | None = None
+    """With random: single class to play instead of a suite. With demonstrations: class whose witness is replayed."""
+    base: Literal["own", "moving", "fixed"] = "own"
+    """With --task: moving or fixed bases of the hands; own: as the class defines it."""
     size: Steps = 0
-    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4; a few more, since episodes are whole."""
-    checkpoint: str = "last"  # Which policy of a run: last, best or a file.
+    """Number of transitions to record; slightly more are recorded, because episodes are whole. 0: 1e6, for
+    medium-expert 2e6, for demonstrations 2e4."""
+    checkpoint: str = "last"  # Checkpoint of the run to play: last, best or a file.
     actions: Literal["sampled", "mean"] = "sampled"
-    """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
+    """Actions of a run's policy. sampled: drawn from its distribution, if it has one; mean: its mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Standard deviation of Gaussian noise on the actions of a witness, or of a policy without a distribution."""
+    """Standard deviation of the Gaussian noise added to the actions of a witness, or of a policy without a
+    distribution."""
     starts: Literal["witness", "tasks"] = "witness"
-    """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
-    class, from their starts, where it succeeds less often but shows more."""
+    """With demonstrations: starts of the episodes. witness: the witness's own task and start, with shifted objects;
+    tasks: all tasks of the class from their own starts, which succeeds less often and covers more states."""
     script: Switch = False
-    """demonstrations, --starts tasks: play a scripted policy instead of the witness, computed from each start
-    (about a second for 500 steps): eight classes have one, and it succeeds more often."""
+    """With demonstrations --starts tasks: play a scripted policy that is computed from each start (one second per 500
+    steps) instead of the witness. It succeeds more often; eight classes have a script."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
-    """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
-    num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
-    seed: Seed = 0  # Seed of starts and actions, and of random's tasks (a run keeps its own tasks).
-    out: Path | None = None  # Folder of the data set; None: NAME/KIND-v0 in the folder of BIDEX_DATA, else in data/.
-    device: str = "auto"  # auto, cpu or cuda:N.
-    engine: Literal["auto", "c", "warp"] = "auto"  # Physics; auto: the one that is fast on the device.
-    threads: Threads | None = None  # Threads of torch and of the physics; None: one per core.
+    """With demonstrations --starts witness: distance in metres by which the objects' start is shifted."""
+    num_envs: Environments | None = None  # Environments stepped together; None: one per task, at least 200.
+    seed: Seed = 0  # Seed of start states and actions, and with random also of the tasks (a run keeps its own tasks).
+    out: Path | None = None
+    """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, otherwise in data/."""
+    device: str = "auto"  # Device to play on: auto, cpu or cuda:N.
+    engine: Literal["auto", "c", "warp"] = "auto"  # Physics engine: c, warp, or auto (the faster one on the device).
+    threads: Threads | None = None  # CPU threads for torch and the physics; None: one per core.
 
     def __post_init__(self) -> None:
         check_fields(self, "record", as_flags=True)

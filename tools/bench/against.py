@@ -45,14 +45,14 @@ def against(
 
     Args:
         other: A commit of the git checkout that this code runs from, or a folder with a checkout.
-        suite: A suite that both know, each by its own file.
-        num_envs: Environments of the suite's world; a class alone has a quarter of them.
-        steps: Control steps of each repeat, after as many to warm up.
-        repeats: Pairs of repeats; medians are reported.
-        classes: Measure each class of the suite alone too, as the suite has it.
-        threads: Engine threads; None takes all CPUs.
+        suite: Suite to step; both sides must have a file for it.
+        num_envs: Environments of the suite's world; the world of a single class has a quarter of this number.
+        steps: Control steps of each repeat, after the same number of steps to warm up.
+        repeats: Number of pairs of repeats; medians are reported.
+        classes: Also measure each class of the suite on its own, with the suite's rules.
+        threads: CPU threads for the physics; None: one per CPU.
         seed: Seed of worlds and actions.
-        out: File that takes the result.
+        out: JSON file to write the result to; None: only print it.
 
     Returns:
         ``old`` and ``new`` (git commit, and whether anything was changed since), the settings, and ``table``: for the

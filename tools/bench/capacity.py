@@ -29,12 +29,12 @@ def capacity(
     pairs of the broadphase and pairs of the convex collider in a sample of 32 environments per step.
 
     Args:
-        suite: Measure the classes of this suite.
-        task: Measure this class; with neither suite nor task every class is measured.
-        steps: Environment steps a class.
-        num_envs: Rows.
-        threads: Engine threads; None takes all CPUs.
-        seed: Seed of world and actions.
+        suite: Suite whose classes are measured.
+        task: Class to measure. Without suite and task, every class is measured.
+        steps: Environment steps per class.
+        num_envs: Environments stepped together.
+        threads: CPU threads for the physics; None: one per CPU.
+        seed: Seed of worlds and actions.
 
     Returns:
         By class: quantiles of contacts, constraint rows, candidate pairs and convex pairs of a simulation.

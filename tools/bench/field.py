@@ -34,9 +34,9 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
     of a step differ between the libraries, so the table has further columns besides the speed.
 
     Args:
-        num_envs: Rows of MT4 and MT20. Meta-World's vector environment has ten, and so has ours of it.
-        steps: Environment steps (of one row) of each repeat, after as many to warm up.
-        repeats: Interleaved repeats; medians are reported.
+        num_envs: Environments of MT4 and MT20. Both vector environments of Meta-World have ten.
+        steps: Environment steps (of one environment) of each repeat, after the same number of steps to warm up.
+        repeats: Number of interleaved repeats; medians are reported.
         seed: Seed of environments and actions.
 
     Returns:

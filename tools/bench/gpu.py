@@ -37,14 +37,14 @@ def gpu(
 
     Args:
         suite: Suite to step.
-        tasks: Classes to step alone.
-        sizes: Numbers of environments.
-        steps: Control steps of each measurement, after as many to warm up, 32 at least.
-        device: Where the worlds live.
-        engine: As in ``Benchmark.make_world``.
+        tasks: Classes to step on their own.
+        sizes: Numbers of environments to measure.
+        steps: Control steps of each measurement, after the same number of steps (at least 32) to warm up.
+        device: Device of the worlds, such as cuda:0.
+        engine: Physics engine: auto, c or warp.
         seed: Seed of worlds and actions.
-        out: File that takes each row as it is measured; what is in it is not measured again.
-        learning: Measure training with MT-PPO too.
+        out: JSON file that receives each row when it is measured; rows that it already contains are not repeated.
+        learning: Also measure training with MT-PPO.
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and

@@ -39,15 +39,15 @@ def stability(
     played from its own start and from shifted starts.
 
     Args:
-        suite: Test the classes of this suite, with the bases they have there, by its version's rules.
-        task: Test this class, with a moving base and, where it has one of its own, the fixed one. With neither suite
-            nor task every class is tested.
-        steps: Environment steps a class.
-        num_envs: Rows.
-        threads: Engine threads; None takes all CPUs.
-        seed: Seed of world and actions.
-        device: Where the world lives.
-        engine: As in ``Benchmark.make_world``.
+        suite: Suite whose classes are tested, with its bases and the rules of its version.
+        task: Class to test, with moving bases and, if the class has them, also with fixed bases. Without suite and
+            task, every class is tested.
+        steps: Environment steps per class.
+        num_envs: Environments stepped together.
+        threads: CPU threads for the physics; None: one per CPU.
+        seed: Seed of worlds and actions.
+        device: Device of the worlds: cpu or cuda:N.
+        engine: Physics engine: auto, c or warp.
 
     Returns:
         By class: unstable rows, warnings, fastest object (m/s), shares of sampled states without a contact deeper than

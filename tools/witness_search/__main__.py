@@ -23,11 +23,11 @@ from tools.witness_search.whole import searched
 class Search:
     """Arguments of every search, and the storage of its episode."""
 
-    task: str  # Task class.
+    task: str  # Task class to solve.
     file: Path | None = None
-    """Keep the episode here, even if it does not hold; None: in witnesses/TASK.npz, if it holds, that is if it solves
-    the task from its start and from eight of ten shifted ones."""
-    threads: int | None = None  # Threads of the physics; None: one per core.
+    """File to store the episode in, even if it does not hold. None: witnesses/TASK.npz, and only if the episode holds:
+    it must solve the task from its start and from at least eight of ten shifted starts."""
+    threads: int | None = None  # CPU threads for the physics; None: one per core.
 
     def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
         """Replay an episode (T, action_size), print the result, and store the episode with facts about its search.
@@ -51,9 +51,9 @@ class Search:
 class Plan(Search):
     """Plan some steps ahead on the printed reward, as the episode goes on."""
 
-    improve: Path | None = None  # Start from the episode in this file.
-    tries: int = 1  # Searches with other seeds before giving up.
-    planner: PlannerConfig = field(default_factory=PlannerConfig)  # The planner.
+    improve: Path | None = None  # Start the search from the episode in this file; None: from scratch.
+    tries: int = 1  # Number of searches, each with another seed, before giving up.
+    planner: PlannerConfig = field(default_factory=PlannerConfig)  # Settings of the planner.
 
     def run(self) -> None:
         """Search with one seed after another until an episode holds."""
@@ -76,9 +76,9 @@ class Plan(Search):
 class Improvement(Search):
     """Arguments of a search that begins with an episode."""
 
-    improve: Path  # File of the episode to begin with.
+    improve: Path  # File of the episode to start from.
     rounds: int  # Rounds of the search.
-    seed: int = 0  # Of changes and shifted starts.
+    seed: int = 0  # Seed of the changes and of the shifted starts.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,28 +27,30 @@ class PlannerConfig:
 
     samples: int = 128  # Action sequences per round.
     copies: int = 1
-    """Slightly shifted states that are played side by side, a divisor of ``samples``: each sequence meets one of them,
-    the best ones of a plan meet all, and their mean counts: no plan that holds by luck."""
+    """Number of slightly shifted copies of the state, a divisor of samples. Each sequence is played from one copy, the
+    best sequences from all copies, and their mean counts, so that no plan succeeds by chance."""
     rounds: int = 3  # Rounds per plan.
-    first_rounds: int = 10  # Rounds of the first plan, which has no predecessor.
+    first_rounds: int = 10  # Rounds of the first plan, which cannot reuse an earlier plan.
     rounds_after: int = 1  # Rounds per plan once the task has been solved.
-    elite_share: float = 0.08  # Share of the sequences that mean and deviation move towards.
-    kept_elites: int = 8  # Elites that are tried again in the next round, and as parents of mutants.
+    elite_share: float = 0.08  # Share of the sequences to which mean and standard deviation are fitted.
+    kept_elites: int = 8  # Elites that are tried again in the next round, and from which mutants are made.
     mutants: float = 0.5
-    """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
-    mutated: float = 0.15  # Share of the actions that a mutant changes which does not change one part of the hands.
-    horizon: int = 41  # Control steps a plan looks ahead.
-    knots: int = 9  # Knots of a plan; actions between them are interpolated linearly.
+    """Share of the sequences that are elites with some changed knots; all others are drawn around the mean."""
+    mutated: float = 0.15  # Share of the actions that a mutant changes, if it does not change one part of the hands.
+    horizon: int = 41  # Control steps that a plan looks ahead.
+    knots: int = 9  # Knots of a plan; actions between knots are interpolated linearly.
     execute: int = 10
-    """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
+    """Control steps played before the next plan. A multiple of the space between knots leaves the rest of the plan
+    unchanged."""
     std: float = 0.5
-    """Deviation of the knots in a first round; a sequence takes a share of it, from all to a twentieth."""
-    min_std: float = 0.12  # The deviation never falls below this.
-    gamma: float = 0.97  # Discount per control step.
+    """Standard deviation of the knots in the first round; each sequence uses a share of it, from one twentieth to
+    all."""
+    min_std: float = 0.12  # Minimum standard deviation of the knots.
+    gamma: float = 0.97  # Discount factor per control step.
     effort: float = 0.05
-    """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N: for
-    free, a hand soon presses on its table so hard that nothing moves it any more."""
-    seed: int = 0  # Of the samples.
+    """Penalty, in units of reward, for one control step with a base's full force (up to 800 N) or torque. Without it, a
+    hand soon presses on its table so hard that nothing moves it any more."""
+    seed: int = 0  # Seed of the samples.
 
 
 @dataclass(frozen=True)

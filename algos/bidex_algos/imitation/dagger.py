@@ -22,24 +22,30 @@ class DAggerConfig(NetworkConfig):
     """All options of DAgger; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (512, 512)  # Widths of the hidden layers.
-    activation: Activation = "elu"  # Non-linearity of the hidden layers.
+    activation: Activation = "elu"  # Activation function of the hidden layers.
     init_std: Positive = 0.2
-    """Standard deviation of the actions for learners that start from the policy; DAgger plays its mean."""
-    rollout_steps: Count = 8  # Steps taken in every environment between two lots of updates.
+    """Standard deviation of the actions for learners that start from this policy; DAgger itself plays the mean
+    action."""
+    rollout_steps: Count = 8  # Steps in every environment between two rounds of updates.
     updates_per_iteration: Count = 50  # Updates after each rollout.
-    batch_size: Count = 1024  # Labelled observations of an update, split evenly over the classes with a teacher.
-    samples: Count = 1_500_000  # Labelled observations that each process keeps; the oldest go first.
-    learning_rate: Positive = 5e-4  # Adam's step size.
-    decay_steps: Whole = 0  # Environment steps over which it falls in a line to a twentieth of that; 0: it stays.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
+    batch_size: Count = 1024
+    """Labelled observations in the batch of an update, split evenly over the classes with a teacher."""
+    samples: Count = 1_500_000
+    """Maximum number of labelled observations that each process stores; the oldest are dropped first."""
+    learning_rate: Positive = 5e-4  # Learning rate of Adam.
+    decay_steps: Whole = 0
+    """Environment steps over which the learning rate falls linearly to one twentieth; 0: constant."""
+    max_grad_norm: Positive = 1.0  # Maximum norm of gradients; longer gradients are scaled down.
     teacher_steps: Whole = 500_000
-    """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0. Drawn for each
-    episode; 0: the student plays all."""
-    noise_std: NonNegative = 0.0  # Standard deviation of noise on the actions that are played.
+    """Environment steps over which the share of episodes that the teacher plays falls from 1 to 0; each episode is
+    drawn separately. 0: the student plays all episodes."""
+    noise_std: NonNegative = 0.0  # Standard deviation of the noise on the played actions.
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    normalise_per_task: bool = False  # By statistics of each task apart; the world must show the task's one-hot.
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Normalise observations to zero mean and unit variance with running statistics, except the one-hot task id."""
+    normalise_per_task: bool = False
+    """Normalise with separate statistics for each task; observations must contain the one-hot task id."""
+    autocast: Autocast = "auto"
+    """Compute hidden layers in bfloat16: on, off, or auto (on CUDA and on CPUs with AMX or AVX-512 BF16)."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""

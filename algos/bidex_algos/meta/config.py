@@ -18,32 +18,33 @@ class MetaConfig(LearnerConfig):
     """Options of the policy, sampling and inner steps; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
-    activation: Activation = "tanh"  # Non-linearity of the hidden layers.
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start; part of what is adapted.
+    activation: Activation = "tanh"  # Activation function of the hidden layers.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions; adaptation changes it.
     std_range: tuple[Positive, Positive] = (0.1, 1.5)  # Bounds of the standard deviation of the actions.
     tasks_per_class: Count = 3
     """Tasks of each class in a meta-batch, drawn again for each meta-batch; fewer if a class has fewer. The class's
     environments are divided among these tasks, and each environment plays one rollout."""
-    max_adapt_steps: Count | None = None  # Longest episode that is played to adapt; None: whole episodes.
+    max_adapt_steps: Count | None = None  # Maximum length in steps of an adaptation episode; None: whole episodes.
     slice_steps: Count | None = None
-    """Adapt on this many steps of running episodes, as Bi-DexHands did; None: on whole episodes."""
-    inner_steps: Count = 1  # Adaptation steps before the outer objective is measured.
-    inner_learning_rate: Positive = 0.1  # Size of an adaptation step.
+    """Adapt to this number of steps from running episodes, as in Bi-DexHands; None: adapt to whole episodes."""
+    inner_steps: Count = 1  # Adaptation steps before the outer objective is evaluated.
+    inner_learning_rate: Positive = 0.1  # Step size of adaptation.
     adapted: Adapted = "all"
-    """Parameters that an adaptation step moves: all, or only the output layer of the mean (ANIL, Raghu et al. 2020)."""
+    """Parameters that adaptation changes: all, or only the output layer of the mean (ANIL, Raghu et al. 2020)."""
     step_sizes: StepSizeKind = "fixed"
     """Inner step sizes that the outer step learns, starting from inner_learning_rate: one per tensor (layer, MAML++),
     one per weight (Meta-SGD), or none (fixed)."""
     step_size_rate: Positive = 0.01
-    """Adam's step size for these inner step sizes, relative to inner_learning_rate. A trust region moves them together
-    with all other parameters."""
+    """Learning rate of Adam for the learned inner step sizes, relative to inner_learning_rate. A trust region changes
+    them together with all other parameters."""
     advantage_scale: Literal["std", "variance"] = "std"
     """Divisor of the advantages in each task. With the variance, as in garage and Meta-World's baselines, the inner
     step depends on the scale of the rewards."""
     first_order: bool = False  # Leave out the second derivatives of the inner step.
-    gamma: Fraction = 0.95  # Discount per step.
-    lam: Fraction = 1.0  # Trace decay of the advantage estimate.
-    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+    gamma: Fraction = 0.95  # Discount factor per step.
+    lam: Fraction = 1.0  # Lambda of generalised advantage estimation.
+    normalise_observations: bool = True
+    """Normalise observations to zero mean and unit variance with running statistics."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

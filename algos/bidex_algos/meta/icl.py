@@ -40,27 +40,35 @@ _FLOOR = 0.03
 class ICLConfig(LearnerConfig):
     """All options of in-context learning; the defaults are the preset ``laptop``."""
 
-    hidden: Widths = (256, 128)  # Widths of the layers that an observation passes in the model of rewards.
-    activation: Activation = "elu"  # Non-linearity of the hidden layers.
-    candidates: Count = 512  # Goals between which belief is divided.
-    trust: Fraction = 0.05  # What a step's log-likelihood counts: the model's errors in neighbouring steps are alike.
+    hidden: Widths = (256, 128)  # Widths of the reward model's layers that encode an observation.
+    activation: Activation = "elu"  # Activation function of the hidden layers.
+    candidates: Count = 512  # Number of candidate goals in the belief.
+    trust: Fraction = 0.05
+    """Weight of each step's log-likelihood in the belief; it is below 1 because the model's errors in successive steps
+    are correlated."""
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
-    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
-    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
-    still_share: Fraction = 0.3  # Share of the episodes in which the policy tries nothing, as in one that is judged.
-    try_steps: Count = 50  # Steps, in the mean, for which an exploring episode tries one goal.
+    episodes_per_trial: Count = 3
+    """Episodes that the memory spans: the exploring episodes and the one that is evaluated."""
+    max_adapt_steps: Count | None = None  # Maximum length in steps of an episode of a trial; None: whole episodes.
+    still_share: Fraction = 0.3
+    """Share of the episodes in which the policy does not explore, as in an evaluation episode."""
+    try_steps: Count = 50  # Mean number of steps for which an exploring episode pursues one drawn goal.
     reward_unit: Positive = 0.3
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    """Reward scale: observations contain asinh(reward / reward_unit), normalised with running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
-    batch_size: Count = 1024  # Steps of an update, split evenly over the classes with a teacher.
-    goals: Count = 8  # Goals for which each trial's steps are rewarded in hindsight, beside the task's own.
-    trials: Count = 1024  # Trials that each process keeps; the oldest go first.
-    learning_rate: Positive = 1e-3  # Adam's step size.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and model apart.
+    batch_size: Count = 1024  # Steps in the batch of an update, split evenly over the classes with a teacher.
+    goals: Count = 8
+    """Number of other goals for which the reward model learns the rewards of each trial in hindsight, in addition to
+    the task's own goal."""
+    trials: Count = 1024  # Maximum number of trials that each process stores; the oldest are dropped first.
+    learning_rate: Positive = 1e-3  # Learning rate of Adam.
+    max_grad_norm: Positive = 1.0
+    """Maximum norm of gradients, for actor and reward model separately; longer gradients are scaled down."""
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of trials that the teacher plays falls from 1 to 0."""
-    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+    normalise_observations: bool = True
+    """Normalise observations to zero mean and unit variance with running statistics."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""

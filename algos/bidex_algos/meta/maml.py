@@ -22,14 +22,17 @@ from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 class MAMLConfig(OuterConfig):
     """All options of MAML; the defaults are the preset ``laptop``."""
 
-    outer: Literal["trpo", "adam"] = "trpo"  # The meta-parameters' step: a trust-region one as in the paper, or Adam's.
-    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
-    max_grad_norm: Positive = 1.0  # Before a step of Adam, meta-gradients longer than this are shortened to it.
-    max_kl: Positive = 0.01  # Bound of the mean KL of adapted policies from the sampling ones in a trust-region step.
-    damping: NonNegative = 1e-2  # Added to the diagonal of the Fisher matrix.
-    cg_iterations: Count = 10  # Conjugate-gradient iterations.
-    backtracks: Count = 15  # Points that the line search tries.
-    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
+    outer: Literal["trpo", "adam"] = "trpo"
+    """Optimiser of the meta-parameters: trpo (a trust-region step, as in the paper) or adam."""
+    outer_learning_rate: Positive = 1e-3  # With --learner.outer adam: learning rate of the meta-parameters.
+    max_grad_norm: Positive = 1.0
+    """With --learner.outer adam: maximum norm of meta-gradients; longer gradients are scaled down."""
+    max_kl: Positive = 0.01
+    """With --learner.outer trpo: maximum mean KL divergence between the sampling policies and the adapted ones."""
+    damping: NonNegative = 1e-2  # With --learner.outer trpo: value added to the diagonal of the Fisher matrix.
+    cg_iterations: Count = 10  # With --learner.outer trpo: iterations of the conjugate-gradient solver.
+    backtracks: Count = 15  # With --learner.outer trpo: maximum number of step lengths that the line search tries.
+    backtrack_factor: Fraction = 0.8  # With --learner.outer trpo: factor by which the line search shortens the step.
 
 
 PRESETS: dict[str, MAMLConfig] = {

@@ -37,20 +37,23 @@ from bidex_meta.world.contract import Info, TaskWorld
 class PEARLConfig(MTSACConfig):
     """All options of PEARL; the defaults are the preset ``laptop``."""
 
-    latent: Count = 8  # Entries of the latent variable that stands for the task.
+    latent: Count = 8  # Size of the latent variable that represents the task.
     encoder: Widths = (128, 128)  # Widths of the encoder's hidden layers.
-    context: Count = 64  # Transitions from which an update, or an episode, estimates what a task has shown.
-    tasks_per_update: Count = 16  # Environments whose tasks an update learns from, split evenly over the classes.
+    context: Count = 64  # Number of transitions from which the encoder infers the task, in an update and in an episode.
+    tasks_per_update: Count = 16
+    """Number of environments whose tasks are in the batch of an update, split evenly over the classes."""
     kl_weight: NonNegative = 1e-4
-    """Factor of the posterior's divergence from the unit Gaussian in the encoder's loss. Where it weighs more than what
-    the critics gain by knowing the task, the posterior stays the prior; Loss/divergence shows it."""
+    """Weight of the KL divergence between the posterior and the unit Gaussian in the encoder's loss. If it outweighs
+    what the critics gain from knowing the task, the posterior stays at the prior; Loss/divergence shows this."""
     episodes_per_trial: Annotated[int, Meta(ge=2, le=1000)] = 3
-    """Episodes after which an environment forgets what its task has shown: those played to adapt, and one more."""
+    """Episodes after which an environment clears its context: the exploring episodes and the one that is evaluated."""
     max_adapt_steps: Count | None = None
-    """Steps after which an exploring episode of a meta-test is cut; None: whole episodes."""
-    reward_unit: Positive = 0.3  # The encoder reads asinh(reward / reward_unit), normalised by running statistics.
-    value_heads: bool = False  # Give each critic an output per class; the latent variable then need not say which.
-    replay_steps: Count = 4000  # Vector steps that the replay keeps, if replay_memory allows.
+    """Maximum length in steps of an exploring episode of a meta-test; None: whole episodes."""
+    reward_unit: Positive = 0.3
+    """Reward scale: the encoder reads asinh(reward / reward_unit), normalised with running statistics."""
+    value_heads: bool = False
+    """Give each critic one output per class, so that the latent variable need not encode the class."""
+    replay_steps: Count = 4000  # Vector steps that the replay buffer holds, unless replay_memory is smaller.
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 

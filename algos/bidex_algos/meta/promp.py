@@ -22,16 +22,19 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive, check_risi
 class ProMPConfig(OuterConfig):
     """All options of ProMP; the defaults are the preset ``laptop``."""
 
-    outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts again.
-    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the start.
+    outer_epochs: Count = 5  # Outer steps on one meta-batch; each of them repeats the adaptation.
+    outer_learning_rate: Positive = 1e-3  # Initial learning rate of Adam for the meta-parameters.
     desired_kl: Positive | None = None
-    """Divide the step size by 1.5 when the KL of the adapted policies from those that sampled exceeds twice this,
-    multiply it when below half; None: leave it. For what is learned already (--start-from) a fixed step may be far too
-    large."""
-    outer_learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the step size where it adapts.
-    clip: Positive = 0.3  # How far the likelihood ratio after adaptation may leave 1 before it earns nothing more.
-    kl_weight: NonNegative = 5e-4  # Factor of the KL from the policies that sampled before adaptation.
-    max_grad_norm: Positive = 1.0  # Meta-gradients longer than this are shortened to it.
+    """Target KL divergence between the adapted policies and the policies that sampled. The learning rate is divided by
+    1.5 if the divergence exceeds twice this value, and multiplied by 1.5 if it is below half of it. None: a fixed
+    learning rate, which may be far too large for a policy that is already skilled (--start-from)."""
+    outer_learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
+    """With --learner.desired-kl: bounds of the adaptive learning rate."""
+    clip: Positive = 0.3
+    """Clip range of the likelihood ratio after adaptation: distance from 1 beyond which the objective no longer
+    rises."""
+    kl_weight: NonNegative = 5e-4  # Weight of the KL divergence from the policies that sampled before adaptation.
+    max_grad_norm: Positive = 1.0  # Maximum norm of meta-gradients; longer gradients are scaled down.
 
     def __post_init__(self) -> None:
         super().__post_init__()

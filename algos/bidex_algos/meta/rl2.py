@@ -34,28 +34,32 @@ from bidex_meta.world.contract import PooledWorld
 class RL2Config(PPOConfig):
     """All options of RL²; the defaults are the preset ``laptop``."""
 
-    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
-    activation: Activation = "elu"  # Non-linearity of the encoder.
-    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
-    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    hidden: Widths = (256, 128)  # Widths of the encoder's layers in front of the memory, in actor and critic.
+    activation: Activation = "elu"  # Activation function of the encoder.
+    memory: Count = 128  # Size of the memory (GRU); actor and critic have separate memories.
+    value_heads: bool = True  # Give the critic one output per task class instead of one output for all classes.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
-    max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
+    episodes_per_trial: Count = 3
+    """Episodes that the memory spans: the exploring episodes and the one that is evaluated."""
+    max_adapt_steps: Count | None = None  # Maximum length in steps of an episode of a trial; None: whole episodes.
     blind_share: Fraction = 0.0
-    """Share of the episodes whose rewards the policy is not shown, as in a meta-test with hidden rewards."""
+    """Share of the episodes whose rewards are hidden from the policy, as in a meta-test with hidden rewards."""
     reward_unit: Positive = 0.01
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
-    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
-    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    """Reward scale: observations contain asinh(reward / reward_unit), normalised with running statistics."""
+    gamma: Fraction = 0.93  # Discount factor per step, across all episodes of a trial.
+    lam: Fraction = 0.95  # Lambda of generalised advantage estimation.
     chunk: Count | None = None
-    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
-    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and critic apart.
-    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+    """Steps over which gradients flow back through the memory; None, or at least the trial's length: the whole
+    trial."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive learning rate.
+    entropy_weight: Finite = 0.0  # Weight of the entropy bonus.
+    max_grad_norm: Positive = 1.0
+    """Maximum norm of gradients, for actor and critic separately; longer gradients are scaled down."""
+    normalise_observations: bool = True
+    """Normalise observations to zero mean and unit variance with running statistics."""
     value_horizon: Positive = 100.0
-    """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
+    """Iterations over which the statistics that normalise the critic's targets forget old returns."""
 
     @property
     def trial_steps(self) -> int:

@@ -35,11 +35,13 @@ _BATCHES = 4
 class VariBADConfig(RL2Config):
     """All options of VariBAD; the defaults are the preset ``laptop``."""
 
-    latent: Count = 8  # Numbers of the latent; the policy reads a mean and a log-deviation of each.
-    kl_weight: NonNegative = 0.1  # Weight of a belief's KL from the one before, against all rewards of a trial.
-    belief_learning_rate: Positive = 1e-3  # Adam's step size for encoder and decoder.
+    latent: Count = 8
+    """Size of the latent variable; the policy reads a mean and a log standard deviation for each entry."""
+    kl_weight: NonNegative = 0.1
+    """Weight of the KL divergence between successive beliefs, relative to all rewards of a trial."""
+    belief_learning_rate: Positive = 1e-3  # Learning rate of Adam for encoder and decoder.
     reward_unit: Positive = 0.3
-    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    """Reward scale: observations contain asinh(reward / reward_unit), normalised with running statistics."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""

@@ -45,15 +45,20 @@ class MultiAgentConfig(OnPolicyConfig):
     """Options of agents and of the critic's loss."""
 
     agents: Partition = "hands"
-    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
-    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
-    huber_delta: Positive = 10.0  # Error of the critic, in its units, beyond which its loss grows no faster than that.
-    value_clip: NonNegative = 0.0  # How far a value may leave the old one before it earns nothing more; 0: no bound.
-    popart: bool = False  # When the statistics of returns change, move the critic's output layer so that values stay.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it: each agent's, and the critic's.
-    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
-    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
+    """Division of the robot into agents: hands (two agents), fingers (twelve: five fingers and the palm of each hand),
+    single, a TOML file with a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+    huber_delta: Positive = 10.0
+    """Error of the critic, in its units, beyond which its loss grows linearly (Huber loss)."""
+    value_clip: NonNegative = 0.0
+    """Distance from the old value beyond which the critic's loss no longer falls; 0: no clipping."""
+    popart: bool = False
+    """Rescale the critic's output layer when the statistics of returns change, so that its values stay the same
+    (PopArt)."""
+    max_grad_norm: Positive = 1.0
+    """Maximum norm of gradients, for each agent and the critic separately; longer gradients are scaled down."""
+    critic_learning_rate: Positive = 1e-3  # Learning rate of Adam for the critic.
+    num_minibatches: Count = 4  # Mini-batches per epoch; each contains shuffled samples of all environments.
+    adam_eps: NonNegative = 1e-8  # Epsilon of Adam, added to its denominators.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,12 +71,13 @@ class MultiAgentConfig(OnPolicyConfig):
 class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """Options shared by IPPO, MAPPO and HAPPO; the defaults are the preset ``laptop``."""
 
-    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
-    value_loss_weight: Finite = 1.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
-    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
+    critic_learning_rate: Positive = 1e-3  # Learning rate of Adam for the critic.
+    value_loss_weight: Finite = 1.0
+    """Weight of the critic's loss. Adam cancels it, so it only matters together with max_grad_norm."""
+    entropy_weight: Finite = 0.0  # Weight of the entropy bonus.
     desired_kl: Positive = 0.03
-    """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
-    agent's has an even share."""
+    """Target KL divergence between the sampling joint policy and the current one, for the adaptive learning rates; it
+    is divided evenly among the agents."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ class InTurnConfig(LearnerConfig):
     """Options shared by HAPPO and HATRPO. A config that inherits others too lists these fields after the others'."""
 
     max_factor: NonNegative = 4.0
-    """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""
+    """Maximum factor by which the likelihood ratios of the agents that were updated earlier may multiply an agent's
+    advantage; 0: no bound."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

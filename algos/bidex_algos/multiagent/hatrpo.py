@@ -21,7 +21,8 @@ class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
     """All options of HATRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.05
-    """Mean KL of the new joint policy from the sampling one that no update exceeds; each agent has an even share."""
+    """Trust region: maximum mean KL divergence between the sampling joint policy and the new one, divided evenly among
+    the agents."""
 
 
 PRESETS: dict[str, HATRPOConfig] = {

@@ -27,8 +27,8 @@ class MADDPGConfig(DDPGConfig):
     """All options of MADDPG; the defaults are the preset ``laptop``."""
 
     agents: Partition = "hands"
-    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
-    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+    """Division of the robot into agents: hands (two agents), fingers (twelve: five fingers and the palm of each hand),
+    single, a TOML file with a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

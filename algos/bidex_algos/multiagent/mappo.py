@@ -21,7 +21,8 @@ class MAPPOConfig(MultiAgentPPOConfig):
     """All options of MAPPO; the defaults are the preset ``laptop``."""
 
     share_parameters: bool = False
-    """Share one network between agents with equal observation groups and action sizes; it sees who acts."""
+    """Share one network between agents with equal observation groups and action sizes; the network also reads the
+    agent's id."""
 
 
 PRESETS: dict[str, MAPPOConfig] = {

@@ -52,16 +52,18 @@ class NetworkConfig(LearnerConfig):
     """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
-    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
-    heads. All but shared for MT suites, whose observations show the task."""
-    hidden: Layers = (256, 256)  # Widths of the hidden layers, of actor and critics alike.
-    activation: Activation = "relu"  # Non-linearity of the hidden layers.
-    policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
+    """Network architecture (docs/learners/multitask.md). shared: one trunk for all tasks; multi_head: a shared trunk
+    with policy_heads and value_heads; towers: only the first layer is shared; separate: one network per task;
+    soft_modules, paco, moore, transformer: other trunks, with or without heads. All but shared need an MT suite, whose
+    observations show the task."""
+    hidden: Layers = (256, 256)  # Widths of the hidden layers of the actor and of the critics.
+    activation: Activation = "relu"  # Activation function of the hidden layers.
+    policy_heads: bool = False
+    """Give the actor one output layer per task; observations must contain the one-hot task id."""
     task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    """Size of the learned task vector that replaces the one-hot task id as a network input; 0: the one-hot task id."""
     point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    """Widths of the layers that encode each point of a point cloud (PointNet), if the world shows point clouds."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

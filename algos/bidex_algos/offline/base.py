@@ -31,17 +31,19 @@ from bidex_meta.world.contract import VectorWorld
 class OfflineConfig(NetworkConfig):
     """Options of networks, batches and statistics; the defaults are the preset ``laptop``."""
 
-    updates_per_iteration: Count = 1000  # Updates between two reports, which --evaluate-every and --video-every count.
-    batch_size: Count = 256  # Transitions of an update, split evenly over the tasks.
-    batch_per_task: Count | None = None  # Take this many of each task instead.
-    learning_rate: Positive = 3e-4  # Adam's step size for the actor.
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
+    updates_per_iteration: Count = 1000  # Updates of an iteration, the unit of --evaluate-every and --video-every.
+    batch_size: Count = 256  # Transitions in the batch of an update, split evenly over the tasks.
+    batch_per_task: Count | None = None
+    """Transitions per task in the batch of an update; replaces batch_size. None: batch_size decides."""
+    learning_rate: Positive = 3e-4  # Learning rate of Adam for the actor.
+    adam_eps: NonNegative = 1e-8  # Epsilon of Adam, added to its denominators.
     max_grad_norm: Positive | None = None
-    """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
+    """Maximum norm of gradients, for each network separately; longer gradients are scaled down. None: no maximum."""
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
-    normalise_per_task: bool = False  # By statistics of each task's data apart; the world must show the task's one-hot.
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX.
+    """Normalise observations to zero mean and unit variance with the data's statistics, except the one-hot task id."""
+    normalise_per_task: bool = False
+    """Normalise with separate statistics for each task; observations must contain the one-hot task id."""
+    autocast: Autocast = "auto"  # Compute hidden layers in bfloat16: on, off, or auto (on CUDA and on CPUs with AMX).
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of the networks; the data are counted when they are read."""
@@ -52,12 +54,12 @@ class OfflineConfig(NetworkConfig):
 class CriticConfig(OfflineConfig):
     """Additional options of learners with critics."""
 
-    value_heads: bool = True  # Give each critic one output per task instead of one for all.
+    value_heads: bool = True  # Give each critic one output per task instead of one output for all tasks.
     critic_layer_norm: bool = True
-    """Normalise the hidden layers of the critics, which keeps values of actions that no data show from growing."""
-    critic_learning_rate: Positive = 3e-4  # Adam's step size for the critics.
-    gamma: BelowOne = 0.99  # Discount per step.
-    tau: Share = 0.005  # Share of the networks that enters their targets in each update (1 - Polyak's factor).
+    """Apply layer normalisation in the critics, which keeps values of actions outside the data from diverging."""
+    critic_learning_rate: Positive = 3e-4  # Learning rate of Adam for the critics.
+    gamma: BelowOne = 0.99  # Discount factor per step.
+    tau: Share = 0.005  # Step of the target networks towards the networks in each update (1 minus the Polyak factor).
     per_task_rewards: bool = True  # Divide rewards by the standard deviation of their task's discounted returns.
 
 

@@ -33,13 +33,17 @@ _LOG_STD = (-4.0, 15.0)
 class BCQConfig(CriticConfig):
     """All options of BCQ; the defaults are the preset ``laptop``."""
 
-    vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the actions' model, a variational autoencoder.
-    vae_learning_rate: Positive = 1e-3  # Adam's step size for it.
-    latent: Count = 2  # Entries of its code, for each action.
-    kl_weight: NonNegative = 0.5  # Weight of the codes' divergence from a normal beside an action's squared error.
-    candidates: Count = 10  # Actions that are drawn for a state; the best one is taken.
-    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05  # The most by which a candidate is changed (Phi).
-    lower_weight: Fraction = 0.75  # Weight of the lower of both critics in a target; the higher one has the rest.
+    vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the action model, a variational autoencoder.
+    vae_learning_rate: Positive = 1e-3  # Learning rate of Adam for the action model.
+    latent: Count = 2  # Size of the action model's latent code, per action dimension.
+    kl_weight: NonNegative = 0.5
+    """Weight of the KL divergence between the latent codes and a normal distribution, relative to the squared error of
+    an action."""
+    candidates: Count = 10  # Number of actions drawn for a state, of which the best one is taken.
+    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05
+    """Maximum change of a drawn action by the perturbation network (Phi)."""
+    lower_weight: Fraction = 0.75
+    """Weight of the lower of the two critics' values in a target; the higher value has the remaining weight."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class, with the autoencoder."""

@@ -27,11 +27,13 @@ class IQLConfig(CriticConfig):
     """All options of IQL; the defaults are the preset ``laptop``."""
 
     expectile: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.7
-    """Which expectile of the values of the data's actions a state is worth: 0.5 their mean, towards 1 the best one."""
-    beta: NonNegative = 3.0  # Weight of an action in the actor's update: exp(beta * advantage); 0: BC.
-    max_weight: Positive = 100.0  # That weight is cut to this.
-    init_std: Positive = 1.0  # Standard deviation of the actor at the start.
-    std_range: tuple[Positive, Positive] = (0.0067, 7.4)  # Its bounds, exp(-5) and exp(2).
+    """Expectile of the values of the data's actions that defines a state's value: 0.5 is their mean; values near 1
+    approach the best action."""
+    beta: NonNegative = 3.0  # Inverse temperature of the actor's weights exp(beta * advantage); 0: behaviour cloning.
+    max_weight: Positive = 100.0  # Maximum weight of an action in the actor's update.
+    init_std: Positive = 1.0  # Initial standard deviation of the actor.
+    std_range: tuple[Positive, Positive] = (0.0067, 7.4)
+    """Bounds of the actor's standard deviation, by default exp(-5) and exp(2)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

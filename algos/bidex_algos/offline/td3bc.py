@@ -25,10 +25,12 @@ class TD3BCConfig(CriticConfig):
     """All options of TD3+BC; the defaults are the preset ``laptop``."""
 
     alpha: NonNegative = 2.5
-    """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
+    """Weight of the value relative to the distance from the data's actions; the value is divided by the mean absolute
+    value of the batch. 0: behaviour cloning."""
     target_std: NonNegative = 0.2  # Standard deviation of the noise on the target actor's actions.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
-    policy_delay: Count = 2  # Updates of the critics for each of the actor and the targets.
+    target_bound: NonNegative = 0.5
+    """Bound of the noise on the target actor's actions; noise is clipped to plus and minus this value."""
+    policy_delay: Count = 2  # Updates of the critics per update of the actor and the target networks.
 
 
 # "paper": alpha is from Table 46, whose other numbers are the defaults. The table omits noise, its bound and the delay;

@@ -34,32 +34,35 @@ from bidex_meta.world.contract import Info, VectorWorld
 class OffPolicyConfig(NetworkConfig):
     """Options of networks, replay, updates, statistics; a vector step is one step in every environment of the world."""
 
-    value_heads: bool = True  # Give each critic one output per task instead of one for all.
+    value_heads: bool = True  # Give each critic one output per task instead of one output for all tasks.
     critic_layer_norm: bool = True
-    """Normalise the hidden layers of the critics, which keeps many updates per step from blowing values up."""
-    replay_steps: Count = 500  # Vector steps that the replay keeps, if replay_memory allows.
-    replay_memory: Positive = 2.0  # The most that the replay of each process may take, in GB (10^9 bytes).
+    """Apply layer normalisation in the critics, which keeps values from diverging under many updates per step."""
+    replay_steps: Count = 500  # Vector steps that the replay buffer holds, unless replay_memory is smaller.
+    replay_memory: Positive = 2.0  # Maximum size of the replay buffer of each process, in GB (10^9 bytes).
     cut_share: Share = 0.0625
-    """Room in it for last observations before time limits, as a share of all transitions. Too small where episodes are
-    shorter than 1 / cut_share; Train/weightless shows it."""
-    warmup_steps: Whole = 20  # Vector steps of uniform actions before the first update.
-    steps_per_iteration: Count = 8  # Vector steps between two reports.
+    """Space in the replay buffer for the last observations before time limits, as a share of all transitions. It is too
+    small if episodes are shorter than 1 / cut_share; Train/weightless shows this."""
+    warmup_steps: Whole = 20  # Vector steps with uniform actions before the first update.
+    steps_per_iteration: Count = 8  # Vector steps of an iteration, after which metrics are reported.
     updates_per_step: Count = 4  # Updates of all networks after each vector step.
-    batch_size: Count = 1024  # Transitions of an update, split evenly over the tasks.
-    batch_per_task: Count | None = None  # Take this many of each task instead.
-    gamma: BelowOne = 0.93  # Discount per step.
-    n_steps: Count = 1  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
-    tau: Share = 0.02  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    learning_rate: Positive = 3e-4  # Adam's step size for the actor.
-    critic_learning_rate: Positive = 1e-3  # Adam's step size for the critics.
-    weight_decay: NonNegative = 0.0  # Share of its step size by which a step shortens all weights (AdamW).
-    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
-    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, those of actor and critics apart.
+    batch_size: Count = 1024  # Transitions in the batch of an update, split evenly over the tasks.
+    batch_per_task: Count | None = None
+    """Transitions per task in the batch of an update; replaces batch_size. None: batch_size decides."""
+    gamma: BelowOne = 0.93  # Discount factor per step.
+    n_steps: Count = 1  # Number of rewards that a target sums before it bootstraps from the value of the next state.
+    tau: Share = 0.02  # Step of the target critics towards the critics in each update (1 minus the Polyak factor).
+    learning_rate: Positive = 3e-4  # Learning rate of Adam for the actor.
+    critic_learning_rate: Positive = 1e-3  # Learning rate of Adam for the critics.
+    weight_decay: NonNegative = 0.0  # Weight decay of AdamW, relative to the learning rate.
+    adam_eps: NonNegative = 1e-8  # Epsilon of Adam, added to its denominators.
+    max_grad_norm: Positive = 1.0
+    """Maximum norm of gradients, for actor and critics separately; longer gradients are scaled down."""
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    """Normalise observations to zero mean and unit variance with running statistics, except the one-hot task id."""
     per_task_rewards: bool = True
-    """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Divide the rewards in a batch by the running standard deviation of their task's discounted return."""
+    autocast: Autocast = "auto"
+    """Compute hidden layers in bfloat16: on, off, or auto (on CUDA and on CPUs with AMX or AVX-512 BF16)."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes of memory as in the base class."""

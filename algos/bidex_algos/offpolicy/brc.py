@@ -58,19 +58,22 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
     """All options of BRC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (256, 256, 256)
-    """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
-    hidden: Layers = (256, 256)  # The same of the actor.
-    value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
+    """Widths of the critics' first layer and of each residual block of two layers, which must be equal."""
+    hidden: Layers = (256, 256)
+    """Widths of the actor's first layer and of each residual block of two layers, which must be equal."""
+    value_heads: bool = False  # Give each critic one distribution per task instead of one distribution for all tasks.
     task_embedding: Whole = 32
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    """Size of the learned task vector that replaces the one-hot task id as a network input; 0: the one-hot task id."""
     updates_per_step: Count = 4  # Updates of all networks after each vector step.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
-    tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    clipped_double_q: bool = False  # Targets and actor take the critic that says less; off: the mean of both.
-    weight_decay: NonNegative = 1e-4  # Share of its step size by which a step shortens all weights (AdamW).
+    n_steps: Count = 3  # Number of rewards that a target sums before it bootstraps from the value of the next state.
+    tau: Share = 0.05  # Step of the target critics towards the critics in each update (1 minus the Polyak factor).
+    clipped_double_q: bool = False
+    """Use the critic with the lower value in targets and in the actor's loss; off: the mean of both critics."""
+    weight_decay: NonNegative = 1e-4  # Weight decay of AdamW, relative to the learning rate.
     target_entropy_per_action: Finite = -0.5
-    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
-    one_temperature: bool = False  # One temperature for all tasks, led by their mean entropy.
+    """Target entropy of the squashed policy, per action dimension, to which each temperature is tuned; uniform actions
+    have 0.69."""
+    one_temperature: bool = False  # Use one temperature for all tasks, tuned by their mean entropy.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -60,10 +60,14 @@ class Atoms(nn.Module):
 class CategoricalConfig(OffPolicyConfig):
     """Options of the critics' distributions and layers, in addition to the options of all off-policy learners."""
 
-    critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; ``hidden`` is then the actor's alone.
-    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Values that a distribution of the return gives probabilities to.
-    value_bound: Positive = 10.0  # They lie evenly from minus this to this, in scaled rewards.
-    clipped_double_q: bool = True  # Targets and actor take the critic that says less; off: the mean of both.
+    critic_hidden: Layers = (256, 256)
+    """Widths of the critics' hidden layers; --learner.hidden applies only to the actor."""
+    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Number of atoms of the return distribution.
+    value_bound: Positive = 10.0
+    """Bound of the return distribution, in scaled rewards; its atoms are evenly spaced from minus to plus this
+    value."""
+    clipped_double_q: bool = True
+    """Use the critic with the lower value in targets and in the actor's loss; off: the mean of both critics."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the bytes as in the base class, which counts ``hidden`` for all networks, plus the critics'."""

@@ -27,8 +27,10 @@ class DDPGConfig(OffPolicyConfig):
     """All options of DDPG; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
-    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
-    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
+    """Standard deviation of exploration noise of the first and the last environment of each task; environments between
+    them have evenly spaced values."""
+    squash_price: NonNegative = 1.0
+    """Weight of the penalty on the mean squared action before tanh in the actor's loss; 0: no penalty."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,15 +27,18 @@ class FastTD3Config(CategoricalConfig):
     """All options of FastTD3; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
-    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
-    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
-    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
-    policy_delay: Count = 2  # Updates of the critics and of their targets for each update of the actor.
-    value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
-    tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    weight_decay: NonNegative = 0.1  # Share of its step size by which a step shortens all weights (AdamW).
+    """Standard deviation of exploration noise of the first and the last environment of each task; environments between
+    them have evenly spaced values."""
+    squash_price: NonNegative = 1.0
+    """Weight of the penalty on the mean squared action before tanh in the actor's loss; 0: no penalty."""
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the target policy's actions.
+    target_bound: NonNegative = 0.5
+    """Bound of the noise on the target policy's actions; noise is clipped to plus and minus this value."""
+    policy_delay: Count = 2  # Updates of critics and target critics per update of the actor.
+    value_heads: bool = False  # Give each critic one distribution per task instead of one distribution for all tasks.
+    n_steps: Count = 3  # Number of rewards that a target sums before it bootstraps from the value of the next state.
+    tau: Share = 0.05  # Step of the target critics towards the critics in each update (1 minus the Polyak factor).
+    weight_decay: NonNegative = 0.1  # Weight decay of AdamW, relative to the learning rate.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -114,20 +114,24 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
     """All options of FlashSAC; the defaults are the preset ``laptop``."""
 
     critic_hidden: Layers = (128, 128, 128)
-    """Width of the critics as often as there are blocks, and once more for the first layer; within a block four times
-    that."""
-    hidden: Layers = (64, 64, 64)  # The same of the actor.
-    value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
+    """Widths of the critics' first layer and of each residual block, which must be equal; a block is four times as wide
+    inside."""
+    hidden: Layers = (64, 64, 64)  # Widths of the actor's first layer and of each residual block, which must be equal.
+    value_heads: bool = False  # Give each critic one distribution per task instead of one distribution for all tasks.
     updates_per_step: Count = 2  # Updates of the critics after each vector step.
-    policy_delay: Count = 2  # Updates of the critics for each of the actor and the temperatures.
-    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
-    tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
-    value_bound: Positive = 5.0  # The atoms lie evenly from minus this to this, in scaled rewards.
+    policy_delay: Count = 2  # Updates of the critics per update of the actor and the temperatures.
+    n_steps: Count = 3  # Number of rewards that a target sums before it bootstraps from the value of the next state.
+    tau: Share = 0.05  # Step of the target critics towards the critics in each update (1 minus the Polyak factor).
+    value_bound: Positive = 5.0
+    """Bound of the return distribution, in scaled rewards; its atoms are evenly spaced from minus to plus this
+    value."""
     target_entropy_per_action: Finite = -0.478
-    """Entropy of the squashed policy that each temperature aims at, for each action: that of a normal distribution of
-    deviation 0.15, log(0.15 sqrt(2 pi e)); uniform actions have 0.69."""
+    """Target entropy of the squashed policy, per action dimension, to which each temperature is tuned. The default is
+    log(0.15 sqrt(2 pi e)), the entropy of a normal distribution with standard deviation 0.15; uniform actions have
+    0.69."""
     noise_repeats: Count = 16
-    """Most steps for which an environment keeps the noise of its actions; n of them as often as n^-2; 1: none."""
+    """Maximum number of steps for which an environment repeats its exploration noise; n steps have a probability
+    proportional to n^-2. 1: no repeats."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

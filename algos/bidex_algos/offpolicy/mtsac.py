@@ -27,12 +27,14 @@ from bidex_meta.world.contract import VectorWorld
 class MTSACConfig(OffPolicyConfig):
     """All options of MT-SAC; the defaults are the preset ``laptop``."""
 
-    init_std: Positive = 0.5  # Standard deviation of the actions at the start, before the squashing.
-    std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Its bounds.
-    alpha_learning_rate: Positive = 3e-3  # Adam's step size for the logarithms of the temperatures.
-    init_alpha: Positive = 0.001  # Temperature of every task at the start.
+    init_std: Positive = 0.5  # Initial standard deviation of the actions, before tanh squashes them.
+    std_range: tuple[Positive, Positive] = (0.02, 2.0)
+    """Bounds of the standard deviation of the actions, before tanh squashes them."""
+    alpha_learning_rate: Positive = 3e-3  # Learning rate of Adam for the logarithms of the temperatures.
+    init_alpha: Positive = 0.001  # Initial temperature of every task.
     target_entropy_per_action: Finite = -1.0
-    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
+    """Target entropy of the squashed policy, per action dimension, to which each temperature is tuned; uniform actions
+    have 0.69."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

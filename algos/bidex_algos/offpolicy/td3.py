@@ -17,9 +17,10 @@ from bidex_meta.world.contract import VectorWorld
 class TD3Config(DDPGConfig):
     """All options of TD3; the defaults are the preset ``laptop``."""
 
-    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
-    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
-    policy_delay: Count = 2  # Updates of the critics for each update of the actor and of all target networks.
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the target policy's actions.
+    target_bound: NonNegative = 0.5
+    """Bound of the noise on the target policy's actions; noise is clipped to plus and minus this value."""
+    policy_delay: Count = 2  # Updates of the critics per update of the actor and of all target networks.
 
 
 # Smoothing and delay of "paper", like the defaults, are from Fujimoto et al. (2018, section 6.1).

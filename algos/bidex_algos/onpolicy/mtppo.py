@@ -40,23 +40,26 @@ class OnPolicyConfig(LearnerConfig):
     """Options of networks, rollouts and statistics; the defaults are the preset ``laptop``."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. towers: the first layer
-    alone is common; separate: none is. soft_modules, paco, moore, transformer: other trunks, each with or without
-    heads. All but shared for MT suites, whose observations show the task."""
-    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, of actor and critic alike.
-    activation: Activation = "elu"  # Non-linearity of the hidden layers.
-    policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
-    value_heads: bool = True  # Give the critic one output per task instead of one for all.
+    """Network architecture (docs/learners/multitask.md). shared: one trunk for all tasks; multi_head: a shared trunk
+    with policy_heads and value_heads; towers: only the first layer is shared; separate: one network per task;
+    soft_modules, paco, moore, transformer: other trunks, with or without heads. All but shared need an MT suite, whose
+    observations show the task."""
+    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers of the actor and of the critic.
+    activation: Activation = "elu"  # Activation function of the hidden layers.
+    policy_heads: bool = False
+    """Give the actor one output layer per task; observations must contain the one-hot task id."""
+    value_heads: bool = True  # Give the critic one output per task instead of one output for all tasks.
     point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    """Widths of the layers that encode each point of a point cloud (PointNet), if the world shows point clouds."""
+    init_std: Positive = 0.8  # Initial standard deviation of the actions.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    rollout_steps: Count = 8  # Steps taken in every environment between two updates.
-    gamma: Fraction = 0.93  # Discount per step.
-    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    rollout_steps: Count = 8  # Steps in every environment between two updates.
+    gamma: Fraction = 0.93  # Discount factor per step.
+    lam: Fraction = 0.95  # Lambda of generalised advantage estimation.
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
+    """Normalise observations to zero mean and unit variance with running statistics, except the one-hot task id."""
+    autocast: Autocast = "auto"
+    """Compute hidden layers in bfloat16: on, off, or auto (on CUDA and on CPUs with AMX or AVX-512 BF16)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,26 +75,30 @@ class OnPolicyConfig(LearnerConfig):
 class MTPPOConfig(OnPolicyConfig):
     """All options of MT-PPO; the defaults are the preset ``laptop``."""
 
-    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    epochs: Count = 4  # Passes over what was collected, per update.
-    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
-    learning_rate: Positive = 3e-4  # Adam's step size at the start.
+    num_minibatches: Count = 4  # Mini-batches per epoch; each contains shuffled samples of all environments.
+    epochs: Count = 4  # Passes over the rollout per update.
+    clip: Positive = 0.2
+    """Clip range of the likelihood ratio: distance from 1 beyond which the objective no longer rises."""
+    learning_rate: Positive = 3e-4  # Initial learning rate of Adam.
     desired_kl: Positive = 0.03
-    """KL of the sampling policy from the current one: the step size is divided by 1.5 above twice this value, and
-    multiplied by 1.5 below half of it."""
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
-    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
+    """Target KL divergence between the sampling policy and the current one. The learning rate is divided by 1.5 if the
+    divergence exceeds twice this value, and multiplied by 1.5 if it is below half of it."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive learning rate.
+    critic_learning_rate: Positive | None = 1e-3
+    """Fixed learning rate of the critic; None: the actor's adaptive learning rate."""
     gradient_surgery: Balancing = "none"
-    """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
-    2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
-    so that all fall at one rate (Liu et al. 2023)."""
-    demonstration_batch: Count = 256  # With --demonstrations: transitions in each mini-batch, of each process.
-    demonstration_cloning: Whole = 0  # Steps on demonstrations in which the policy is cloned before it plays.
+    """Method that combines the tasks' policy gradients. pcgrad: remove from each gradient the part that opposes another
+    task's (Yu et al. 2020); cagrad: turn the sum towards the task that it improves least (Liu et al. 2021); famo:
+    weight the losses so that all fall at one rate (Liu et al. 2023); none: add them."""
+    demonstration_batch: Count = 256
+    """With --demonstrations: demonstrated transitions in each mini-batch of each process."""
+    demonstration_cloning: Whole = 0
+    """With --demonstrations: behaviour-cloning updates before the policy acts for the first time."""
     teacher_updates: Whole = 20
-    """With --teacher: DAgger's updates after each of PPO's, while a taught class never succeeds; 0: none."""
+    """With --teacher: DAgger updates after each PPO update, while a class with a teacher has no success; 0: none."""
     critic_first: Whole = 0
-    """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
-    or of --start-from), which a critic that knows nothing would spoil."""
+    """Environment steps at the start in which only the critic learns. This protects a policy that is already skilled
+    (cloned, or from --start-from) from an untrained critic."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,20 +27,26 @@ from bidex_meta.world.contract import VectorWorld
 class MTTRPOConfig(OnPolicyConfig):
     """All options of MT-TRPO; the defaults are the preset ``laptop``."""
 
-    max_kl: Positive = 0.1  # Mean KL of the new policy from the sampling one that an update may not exceed.
-    damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal: shortens steps that samples tell nothing of.
-    cg_iterations: Count = 10  # Conjugate-gradient iterations.
-    fisher_stride: Count = 4  # Every so many-th sample goes into the Fisher matrix; it needs fewer than gradients.
-    backtracks: Count = 10  # Points that the line search tries.
-    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
+    max_kl: Positive = 0.1
+    """Trust region: maximum mean KL divergence between the sampling policy and the new one in an update."""
+    damping: NonNegative = 0.1
+    """Value added to the diagonal of the Fisher matrix, which shortens steps in directions that the samples do not
+    inform about."""
+    cg_iterations: Count = 10  # Iterations of the conjugate-gradient solver.
+    fisher_stride: Count = 4
+    """Use every n-th sample for the Fisher matrix, which needs fewer samples than the gradient."""
+    backtracks: Count = 10  # Maximum number of step lengths that the line search tries.
+    backtrack_factor: Fraction = 0.8  # Factor by which the line search shortens the step.
     accept_ratio: Fraction = 0.1
-    """Share of the improvement promised by the gradient that must come true where the line search stops; more keeps to
-    steps along which the surrogate is almost straight."""
-    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
-    critic_epochs: Count = 4  # The critic's passes over the rollout per update.
-    num_minibatches: Count = 4  # The critic's mini-batches per epoch.
-    max_grad_norm: Positive = 1.0  # Gradients of the critic longer than this are shortened to it.
-    autocast: Autocast = "off"  # Hidden layers in bfloat16: too coarse for the Fisher matrix, so off by default.
+    """Minimum ratio of actual to predicted improvement at which the line search accepts a step; larger values accept
+    only steps along which the surrogate is almost linear."""
+    critic_learning_rate: Positive = 1e-3  # Learning rate of Adam for the critic.
+    critic_epochs: Count = 4  # Passes of the critic over the rollout per update.
+    num_minibatches: Count = 4  # Mini-batches per epoch of the critic.
+    max_grad_norm: Positive = 1.0  # Maximum norm of the critic's gradients; longer gradients are scaled down.
+    autocast: Autocast = "off"
+    """Compute hidden layers in bfloat16: on, off or auto. Off by default, because bfloat16 is too coarse for the Fisher
+    matrix."""
 
 
 PRESETS: dict[str, MTTRPOConfig] = {

@@ -17,15 +17,19 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 class PPOConfig(LearnerConfig):
     """Options of passes, clip and step sizes. A config that inherits others too lists these fields last."""
 
-    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
-    epochs: Count = 4  # Passes over what was collected, per update.
-    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
-    learning_rate: Positive = 3e-4  # Adam's step size at the start.
+    num_minibatches: Count = 4  # Mini-batches per epoch; each contains shuffled samples of all environments.
+    epochs: Count = 4  # Passes over the rollout per update.
+    clip: Positive = 0.2
+    """Clip range of the likelihood ratio: distance from 1 beyond which the objective no longer rises."""
+    learning_rate: Positive = 3e-4  # Initial learning rate of Adam.
     adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: Positive = 0.03  # KL of the sampling policy from the current one that the adaptive step size aims at.
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
-    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
+    """Divide the learning rate by 1.5 if the KL divergence exceeds twice desired_kl, and multiply it by 1.5 if it is
+    below half."""
+    desired_kl: Positive = 0.03
+    """Target KL divergence between the sampling policy and the current one, for the adaptive learning rate."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive learning rate.
+    critic_learning_rate: Positive | None = 1e-3
+    """Fixed learning rate of the critic; None: the actor's adaptive learning rate."""
 
     @property
     def followed_kl(self) -> float | None:
