@@ -239,11 +239,11 @@ def config_of(content: object, where: str) -> RunConfig[JsonObject]:
     """Return a run's config from a file's content; raise BidexError, which names ``where``, if it is not a config."""
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
-        raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")
+        raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Give a run folder.")
     config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
-        raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
-    # A copy, because msgspec leaves defaults to the class and does not write those.
+        raise BidexError(f"{where}: expected either a suite or a task, with null for the other. Give a run folder.")
+    # Defaults are copied into the config, because msgspec does not write defaults that only the class holds.
     return dataclasses.replace(config, threads=config.threads or 1)
 
 

@@ -22,7 +22,8 @@ from bidex_meta.suite import OTHERS
 from bidex_meta.world.contract import PrivilegedWorld
 from bidex_meta.worlds import open_worlds
 
-# Of the known formula: candidates, each of which is asked for in each step, and a deviation for goals between them.
+# These values are for the known formula: candidates, each of which is evaluated in each step, and a standard deviation
+# for goals between them.
 _CANDIDATES = 128
 _EXACT = 0.02
 

@@ -13,15 +13,16 @@ from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
-_CAGRAD_RADIUS = 0.4  # how far cagrad's direction may leave the mean gradient, in its lengths
-_FAMO_RATE = 0.025  # Adam's step size of famo's weights
-_FAMO_DECAY = 0.01  # how strongly these weights are drawn back to even ones
+# Maximum distance of cagrad's direction from the mean gradient, relative to the mean gradient's length.
+_CAGRAD_RADIUS = 0.4
+_FAMO_RATE = 0.025  # learning rate of Adam for famo's weights
+_FAMO_DECAY = 0.01  # weight decay of famo's weights towards equal weights
 
 
 class Balance(ABC):
     """Replaces the gradient of the sum of all tasks' losses by a balanced one."""
 
-    tag: ClassVar[str]  # of the number that it reports
+    tag: ClassVar[str]  # tag of the reported number
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
@@ -106,7 +107,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
     mu = 0.1 * (even @ mean).clamp_min(1e-30)
     diagonal = torch.eye(len(even), dtype=gram.dtype, device=gram.device)
-    for _ in range(24):  # the last mu is 1e-8 of the mean gradient's square
+    for _ in range(24):  # 24 halvings leave a mu of 1e-8 of the mean gradient's square
         own = gram @ weights
         root = (mu.square() + square * (weights @ own).clamp_min(0.0)).sqrt()
         pull = square / (mu + root)

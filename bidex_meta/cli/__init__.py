@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 return _dispatch(given)
             finally:
-                sys.stdout.flush()  # when Python exits, nobody would catch a failing write
+                sys.stdout.flush()  # a write that fails when Python exits would not be caught
     except BidexError as error:
         return _failed(str(error), EXIT_BAD_INPUT, debug)
     except FloatingPointError as error:
@@ -95,7 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
-        # A reader that closes only stdout has seen enough (`| head`). If stderr is closed, work may have been aborted.
+        # A reader that closes only stdout has seen enough (`| head`). If stderr is closed too, work may have been
+        # aborted.
         if unread(sys.stderr):
             code = errors.EXIT_UNREAD
         else:
@@ -109,12 +110,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             place = ""
         else:
             place = f"{os.fsdecode(error.filename)}: "
-        return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+        return _failed(f"{place}{error.strerror or error}. Fix the path, or make room.", EXIT_BAD_INPUT, debug)
     except (Exception, SystemExit) as error:
         message = own_fault(error)
         if message is None:
             raise
-        return _failed(f"{message} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
+        return _failed(f"{message} Fix it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -128,7 +129,8 @@ class _Terminated(KeyboardInterrupt):
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
     """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and the reason is printed."""
-    # With several processes signals stay as they are: a collective operation waits outside Python and delays handlers.
+    # With several processes, signals keep their handlers, because a collective operation waits outside Python and would
+    # delay ours.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
         return
@@ -205,7 +207,7 @@ def _dispatch(arguments: list[str]) -> int:
     for place, word in enumerate(rest):
         if not word or re.fullmatch(r"--[\w.-]+=", word):
             flag = word.rstrip("=") or (rest[place - 1] if place else "a word")
-            raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
+            raise BidexError(f"{flag} after bidex-meta {name} has no value. Add a value, or leave the flag out.")
     with watched(f"bidex-meta {name}, starting") if launch().rank == 0 else contextlib.nullcontext():
         importlib.import_module(COMMANDS[name].module).main(rest)
     return 0

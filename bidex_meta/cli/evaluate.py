@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
     if flags.random:
-        raise BidexError(f"{algo} is compared with itself before adaptation. Leave --random out.")
+        raise BidexError(f"{algo} adapts, so it is compared with itself before adaptation. Leave --random out.")
     if flags.other_tasks:
         raise BidexError(f"{algo} adapts: --split others plays unseen tasks of its train classes.")
 
@@ -77,6 +77,8 @@ def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
 def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:
     flags.refuse_adaptation(algo)
     if flags.split == "both":
-        raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
+        raise BidexError(
+            f"{algo} does not adapt to tasks: each split is evaluated separately. Use --split train or test."
+        )
     if flags.split == OTHERS:
-        raise BidexError(f"{algo} does not adapt to tasks: --other-tasks plays others beside its own.")
+        raise BidexError(f"{algo} does not adapt to tasks: --other-tasks plays unseen tasks in addition to its own.")

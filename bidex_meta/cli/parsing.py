@@ -24,7 +24,7 @@ from bidex_meta.utils.validation import Seed, check_fields
 Options = TypeVar("Options")
 
 
-_HELP_COLUMN = 26  # where texts of the short help begin
+_HELP_COLUMN = 26  # column at which texts of the short help begin
 _END = re.compile(r"[.;](?: |$)(?![^(]*\))")
 """End of the first sentence of a help text: a full stop or semicolon outside parentheses."""
 
@@ -113,7 +113,7 @@ def parse(
     complaint = io.StringIO()
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     try:
-        # tyro prints a box of several lines and exits; we keep its words and drop the box.
+        # tyro prints a box of several lines and exits. We print its words without the box.
         with contextlib.redirect_stderr(complaint):
             parsed, unknown = tyro.cli(
                 options, args=list(arguments), prog=f"bidex-meta {command}", return_unknown_args=True, **keywords

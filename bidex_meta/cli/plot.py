@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
         out = output(flags.out, runs, "curves.png")
         plot(runs, out)
     elif len(runs) > 1:
-        raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
+        raise BidexError(f"--adaptation draws a single run, got {len(runs)}. bidex-meta report shows all.")
     else:
         out = output(flags.out, runs, "adaptation.png")
         run = runs[0]

@@ -51,14 +51,16 @@ def main(arguments: Sequence[str]) -> None:
         root = source.parents[1]  # a snapshot in the cache links to files next to the snapshots' folder
     files = files_of(source, wanted, root)
     if not {"config.json", "data/metadata.json"} & files.keys():
-        raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")
+        raise BidexError(
+            f"{flags.name} holds neither a run's config.json nor a data set. Give the name that was pushed."
+        )
     out = flags.out or Path("pulled") / Path(flags.name.removeprefix(FOLDER)).name
     with new_folder(absolute(out)) as folder:
         copied(files, folder)
         try:
             found = checked(folder)
         except BidexError as error:
-            raise BidexError(f"{flags.name} is damaged, and was not kept: {error}") from None
+            raise BidexError(f"{flags.name} is damaged and was deleted: {error}") from None
         if isinstance(found, RunFolder):
             _name_suite(found, absolute(out))
     print(out)

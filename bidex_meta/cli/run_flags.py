@@ -49,7 +49,7 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     if resume := peek(arguments, "--resume"):
         folder = RunFolder.open(Path(resume))
     default = _defaults(arguments, folder)
-    # The learner's flags are among those of its config; lists begin empty, since flags add to them.
+    # The learner's flags belong to its config. Lists begin empty, because flags append to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
     start = RunFlags(replace(default, dataset=(), demonstrations=(), teacher=()))
     settings = [f"--learner.{name.replace('_', '-')}" for name in USUAL_SETTINGS]

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> None:
     """Check, play, write, print."""
     flags = parse(SubmitFlags, arguments, "submit")
     if flags.runs and flags.evaluation is not None:
-        raise BidexError("Expected run folders or --evaluation, got both. Submit them apart.")
+        raise BidexError("Expected run folders or --evaluation, got both. Submit them separately.")
     if not flags.runs and flags.evaluation is None:
         raise BidexError("Expected run folders to submit, got none. Name them: bidex-meta submit runs/MT20/mtppo/*")
     if flags.track is not None and flags.evaluation is None:
@@ -73,7 +73,7 @@ def _tuning(text: str | None) -> tuple[int, int]:
     if numbers is None:
         raise BidexError(
             "--tuning: expected the number of settings that you tried before you chose these, times the seeds of each, "
-            f"got {shortened(text) if text else 'none'}. Say for example --tuning 12x1, or 1x1 if you tried no others."
+            f"got {shortened(text) if text else 'none'}. For example: --tuning 12x1, or 1x1 if you tried no others."
         )
     return int(numbers[1]), int(numbers[2])
 
@@ -85,7 +85,9 @@ def _folders(flags: SubmitFlags) -> list[RunFolder]:
 def _check(flags: SubmitFlags, path: Path) -> None:
     """Repeat an entry, and print differences and the verdict; return exit code 1 if something differs."""
     if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
-        raise BidexError("--check takes an entry, its runs and --device, and all else from the entry. Leave it out.")
+        raise BidexError(
+            "--check takes an entry, its runs and --device. Everything else comes from the entry. Leave other flags out."
+        )
     found = check(path, _folders(flags), flags.device)
     table = Sheet(["task", "outcome", "success", "again"], "Results that are not equal")
     for each in found.classes:

@@ -39,14 +39,14 @@ _Shown = dict[str, tuple[slice, float]]
 class Findings:
     """Result of a check."""
 
-    episodes: int = 0  # checked
-    steps: int = 0  # their transitions
-    wrong: list[str] = field(default_factory=list)  # what is wrong, a line for each of the first few wrong episodes
-    count: int = 0  # wrong episodes
+    episodes: int = 0  # checked episodes
+    steps: int = 0  # transitions of the checked episodes
+    wrong: list[str] = field(default_factory=list)  # descriptions of the first few faulty episodes, one line each
+    count: int = 0  # number of faulty episodes
     recomputed: dict[str, int] = field(default_factory=dict)  # transitions whose reward was computed again, by class
     largest: dict[str, float] = field(default_factory=dict)
     """Largest difference between a stored reward and a computed one, in the formula's units, by class."""
-    skipped: dict[str, str] = field(default_factory=dict)  # why rewards of a class were not computed again
+    skipped: dict[str, str] = field(default_factory=dict)  # the reason, by class, if rewards were not computed again
     unsealed: list[str] = field(default_factory=list)  # files without a digest
 
 
@@ -231,7 +231,7 @@ class SlotSummary:
     returns: tuple[float, float, float, float]  # unscaled: least, median, mean, largest
     success: float  # share of episodes that met their goal
     score: float | None  # mean normalised score (``evaluation.references``); None where a reference is missing
-    tasks: int  # different ones played
+    tasks: int  # number of different tasks
     broken: int  # episodes ended by broken physics
 
 

@@ -115,9 +115,9 @@ def check_touch(dataset: Dataset, touch: bool) -> None:
 class _Columns(NamedTuple):
     """Columns of an observation without its task id; padding stands before the cloud."""
 
-    state: np.ndarray  # without the cloud, ascending
-    cloud: np.ndarray  # of the point cloud, point after point
-    label: str  # form of the cloud, for messages
+    state: np.ndarray  # columns of the state without the point cloud, ascending
+    cloud: np.ndarray  # columns of the point cloud, point by point
+    label: str  # form of the point cloud, for messages
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
@@ -144,7 +144,9 @@ class _Form:
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
             fault = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
-            raise BidexError(f"{fault}. Record it with the same bases (--base), or learn for what it was recorded of.")
+            raise BidexError(
+                f"{fault}. Record it with the same bases (--base), or train on the tasks that it was recorded on."
+            )
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for start, stop in dict(shown).get("task_id", ()))
         self._width = plain
@@ -153,7 +155,7 @@ class _Form:
         self._theirs = _Columns.of(groups, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
-        slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
+        slots: Sequence[Slot] = getattr(world, "slots", ())  # Meta-World's worlds have no slots
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         check_touch(dataset, any(slot.task_class.touch for slot in slots))
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
@@ -176,7 +178,7 @@ class _Form:
         there = len(theirs.state)
         if here > there or (here < there and not may_pad):
             fault = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
-            raise BidexError(f"{fault}. Learn for what it was recorded of.")
+            raise BidexError(f"{fault}. Train on the tasks that it was recorded on.")
 
     def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
         """Yield all episodes, each with its slot and its observations in the world's form."""
@@ -209,7 +211,7 @@ def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[
         yield from [0] * len(names)
         return
     known: Mapping[str, int] = {name: slot for slot, name in enumerate(world.task_names)}
-    classes = {slot.name: slot.task_class for slot in getattr(world, "slots", ())}  # of Meta-World's there are none
+    classes = {slot.name: slot.task_class for slot in getattr(world, "slots", ())}  # Meta-World's worlds have no slots
     for name in names:
         here = name_among(name, classes)
         if here not in known:

@@ -34,9 +34,9 @@ H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no typ
 MAIN = "main_data.hdf5"
 METADATA = "metadata.json"
 RECORDING = "recording.json"
-FORMAT = 1  # increased when older code can no longer read the files
+FORMAT = 1  # raised when older code can no longer read the files
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 4300  # overhead of an episode in HDF5, bytes: measured with an instruction of 100 letters
+EPISODE_BYTES = 4300  # overhead of an episode in HDF5 in bytes, measured with an instruction of 100 letters
 ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
 ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
@@ -53,17 +53,19 @@ class Episode:
     actions: np.ndarray  # (T, a), float32, clipped to [-1, 1]
     rewards: np.ndarray  # (T,), float32, with the suite's scale of the class
     terminated: np.ndarray  # (T,), bool: true at most for the last transition
-    truncated: np.ndarray  # (T,), bool: likewise, by time, or before a broken transition
+    # (T,), bool: true at most for the last transition, at the time limit or before a broken transition.
+    truncated: np.ndarray
     task: int = 0  # slot of the world
-    task_name: str = ""  # its name: a class, or ``Class/task``
+    task_name: str = ""  # name of the task: a class, or ``Class/task``
     task_index: int = 0  # task of the slot's pool
-    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: what that task freezes, if any
+    # (v,), float64: the values that the task fixes, if any.
+    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))
     success: bool = False  # by the suite's rule: the goal was met at any step, or held at the end
-    broken: bool = False  # whether physics broke in the next transition, which is left out
+    broken: bool = False  # True if physics broke in the next transition, which is not stored
     return_unscaled: float = 0.0  # sum of the rewards by the printed formula, before the suite's scale
     row: int = 0  # environment of the process's world
-    policy: int = 0  # which of several policies acted, from 0 on
-    instruction: str = ""  # what the task asks for, without what the suite hides; empty if the world has no sentences
+    policy: int = 0  # index of the policy that acted, counting from 0
+    instruction: str = ""  # the task in words, without what the suite hides; empty if the world has no sentences
 
     def __len__(self) -> int:
         """Return the number of transitions, T."""
@@ -76,7 +78,7 @@ def hdf5() -> ModuleType:
         import h5py
     except ModuleNotFoundError:
         fault = "Expected h5py for data sets, but it is not installed"
-        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[data]'.") from None
+        raise BidexError(f"{fault}. Install it: pip install 'bidex-meta[data]'.") from None
     return h5py
 
 
@@ -194,7 +196,7 @@ class PartWriter:
             group = file.create_group(f"episode_{len(self._rows)}")
             for name, ours in ARRAYS.items():
                 group.create_dataset(name, data=getattr(episode, ours))
-            group.create_group("infos")  # Minari prints its keys
+            group.create_group("infos")  # Minari prints the keys of this group
             shown = ("task", "task_index", "policy", "success", "broken")
             group.attrs.update({name: row[name] for name in shown} | named)
         self._rows.append(row)

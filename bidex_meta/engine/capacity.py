@@ -13,11 +13,10 @@ from bidex_meta.utils.validation import Whole
 class Capacity:
     """Buffer sizes per world, or the largest part of the buffers that was in use."""
 
-    contacts: (
-        Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world
-    )
-    convex: Whole  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
-    rows: Whole  # constraint rows, a hard limit for each world
+    contacts: Whole  # candidate pairs of the broadphase, and contacts, per world; all worlds share one pool
+    # Pairs of one kind that the convex collider (eggs, cylinders) processes at a time, in one shared pool.
+    convex: Whole
+    rows: Whole  # constraint rows; a hard limit for each world
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:

@@ -28,7 +28,7 @@ class Engine(Protocol):
     ctrl: Tensor  # position targets, shape (num, nu)
     xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
     sensordata: Tensor  # shape (num, nsensordata)
-    _state: dict[str, Tensor]  # views of what a state holds
+    _state: dict[str, Tensor]  # views of the arrays that make up a state
     _mocap: list[Tensor]  # positions and quaternions of movable fixtures, or empty
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:

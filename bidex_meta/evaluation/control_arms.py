@@ -30,9 +30,9 @@ class Control:
     """The arms of one run: the same episodes in the same order."""
 
     before: Evaluation
-    own: Evaluation  # adapted to data of the tasks themselves
-    foreign: list[Evaluation]  # adapted to data of each train task
-    adaptations: dict[str, np.ndarray]  # per class the adaptation that each episode followed, (episodes,)
+    own: Evaluation  # results after adaptation to data of the tasks themselves
+    foreign: list[Evaluation]  # results after adaptation to data of each train task
+    adaptations: dict[str, np.ndarray]  # by class, index of the adaptation before each episode, (episodes,)
     rollouts: int  # episodes of each task in a shot
 
 

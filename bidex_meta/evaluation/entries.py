@@ -18,14 +18,14 @@ from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
 from bidex_meta.utils.validation import Count, Few, Fraction, NonNegative, Seed, Whole
 
 FORMAT = 3
-SHOTS = 2  # of a meta-test: a trial has three episodes
-TASKS = 20  # of a class in a meta-test, the first of its pool
+SHOTS = 2  # shots of a meta-test, so a trial has three episodes
+TASKS = 20  # tasks per class in a meta-test, the first of its pool
 MULTI_TASK = "multi-task"
 _FIRST_SEED = 2**30
 """The least evaluation seed: seeds of training are small, so that no run trains on the tasks of an evaluation."""
 _TASKS_OF_METAWORLD = 50
-_MOST_EPISODES = 1000  # of a task after a shot, over all trials
-ROUNDING = 1e-6  # of stored rates
+_MOST_EPISODES = 1000  # maximum number of episodes of a task after a shot, over all trials
+ROUNDING = 1e-6  # rounding of stored rates
 _Interval = tuple[Fraction, Fraction]
 _Name = Annotated[str, Meta(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f|]*$")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$")]
@@ -44,7 +44,7 @@ class ClassRow:
     """The results of a class."""
 
     success: Fraction
-    interval: _Interval | None  # 95 %, of the mean over runs and tasks; None with a single episode
+    interval: _Interval | None  # 95 % interval of the mean over runs and tasks; None with a single episode
     solved: Annotated[list[Annotated[list[Whole], Meta(min_length=1)]], Meta(min_length=1)]
     """Successful episodes of each task, one list per run."""
 
@@ -56,9 +56,9 @@ Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 class Part:
     """The results on tasks of one kind."""
 
-    trials: Few  # adaptations to each task, each with ``episodes`` of the entry
+    trials: Few  # adaptations to each task; each is followed by the entry's number of ``episodes``
     rollouts: Whole  # exploration episodes of each task in a shot; 0 for a policy that does not adapt
-    shots: Annotated[list[Classes], Meta(min_length=1)]  # after 0, 1, ... shots
+    shots: Annotated[list[Classes], Meta(min_length=1)]  # results after 0, 1, ... shots
 
     def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
         """Return success (runs, units) in each class after a shot; ``episodes`` are those of an adaptation."""
@@ -83,18 +83,18 @@ class Conditions:
 class Tuning:
     """The submitter's statement of the search for settings."""
 
-    trials: Count  # settings that were tried
-    seeds: Count  # of each
+    trials: Count  # number of settings that were tried
+    seeds: Count  # seeds per setting
 
 
 @dataclass(frozen=True)
 class Receipt:
     """Digests of everything that the results come from; lists have one item per run."""
 
-    weights: list[_Digest]  # of the policies, see ``weights_digest``
+    weights: list[_Digest]  # digests of the policies, see ``weights_digest``
     config: list[_Digest]
-    code: _Commit | None  # that evaluated; + if files differed from the commit; None: not from a repository
-    evaluation: _Digest  # of all other content of the entry
+    code: _Commit | None  # commit that evaluated, with + if files differed from it; None: not from a repository
+    evaluation: _Digest  # digest of all other content of the entry
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,9 @@ class Stated:
     """Statements of the run folders that nobody can verify; lists have one item per run."""
 
     seeds: list[Seed]
-    hours: list[NonNegative]  # of training, without evaluation
-    device: _Name  # that trained
-    commit: list[_Commit | None]  # that trained; + if files differed from the commit
+    hours: list[NonNegative]  # training time of each run, without evaluation
+    device: _Name  # devices that trained
+    commit: list[_Commit | None]  # commits that trained, with + if files differed; None: not from a repository
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +118,8 @@ class _Listed(ABC):
     suite: _Name
     track: Track
     tuning: Tuning
-    seed: Seed  # of starts; of a run also of new tasks
-    episodes: Few  # of each task after each adaptation
+    seed: Seed  # seed of start states, and for runs also of new tasks
+    episodes: Few  # episodes of each task after each adaptation
     new: Part
     """Results on tasks that the seed draws; of an agent that is no run, on test tasks."""
     conditions: Conditions
@@ -227,7 +227,7 @@ class Entry(_Listed):
     verified = True
     algorithm: _Name
     train_tasks: Whole | None  # per class; 0: a new task in each episode or trial; None: the suite's number
-    steps: list[Count]  # of the checkpoints
+    steps: list[Count]  # steps of the checkpoints
     own: Part
     """Results on the tasks of the suite's train split, as the runs' seeds draw them."""
     stated: Stated
@@ -268,7 +268,7 @@ class AgentEntry(_Listed):
 
     verified = False
     track: AdaptationTrack
-    agent: _Name  # its class
+    agent: _Name  # class of the agent
     task_seed: Seed
 
     def _tasks(self, pool: int) -> range:
@@ -305,7 +305,7 @@ def _table(solved: list[list[int]], episodes: int) -> np.ndarray:
     table = []
     for run, of_run in enumerate(counts):
         outcomes = (np.arange(episodes) < of_run[:, None]).ravel()
-        # Runs are resampled together, so that successes of two runs must not stand side by side.
+        # All runs are resampled at the same columns, so successes of two runs must not line up.
         table.append(np.random.default_rng(run).permutation(outcomes))
     return np.array(table, dtype=float)
 
@@ -326,7 +326,9 @@ def _suite(name: str) -> Suite | None:
     if name in METAWORLD_SUITES:
         return None
     if name not in suite_names():
-        raise BidexError(f"expected a shipped suite, got {name}: nobody else can play it. Submit a run on another.")
+        raise BidexError(
+            f"expected a shipped suite, got {name}: other people cannot play it. Submit a run on a shipped suite."
+        )
     return load_suite(name)
 
 

@@ -36,12 +36,14 @@ _ADAPTS = ("init", "adapt_action", "step", "adapt")
 class MetaEvaluation:
     """The results of ``meta_evaluate``."""
 
-    by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
+    # Results after 0, 1, ..., K shots (or the requested ones), on the same episodes in the same order.
+    by_shot: list[Evaluation]
     adaptations: dict[str, np.ndarray]
     """Per class the number from 0 of the adaptation (a trial of a task) that each episode followed, ``(episodes,)``."""
-    protocol: Protocol  # as played, with the actual number of rollouts and length of the longest exploring episode
+    # The protocol with the actual number of rollouts and the length of the longest exploring episode.
+    protocol: Protocol
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
-    hidden_by_shot: list[Evaluation] | None = None  # the same with rewards hidden, if the protocol asks for that
+    hidden_by_shot: list[Evaluation] | None = None  # results with hidden rewards, if the protocol asks for them
 
     @property
     def rollouts(self) -> int:
@@ -187,7 +189,7 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
         remaining = remaining - playing.long()
         first = False
     note("Adapting")
-    with torch.enable_grad():  # adaptation needs gradients, whatever the mode of the caller
+    with torch.enable_grad():  # adaptation needs gradients, even if the caller switched them off
         agent.adapt()
     return steps
 
@@ -205,7 +207,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)
         valid = running & ~info["unstable"]
-        # The world goes on with environments that were cut here; they are ignored until their next reset.
+        # The world continues with environments whose episodes were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
         agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
         steps += valid.sum()

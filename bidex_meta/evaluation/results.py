@@ -19,14 +19,14 @@ MANY_TASKS = 10  # number of tasks from which intervals resample tasks instead o
 class ClassResult:
     """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
 
-    returns: np.ndarray  # sum of the unscaled reward, float64; of broken episodes as ``counted_returns``
-    successes: np.ndarray  # success by the suite's rule, float64 0 or 1; 0 of broken episodes
+    returns: np.ndarray  # sum of the unscaled reward, float64; for broken episodes as in ``counted_returns``
+    successes: np.ndarray  # success by the suite's rule, float64 0 or 1; 0 for broken episodes
     lengths: np.ndarray  # steps, int64
     tasks: np.ndarray  # index of the played task in the class's pool, int64
     unstable: int  # episodes that ended because the physics broke
-    reference: Reference | None = None  # for the normalised score and broken episodes, where it is known
+    reference: Reference | None = None  # reference for the normalised score and for broken episodes, if known
     once: float | None = None  # share of episodes solved at any step
-    at_end: float | None = None  # share solved in their last steps (``suite.HELD_STEPS``)
+    at_end: float | None = None  # share of episodes solved in their last steps (``suite.HELD_STEPS``)
 
     @property
     def episodes(self) -> int:
@@ -95,7 +95,7 @@ class Evaluation:
     """The results of ``evaluate``."""
 
     classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
-    episodes_per_task: int  # episodes of every task
+    episodes_per_task: int  # number of episodes of every task
 
     @property
     def success(self) -> float:
@@ -120,7 +120,9 @@ class Evaluation:
         return to_builtins(self.summary())
 
 
-Difference = Estimate  # of two policies' mean returns in a class; tasks of both (few: episodes) are resampled
+# This is the difference of two policies' mean returns in a class. Tasks of both are resampled, or episodes if tasks are
+# few.
+Difference = Estimate
 
 
 def results_by_class(

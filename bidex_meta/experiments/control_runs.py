@@ -24,13 +24,13 @@ from bidex_meta.worlds import open_worlds
 class ControlResult:
     """Result of a control over all runs."""
 
-    runs: list[str]  # their folders
-    title: str  # learner and suite
+    runs: list[str]  # folders of the runs
+    title: str  # name of learner and suite
     shots: int
     trials: int
     rollouts: int  # episodes of each task in a shot
-    episodes: dict[str, int]  # of an arm, by class
-    classes: dict[str, dict[str, Json]]  # by class and arm, as of ``arms``
+    episodes: dict[str, int]  # number of evaluation episodes of an arm, by class
+    classes: dict[str, dict[str, Json]]  # results by class and arm, as in ``arms``
 
     def to_json(self) -> Json:
         """Return the result with plain values, ready for JSON."""
@@ -115,6 +115,6 @@ def _check(folders: Sequence[RunFolder]) -> None:
             raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
         if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
             raise BidexError(
-                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
+                f"Expected runs that differ only in the seed, but {folders[0].path} and {folder.path} differ in "
                 f"{', '.join(differing)}. Name them in separate calls."
             )

@@ -233,7 +233,7 @@ def evaluate(
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
     if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
-        raise BidexError(f"{config.algo} adapts to tasks: its policy alone says little. Use meta_test(run).")
+        raise BidexError(f"{config.algo} adapts to tasks, so its unadapted policy says little. Use meta_test(run).")
     state, steps = load_checkpoint(folder, checkpoint)
     policy = policy_of(folder, state, config.device)
     size = Options(episodes=episodes, num_envs=num_envs, seed=seed)
@@ -304,7 +304,7 @@ def meta_test(
     if isinstance(agent, RunFolder | str | Path):
         for name, value in (("suite", suite), ("task_seed", task_seed)):
             if value is not None:
-                raise BidexError(f"meta_test: {name}: a run brings its own, got {value}. Leave {name} out.")
+                raise BidexError(f"meta_test: {name}: a run has its own, got {value}. Leave {name} out.")
         folder = _opened(agent)
         config, worlds = _set_up(folder, device, engine, randomisation)
         if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:

@@ -21,12 +21,12 @@ class Film:
 
     out: Path
     seed: int = 0
-    steps: int | None = None  # None: none for a picture, one episode for a film, with ``tiled`` the longest one
+    steps: int | None = None  # None: none for a picture, one episode for a film, with ``tiled`` the longest episode
     tiled: bool = False
-    large: bool = False  # with ``tiled``: one environment at a time large beside all
+    large: bool = False  # with ``tiled``: show one environment at a time large next to all tiles
     every: int | None = None  # steps per frame; None: 1, with ``tiled`` 2
-    width: int | None = None  # pixels, of a tile with ``tiled``; None: 640, with ``tiled`` 240
-    height: int | None = None  # None: three quarters of the width
+    width: int | None = None  # width in pixels, with ``tiled`` of one tile; None: 640, with ``tiled`` 240
+    height: int | None = None  # height in pixels; None: three quarters of the width
     camera: str | None = None
     points: bool = False  # also draw the environment's point cloud
 
@@ -63,7 +63,7 @@ class Film:
         every = self.every or (2 if self.tiled else 1)
         frames = counted(self._frames(agent, world, rows, steps, every), self._count(steps, every), "frames")
         if self.is_picture:
-            for frame in frames:  # a tiled picture comes after the first frame
+            for frame in frames:  # a tiled picture needs a frame after the first one
                 video.write_image(self.out, frame)
         else:
             video.write_film(self.out, frames, CONTROL_RATE / every)

@@ -16,11 +16,11 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
-TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
-# episodes of a task in a shot where the config has none; the most taken from it
+TASKS = 5  # default tasks of each class, the first of its pool: all tasks of ML1, a tenth of ML20's
+# The first number is the episodes of a task in a shot if the config has none, the second the maximum taken from it.
 _ROLLOUTS = 10
 _MOST_ROLLOUTS = 40
-_ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
+_ENVIRONMENTS = 1024  # default maximum of environments stepped together; the world needs half a GB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
     tasks = min(options.tasks or TASKS, max(counts))
     protocol = Protocol(
         split, options.seed, tasks, rollouts=rollouts,
-        episodes_per_task=options.episodes or rollouts,  # which the same environments play at once
+        episodes_per_task=options.episodes or rollouts,  # the same environments play these episodes at once
         trials=options.trials or -(-TASKS // tasks), hidden_rewards=options.hidden_rewards,
         max_adapt_steps=adaptation.max_adapt_steps
     )  # fmt: skip
@@ -156,7 +156,7 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:
-        # A divisor, so that every environment plays in every round.
+        # The number is a divisor, so that every environment plays in every round.
         return classes * max(number for number in range(1, of_class + 1) if rollouts % number == 0)
     portions = -(-adaptations // (of_class // rollouts))
     return classes * -(-adaptations // portions) * rollouts

@@ -67,7 +67,7 @@ class ClassSummary(msgspec.Struct, frozen=True, kw_only=True):
     episodes: Whole | None = None
     tasks: Few | None = None
     unstable: Whole | None = None  # episodes that ended because the physics broke
-    solved: list[Whole] | None = None  # successful episodes of each task, by rising number of the task
+    solved: list[Whole] | None = None  # number of successful episodes of each task, in order of the tasks' numbers
 
 
 Classes = Annotated[dict[str, ClassSummary], Meta(min_length=1)]
@@ -79,7 +79,7 @@ class Summary:
 
     episodes_per_task: Few | None = None
     classes: Classes
-    aggregate: dict[str, Aggregate | None] | None = None  # by measure: ``success`` and ``score``
+    aggregate: dict[str, Aggregate | None] | None = None  # aggregates by measure: ``success`` and ``score``
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ class SplitSummary:
     before: Summary
     after: Summary
     gain: Gains | None = None
-    by_shot: Annotated[list[Summary], Meta(min_length=1)]  # after 0, 1, ..., ``shots`` shots
-    rewards_shown: bool = False  # agents saw the rewards of these episodes; before 0.3.0 they did not
+    by_shot: Annotated[list[Summary], Meta(min_length=1)]  # results after 0, 1, ..., ``shots`` shots
+    rewards_shown: bool = False  # True if agents saw the rewards of these episodes; before 0.3.0 they did not
     hidden_by_shot: list[Summary] | None = None  # the same episodes played with their rewards hidden
 
 
@@ -147,7 +147,7 @@ class PolicyEvaluation:
     run: Text | None = None
     steps: Whole | None = None  # environment steps that the policy was trained for
     split: Text = "train"
-    seed: Seed | None = None  # of the episodes' starts
+    seed: Seed | None = None  # seed of the episodes' start states
     policy: Summary
     random: Summary | None = None  # The results of a random policy on the same tasks.
     return_above_random: dict[str, Estimate] | None = None
@@ -171,11 +171,11 @@ class MetaTestEvaluation:
     """The evaluation of a learner, or of an agent of the caller's, before and after it adapts."""
 
     run: Text | None = None
-    agent: Text | None = None  # class of an agent that is no run
-    suite: Text | None = None  # that the agent played; a run's is in its config
-    task_seed: Seed | None = None  # that drew the agent's tasks
+    agent: Text | None = None  # class of an agent that is not a run
+    suite: Text | None = None  # suite that the agent played; for a run, its config holds the suite
+    task_seed: Seed | None = None  # seed that drew the agent's tasks
     steps: Whole | None = None  # environment steps that the learner was meta-trained for
-    seed: Seed | None = None  # of the episodes' starts
+    seed: Seed | None = None  # seed of the episodes' start states
     splits: Annotated[dict[str, SplitSummary], Meta(min_length=1)]
     conditions: Conditions = Conditions()
     randomisation: Json | None = None

@@ -5,7 +5,7 @@ import math
 
 def centimetres(*metres: float) -> str:
     """Return a length, or a point in the world as ``(1.0, -79.0, 54.0) cm``."""
-    numbers = ", ".join(f"{round(100.0 * each, 1) + 0.0:.1f}" for each in metres)  # + 0.0: no -0.0
+    numbers = ", ".join(f"{round(100.0 * each, 1) + 0.0:.1f}" for each in metres)  # adding 0.0 turns -0.0 into 0.0
     if len(metres) > 1:
         return f"({numbers}) cm"
     return f"{numbers} cm"

@@ -19,10 +19,10 @@ def say(text: str) -> None:
 class Launch:
     """This process among those of the run, as torchrun describes it in the environment."""
 
-    rank: int = 0  # process 0 alone writes and prints
-    count: int = 1  # on all machines
-    local_rank: int = 0  # on its machine
-    local_count: int = 1  # on its machine
+    rank: int = 0  # only process 0 writes and prints
+    count: int = 1  # number of processes on all machines
+    local_rank: int = 0  # rank on its machine
+    local_count: int = 1  # number of processes on its machine
 
     def own_device(self, device: str) -> str:
         """Return the device of this process.
@@ -36,7 +36,7 @@ class Launch:
 
 def launch() -> Launch:
     """Return this process's rank and the number of processes, read from the environment variables on every call."""
-    # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
+    # A batch system may set WORLD_SIZE for other reasons. torchrun also sets the address at which processes meet.
     if "MASTER_ADDR" not in os.environ:
         return Launch()
     defaults = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}

@@ -18,7 +18,7 @@ ROW_BYTES = 500_000
 """Of an environment on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 each."""
 POINT_BYTES = 100
 """Of a point of an environment's cloud: calculated, in the observation, its copies in a step's info and sources."""
-_ROOT = Path("/")  # holds proc and sys; tests give another folder
+_ROOT = Path("/")  # folder that contains proc and sys; tests use another one
 
 
 def usable_cores() -> int:
@@ -46,7 +46,9 @@ def check_memory(needed: float, what: str, mend: str) -> None:
     """
     there = available()
     if needed > there:
-        raise BidexError(f"{what} would take about {needed / 1e9:,.1f} GB, and {there / 1e9:,.1f} are free. {mend}")
+        raise BidexError(
+            f"{what} would take about {needed / 1e9:,.1f} GB, but only {there / 1e9:,.1f} are free. {mend}"
+        )
 
 
 def _free_of_groups() -> Iterator[int]:
@@ -67,7 +69,7 @@ def _cpu_quotas() -> Iterator[float]:
     for group in _groups("cpu"):
         version_1 = _numbers(group / "cpu.cfs_quota_us") + _numbers(group / "cpu.cfs_period_us")
         for quota in (_numbers(group / "cpu.max"), version_1):
-            if len(quota) == 2 and min(quota) > 0:  # version 1 has a quota of -1 for none
+            if len(quota) == 2 and min(quota) > 0:  # version 1 writes -1 for no quota
                 yield quota[0] / quota[1]
 
 
@@ -83,7 +85,7 @@ def _groups(controller: str) -> Iterator[Path]:
         if controllers and controller not in controllers.split(","):
             continue
         place = Path(path.lstrip("/"))
-        # Version 2 has one tree, which lies in a folder "unified" where the machine has version 1 too.
+        # Version 2 has one tree. If the machine also has version 1, the tree is in a folder "unified".
         trees = (controller, controllers) if controllers else (".", "unified")
         for tree in trees:
             yield from (root / tree / group for group in (place, *place.parents))

@@ -22,22 +22,22 @@ from bidex_meta.errors import BidexError, nearest, shortened
 
 Kind = TypeVar("Kind")
 
-MOST = 10**12  # no count of anything is larger
+MOST = 10**12  # no count is larger than this
 _LARGE = 1e300
 
 Whole = Annotated[int, Meta(ge=0, le=MOST)]
 Count = Annotated[int, Meta(ge=1, le=MOST)]
 Few = Annotated[int, Meta(ge=1, le=1_000_000)]  # repetitions: episodes, tasks, trials, images
-Shots = Annotated[int, Meta(ge=0, le=1000)]  # adaptations one after the other
+Shots = Annotated[int, Meta(ge=0, le=1000)]  # adaptation rounds, one after the other
 Environments = Annotated[int, Meta(ge=1, le=10_000_000)]
-Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more than there are cores
+Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more threads than the machine has cores
 Pixels = Annotated[int, Meta(ge=1, le=16_384)]
 Port = Annotated[int, Meta(ge=1, le=65_535)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Width = Annotated[int, Meta(ge=1, le=65_536)]  # of a network's layer; so wide a one alone holds 17 GB
+Width = Annotated[int, Meta(ge=1, le=65_536)]  # width of a network's layer; a single layer of this width holds 17 GB
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, max_length=64)]
 Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
-Point = tuple[Finite, Finite, Finite]  # a place in the world, metres
+Point = tuple[Finite, Finite, Finite]  # a position in the world, metres
 Positive = Annotated[float, Meta(gt=0.0, le=_LARGE)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
 Seconds = Annotated[float, Meta(ge=0.0)]  # may be infinite
@@ -131,7 +131,7 @@ def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
     """
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors of an accelerator
+    except (TypeError, ValueError, RuntimeError):  # lists of unequal lengths, or tensors of an accelerator
         array = np.array(None)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
         if array.dtype.kind in "fiu":
@@ -199,7 +199,7 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
         path = ""
     path = path.rstrip("`")
     place = (field + path).removeprefix(".")
-    if isinstance(error.__cause__, BidexError):  # of a dataclass that checks more than its annotations
+    if isinstance(error.__cause__, BidexError):  # a dataclass raised it in a check beyond its annotations
         return str(error.__cause__)
     missing = re.fullmatch(r"Object missing required field `(.*)`", complaint)
     if missing:
@@ -221,7 +221,7 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
     return f"{place or 'content'}: {expected}{got}."
 
 
-# Our words for msgspec's.
+# These are our words for msgspec's terms.
 _WORDS = {"a table": "object", "a list": "array", "a whole number": "int", "a number": "float", "a text": "str"}
 _WORDS |= {"true or false": "bool"}
 
@@ -234,7 +234,7 @@ def _choices(hint: object) -> list[object]:
     return list(itertools.chain.from_iterable(map(_choices, parts)))
 
 
-# A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.
+# This matches a part of msgspec's path, such as ``.runs[0].name``; ``[...]`` stands for an unknown index.
 _STEP = re.compile(r"\.([^.\[]+)|\[([^\]]*)\]")
 
 

@@ -18,7 +18,7 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, quaternion_product, rotate, xyzw
 from bidex_meta.witness.store import quantised
 
-GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
+GAIN = 8.0  # 1/s: speed of a hand per distance to its target, and of its turn per angle to its target
 _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2")
 _MIDDLES = ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
@@ -29,10 +29,10 @@ _Quaternion = tuple[float, float, float, float]  # (w, x, y, z)
 class Lead(NamedTuple):
     """Targets of a script in a control step; pairs are of the right and the left hand."""
 
-    points: tuple[Point, Point]  # where the hands' points shall go, world, metres
-    speed: float  # at most, m/s
+    points: tuple[Point, Point]  # target positions of the hands' points, world, metres
+    speed: float  # maximum speed, m/s
     fingers: tuple[np.ndarray, np.ndarray]  # actions of the joints, (20,) each
-    held: tuple[_Quaternion, _Quaternion]  # orientations, world; zeros for a hand that may turn
+    held: tuple[_Quaternion, _Quaternion]  # target orientations, world; zeros for a hand that may turn freely
 
 
 Actions = Iterator[Lead]
@@ -70,7 +70,7 @@ class HandController:
         self.frozen = frozen
         self.episode_steps = task.episode_steps
         self.taken = 0
-        self.wide = task.rules.wide  # whether a task asks for more than version 1's
+        self.wide = task.rules.wide  # True if tasks follow the rules of version 2
         self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
         self._first = {side: _numbers(self.where(f"{side}/mount_quaternion")) for side in SIDES}
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
@@ -152,7 +152,7 @@ class HandActions:
         """
         now = xyzw(now / now.norm(dim=-1, keepdim=True))
         error = multiply(held, conjugate(now))
-        way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rad, for small angles
+        way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rotation vector, rad; valid for small angles
         torque = rotate(now, rotate(conjugate(now), way) * constant(ANGULAR_DAMPING, now))
         return GAIN * torque / self._full_torque
 

@@ -15,11 +15,11 @@ from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.world.part import judge
 
-# witnesses are about task 0 of each class of this suite and seed
+# Witnesses solve task 0 of each class of this suite and seed.
 SUITE = "MT20"
 SEED = 0
-SHIFT = 1e-4  # how far the objects' start is shifted to see whether a witness succeeds by more than luck, metres
-SHIFTED = 10  # shifted starts of a replay
+SHIFT = 1e-4  # metres by which the objects' start is shifted, to test whether a witness succeeds by more than luck
+SHIFTED = 10  # number of shifted starts of a replay
 
 State = dict[str, Tensor]
 
@@ -28,10 +28,10 @@ State = dict[str, Tensor]
 class Trace:
     """Results of T steps of N environments."""
 
-    rewards: Tensor  # unscaled, (T, N), float64; 0 from the step after an end on
-    least: Tensor  # the least of the reward's terms, times their number; else as ``rewards``
+    rewards: Tensor  # unscaled rewards (T, N), float64; 0 after the end of an episode
+    least: Tensor  # smallest reward term times the number of terms, with the shape of ``rewards``
     success: Tensor  # bool (T, N), until the end of the episode
-    alive: Tensor  # bool (N,): the episode has not failed nor its physics broken
+    alive: Tensor  # bool (N,): neither did the episode fail nor did its physics break
 
 
 def task_slot(name: str) -> Slot:
@@ -149,8 +149,8 @@ class Replay:
     """Result of a replay."""
 
     total: float  # return from the unshifted start
-    first_success: int | None  # index of its first successful step
-    succeeded: int  # shifted starts that succeed
+    first_success: int | None  # index of the first successful step from the unshifted start
+    succeeded: int  # number of shifted starts that succeed
     depths: Tensor  # deepest contact after each step from each start, metres, (steps, 1 + shifted starts)
 
     @property

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
-# Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
+# A meta-batch consists of whole episodes of all environments, so fewer environments give more meta-batches.
 _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 
@@ -32,17 +32,18 @@ class WorldsConfig:
     suite: str | None = None
     task: str | None = None
     base: Base = "own"
-    points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
-    touch: bool = False  # True: observations show touch sensors; False: as the suite has it
+    points: int = 0  # number of points of the cloud that replaces objects' states; 0: as in the suite
+    touch: bool = False  # True: observations contain touch sensors; False: as in the suite
     object: str | None = None
-    tasks_per_class: int | None = None  # train tasks per class of a suite; 0: a new one in each episode or trial
-    seed: int = 0  # of starts, and of tasks without ``task_seed``
-    task_seed: int | None = None  # of tasks and starts instead
+    tasks_per_class: int | None = None  # train tasks per class of a suite; 0: a new task in each episode or trial
+    seed: int = 0  # seed of start states, and of tasks without ``task_seed``
+    task_seed: int | None = None  # seed of tasks and start states, instead of ``seed``
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
-    deterministic: bool = False  # whether a world on a GPU repeats bit for bit
-    randomisation: str | None = None  # file whose table randomises all worlds; None: the suite's training worlds alone
+    deterministic: bool = False  # True if a world on a GPU must repeat bit for bit
+    # File whose table randomises all worlds; None: only the training worlds, as in the suite.
+    randomisation: str | None = None
 
     @staticmethod
     def of(config: "Mapping[str, Json] | WorldsConfig") -> "WorldsConfig":
@@ -62,9 +63,9 @@ class Worlds(ABC):
 
     hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
-    class_name: str | None = None  # the class, if there is a single one
+    class_name: str | None = None  # name of the class, if the worlds have a single class
     object: str | None = None
-    moving_base: bool | None = None  # whether a single class has moving bases; None: the class's own bases
+    moving_base: bool | None = None  # True if a single class has moving bases; None: as the class defines it
     on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
     """A preset that precedes the others for these worlds, if the learner has it; and the reason in words."""

@@ -27,7 +27,7 @@ _HEALTHY_REWARD = 5.0
 _CONTROL_WEIGHT = 0.1
 _CONTACT_WEIGHT = 5e-7
 _CONTACT_MOST = 10.0
-# metres, of the torso
+# These bounds are heights of the torso in metres.
 _LOWEST = 1.0
 _HIGHEST = 2.0
 _START_NOISE = 1e-2
@@ -66,7 +66,7 @@ class HumanoidWorld(ForeignWorld):
         self._bound = [torch.from_numpy(bind(name).view()) for name in ("cinert", "cvel", "qfrc_actuator")]
         self._centres = torch.from_numpy(bind("xipos").view())
         self._contact = torch.zeros(num_envs, model.nbody, 6, dtype=torch.float64)
-        self._x = torch.zeros(num_envs, dtype=torch.float64)  # of the centre of mass, metres
+        self._x = torch.zeros(num_envs, dtype=torch.float64)  # x of the centre of mass, metres
         self.set_tasks({NAME: np.zeros((1, 0))})
 
     def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
@@ -76,7 +76,7 @@ class HumanoidWorld(ForeignWorld):
                 raise unknown_name("class", name, [NAME])
             shape = np.shape(pool)
             if len(shape) != 2 or shape[0] == 0 or shape[1] != 0:
-                raise BidexError(f"Expected tasks of {NAME} as (n, 0), for they are all alike, got {shape}.")
+                raise BidexError(f"Expected tasks of {NAME} as (n, 0), because all tasks are equal, got {shape}.")
             self._set_pool_sizes([shape[0]])
 
     @property
@@ -108,7 +108,7 @@ class HumanoidWorld(ForeignWorld):
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
         engine = self._engine
         moved = active & ~broken
-        # In single precision, as Gymnasium's actions are.
+        # Actions are in single precision, as in Gymnasium.
         engine.ctrl[:] = self._action * self._largest.float()
         engine.step(_SUBSTEPS, moved)
         self._feel(moved)

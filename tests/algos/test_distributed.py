@@ -388,5 +388,5 @@ def test_a_checkpoint_of_more_processes_is_refused():
     learner.iterate()
     state = checkpoint(learner, world)
     assert state is not None
-    with pytest.raises(BidexError, match="of 2 processes, but here are 1"):
+    with pytest.raises(BidexError, match="has 2 processes, but this run has 1"):
         resume(learner, world, {**state, "others": [state]})

@@ -211,7 +211,7 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
     said = printed(capsys, "run", "--resume", folder / "r", "--episodes", "1")
     assert "Enough: Train/mean_return is" in said and RunFolder.open(folder / "r").evaluation().steps == steps[-1]
     assert [row["step"] for row in RunFolder.open(folder / "r").metrics()] == steps
-    assert "Add --evaluate-every" in printed(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
+    assert "Add for example --evaluate-every" in printed(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
     assert "--stop-at-success" in printed(capsys, "run", *SMALL, "--stop-at-success", "80", code=2)
 
 

@@ -142,7 +142,7 @@ def test_a_run_imitates_several_sets_and_is_resumed(
         (["--demonstrations", "HandOver/demo-v0"], "Unknown data set 'HandOver/demo-v0'"),
         ([*shown, "--base", "own"], "Add --base moving"),
         ([*shown, "--task", "Switch"], "HandOver"),
-        ([*shown, "--algo", "td3"], "td3 imitates nothing; --demonstrations goes with mtppo, ppo"),
+        ([*shown, "--algo", "td3"], "td3 does not imitate; --demonstrations goes with mtppo, ppo"),
     ]
     for flags, text in wrong:
         assert text in printed(capsys, *RUN, *flags, "--run-dir", sets / "bad", code=2)

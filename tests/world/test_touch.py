@@ -164,7 +164,7 @@ def test_states_of_worlds_with_and_without_are_told_apart() -> None:
 def test_worlds_without_our_hands_have_none() -> None:
     for name in ("metaworld/MT3", "gymnasium/Humanoid-v5"):
         kind = "suite" if name.startswith("metaworld") else "task"
-        with pytest.raises(BidexError, match=r"Touch sensors are of our hands.*Leave --touch out"):
+        with pytest.raises(BidexError, match=r"Only bidex-meta's hands have touch sensors.*Leave --touch out"):
             open_worlds(WorldsConfig(**{kind: name}, touch=True))
 
 

@@ -114,9 +114,9 @@ def test_an_unknown_name_is_one_line(config: dict[str, object], told: str) -> No
     ("config", "split", "told"),
     [
         ({"suite": "MT4"}, "test", "MT4 has the splits train, got 'test'"),
-        ({"task": "HandOver"}, "test", "HandOver alone has no test split. Leave --split out."),
-        ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has the split train alone, got 'test'."),
-        ({"task": "gymnasium/Humanoid-v5"}, "test", "gymnasium/Humanoid-v5 has the split train alone, got 'test'."),
+        ({"task": "HandOver"}, "test", "A run on the single task HandOver has no test split. Leave --split out."),
+        ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has only the split train, got 'test'."),
+        ({"task": "gymnasium/Humanoid-v5"}, "test", "gymnasium/Humanoid-v5 has only the split train, got 'test'."),
         ({"suite": "metaworld/MT3", "device": "cuda"}, "train", "got --device cuda. Add --device cpu."),
         ({"suite": "metaworld/MT3", "engine": "warp"}, "train", "got --engine warp. Add --device cpu."),
     ],

@@ -93,9 +93,9 @@ def _pairs(old: "_Worker", new: "_Worker", world: Json, steps: int, repeats: int
     walls: dict[_Worker, list[float]] = {old: [], new: []}
     cpus: dict[_Worker, list[float]] = {old: [], new: []}
     for repeat in range(repeats + 1):
-        for worker in (old, new) if repeat % 2 else (new, old):  # alternate which side finds a warm machine
+        for worker in (old, new) if repeat % 2 else (new, old):  # alternates which side finds a warm machine
             took = worker.ask("step", steps=steps, seed=repeat)
-            if repeat:  # the first one warms up
+            if repeat:  # the first repeat warms up
                 walls[worker].append(took["wall"])
                 cpus[worker].append(took["cpu"])
     done = world["num_envs"] * steps

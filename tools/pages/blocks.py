@@ -26,7 +26,7 @@ from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.pretrained import pretrained_table
 from tools.pages.scaling import rows_figure, rows_table
-from tools.pages.studies import curves_figure, digest_of, read_studies
+from tools.pages.studies import bars_figure, curves_figure, digest_of, read_studies
 from tools.pages.validity import validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
@@ -45,6 +45,7 @@ _WITHOUT_STUDY = {
     "pretrained": pretrained_table,
 }
 _FIGURES = {
+    "bars": (bars_figure, "Success per class"),
     "curves": (curves_figure, "Return and success over training"),
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
@@ -59,10 +60,11 @@ _DIGEST = "Description"
 class Block:
     """The options of a block."""
 
-    study: str = ""  # Its name; of several, with commas between, one table or picture (``best``, ``ladder``).
+    # Name of the study; with commas, several studies in one table or picture (``best``, ``ladder``, ``bars``).
+    study: str = ""
     show: str = "table"
-    on: str | None = None  # Only this suite or class.
-    split: str | None = None  # Only this split of meta-tests.
+    on: str | None = None  # Show only this suite or class.
+    split: str | None = None  # Show only this split of meta-tests.
 
 
 def filled_pages(root: Path) -> list[Path]:
@@ -78,7 +80,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
     """
     text, changed = page.read_text(), []
     if text.count("<!-- results:") != text.count("<!-- end -->"):
-        raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Mend it.")
+        raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Fix it.")
 
     def replaced(found: re.Match[str]) -> str:
         try:

@@ -31,8 +31,8 @@ _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", 
 class Arm:
     """One setting of a study, on several seeds."""
 
-    group: Group  # Final evaluations of its runs, labelled with its name.
-    runs: list[StoredRun]  # Its runs.
+    group: Group  # Final evaluations of the arm's runs, labelled with the arm's name.
+    runs: list[StoredRun]  # Runs of the arm.
 
     @cached_property
     def success(self) -> Estimate:
@@ -62,8 +62,8 @@ class Study:
     """Arms on one suite or class."""
 
     name: str  # Name of its file.
-    on: str  # The suite or class.
-    runs: list[StoredRun]  # Sorted by name.
+    on: str  # Name of the suite or class.
+    runs: list[StoredRun]  # Runs of the study, sorted by name.
     split: str | None = None  # Split of a meta-test to show; None: all.
 
     @cached_property
@@ -153,6 +153,24 @@ def curves_figure(study: Study) -> "Figure":
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 
 
+def bars_figure(*studies: Study) -> "Figure":
+    """Draw success per class as bars, one colour per arm, with the range over seeds.
+
+    Raises ValueError if two arms have the same name.
+    """
+    groups: dict[str, list[plots.Bar]] = {}
+    for arm in chain.from_iterable(study.arms for study in studies):
+        label = arm.group.label
+        if label in groups:
+            raise ValueError(f"two arms are named {label!r}")
+        percent = 100.0 * arm.group.success.T  # (classes, seeds)
+        groups[label] = [
+            (name, seeds.mean(), (seeds.min(), seeds.max()))
+            for name, seeds in zip(arm.group.classes, percent, strict=True)
+        ]
+    return plots.draw_bars(groups, "success (%); lines show the range over seeds")
+
+
 def _subject(runs: Sequence[StoredRun]) -> str:
     """Return the suite or class of the runs; among several suites with the same classes, the shipped suite."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
@@ -176,5 +194,5 @@ def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
             if key not in _FREE and first[key] != other[key]:
                 raise BidexError(
                     f"{run.path} and {same.path.name} are both of the arm {name!r}, but {key} is {other[key]} and "
-                    f"{first[key]}. Collect one anew with --arm."
+                    f"{first[key]}. Collect one again with --arm."
                 )

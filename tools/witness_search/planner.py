@@ -58,7 +58,7 @@ class Plan:
     """Result of a search."""
 
     actions: np.ndarray  # Actions of the whole episode, (T, action_size), multiples of 1/127.
-    rewards: np.ndarray  # Unscaled rewards they gave, (T,).
+    rewards: np.ndarray  # Unscaled rewards of the actions, (T,).
     first_success: int | None  # Index of the first successful step, None if there is none.
     rival: float | None
     """Highest return of the unsuccessful episodes that the search saw: before the first success, the best sequences
@@ -89,7 +89,7 @@ class Planner:
         Every plan also tries the actions (T, action_size) of an ``earlier`` search at their time.
         """
         cfg, sim = self.config, self.simulator
-        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
+        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # the starts differ from those of the replay
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
         if earlier is not None:
             mean = knots_of(earlier, 0, cfg)

@@ -15,7 +15,7 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]  # parameters that an inner step moves: all, or only the mean's output layer
+Adapted = Literal["all", "head"]  # parameters that an inner step changes: all, or only the mean's output layer
 StepSizeKind = Literal["fixed", "layer", "weight"]  # granularity of learned inner step sizes; fixed: not learned
 
 
@@ -53,7 +53,8 @@ Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have 
 Objective = Literal["likelihood", "ratio"]
 """Objective of the inner step: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192  # for layers 64-64 they fit a CPU's caches; all tasks at once take 1.5 times as long
+# With layers 64-64, these fit into a CPU's caches; all tasks at once take 1.5 times as long.
+_TRANSITIONS_AT_ONCE = 8_192
 
 
 @dataclass
@@ -63,9 +64,9 @@ class TaskBatch:
     obs: Tensor  # normalised observations (M, B, d)
     actions: Tensor  # sampled actions (M, B, a)
     old_means: Tensor  # means of the policies that sampled (M, B, a)
-    old_log_stds: Tensor  # logarithms of their standard deviations (M, a)
-    advantages: Tensor  # normalised within each task (M, B)
-    weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
+    old_log_stds: Tensor  # logarithms of the standard deviations of the policies that sampled (M, a)
+    advantages: Tensor  # advantages, normalised within each task (M, B)
+    weights: Tensor  # 1, or 0 for transitions to ignore: after an episode's end, or where physics broke (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the fields in order."""

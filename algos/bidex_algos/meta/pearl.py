@@ -57,7 +57,7 @@ class PEARLConfig(MTSACConfig):
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 
-# v2: MT-PPO's discount.
+# The preset v2 uses MT-PPO's discount.
 PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.99)}
 
 
@@ -145,7 +145,7 @@ class PEARL(MTSAC):
 
     def _below(self, counts: Tensor, *shape: int) -> Tensor:
         """Draw uniform integers (shape) below ``counts``, which broadcast; 0 where a count is 0."""
-        # The remainder of so large a number favours no entry by more than 1 in 2^40 / count.
+        # A remainder of this large number favours no entry by more than 1 in 2^40 / count.
         return self._uniform(0, 2**40, *shape) % counts.clamp_min(1)
 
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ class TaskRows:
         column = torch.arange(width, device=task_of_row.device)
         self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
         self.weight = (column < counts[:, None]).float()
-        # Position of each environment in the flattened rectangle.
+        # This is the position of each environment in the flattened rectangle.
         place = torch.empty_like(order)
         rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
         place[order] = task_of_row[order] * width + rank
@@ -78,7 +78,7 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
         weighted = x * w[:, None]
         gram = (weighted.T @ x).double()
         diagonal = gram.diagonal()
-        # A small penalty on every entry, relative to the mean, so that features may be linearly dependent.
+        # A small penalty on every entry, relative to the mean, allows for linearly dependent features.
         penalty = torch.full_like(diagonal, 1e-5)
         penalty[:-4] += ridge * x.shape[1] / w.sum().clamp_min(1.0)
         diagonal += penalty * diagonal.mean().clamp_min(1.0)
@@ -93,12 +93,12 @@ class Stage:
     obs: list[Tensor] = field(default_factory=list)  # normalised observations before the step (N, d)
     actions: list[Tensor] = field(default_factory=list)  # sampled actions, not clamped (N, a)
     means: list[Tensor] = field(default_factory=list)  # means of the sampling policies (N, a)
-    rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 where not valid
-    terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode came to a true end
-    ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
+    rewards: list[Tensor] = field(default_factory=list)  # rewards (N,); 0 where not valid
+    terminated: list[Tensor] = field(default_factory=list)  # bool (N,): the episode came to a true end
+    ended: list[Tensor] = field(default_factory=list)  # bool (N,): the episode is over, for any reason
     # Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
-    elapsed: list[Tensor] = field(default_factory=list)  # steps of the episode before this one (N,)
+    elapsed: list[Tensor] = field(default_factory=list)  # steps of the episode before this step (N,)
 
     def add(self, **step: Tensor) -> None:
         """Append a step, with every field given by name."""
@@ -148,8 +148,8 @@ class Outcome(NamedTuple):
     """Results of a stage."""
 
     earned: Tensor  # undiscounted, unscaled return of each environment (N,)
-    success: Tensor  # whether each environment succeeded, bool (N,)
-    steps: Tensor  # environment steps, int64 (); a row that waits for the others takes none
+    success: Tensor  # True if the environment succeeded, bool (N,)
+    steps: Tensor  # environment steps, int64 (); a row that waits for the others takes no steps
 
 
 def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -185,17 +185,17 @@ class Batch:
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
-    # Inputs of the memory besides the observation; see Trials.previous.
+    # These are the memory's inputs besides the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
     old_means: Tensor  # means of the sampling policy (T, N, a)
-    old_log_probs: Tensor  # log-density of the actions under it (T, N)
+    old_log_probs: Tensor  # log-density of the actions under the sampling policy (T, N)
     advantages: Tensor  # normalised advantages (T, N)
-    targets: Tensor  # what the critic shall predict, in its own units (T, N)
-    weights: Tensor  # 1, or 0 for slots that teach nothing (T, N)
+    targets: Tensor  # targets of the critic, in its own units (T, N)
+    weights: Tensor  # 1, or 0 for slots to ignore (T, N)
     actor_states: Tensor  # the actor's memory before each chunk (T / C, N, memory)
-    critic_states: Tensor  # the critic's (T / C, N, memory)
-    chunk: Tensor  # number of each chunk that holds a step, int64 (S,)
-    row: Tensor  # its row, int64 (S,)
+    critic_states: Tensor  # the critic's memory before each chunk (T / C, N, memory)
+    chunk: Tensor  # number of each chunk that contains a step, int64 (S,)
+    row: Tensor  # row of each chunk, int64 (S,)
 
     @property
     def size(self) -> int:
@@ -244,7 +244,7 @@ def make_batch(
     Also returns the explained variance per task (num_tasks,). ``return_stats`` is updated with the trial's returns.
     """
     num_tasks = len(return_stats.mean)
-    # The only host sync: the number of steps of the longest trial.
+    # This is the only host sync: it reads the number of steps of the longest trial.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
     means = []
@@ -268,7 +268,7 @@ def make_batch(
     valid = t.valid[:slots] & filled
     # The value after the trial's last slot is never used.
     next_values = torch.cat([values[1:], values[-1:]])
-    # The end of an episode does not end the trial: the next episode follows with the same memory.
+    # The end of an episode does not end the trial, because the next episode continues with the same memory.
     advantages = gae(
         t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
         gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid

@@ -92,7 +92,7 @@ class InTurnConfig(LearnerConfig):
         super().__post_init__()
         if 0 < self.max_factor < 1:
             raise BidexError(
-                f"{self.algo}: max_factor: expected 0 or at least 1, which is no change at all, got {self.max_factor}."
+                f"{self.algo}: max_factor: expected 0 or at least 1 (which means no change), got {self.max_factor}."
             )
 
 
@@ -108,7 +108,7 @@ PAPER_PPO: Options = PAPER | {
 }  # fmt: skip
 """PAPER with the passes and the clip of both tables."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # the values of both tables' column for LiftUnderarm that differ
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # values in which both tables' columns for LiftUnderarm differ
 
 
 @torch.no_grad()
@@ -130,14 +130,14 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
 class AgentBatch:
     """Samples (B,) of one agent with a_i actions, cut out of the batch once, so that mini-batches only select rows."""
 
-    seen: Tensor  # what its network is fed (B, d_i)
-    task: Tensor  # the tasks' one-hot (B, heads); without columns where the agent has one head
-    actions: Tensor  # its part of the sampled actions (B, a_i)
-    old_means: Tensor  # of the sampling policy (B, a_i)
-    old_log_std: Tensor  # of the sampling policy (B, a_i)
-    old_log_probs: Tensor  # log-density of its part under the sampling policy (B,)
-    gain: Tensor  # the advantages it shall climb (B,)
-    weights: Tensor  # as in the batch (B,)
+    seen: Tensor  # inputs of the agent's network (B, d_i)
+    task: Tensor  # one-hot task ids (B, heads); without columns if the agent has one head
+    actions: Tensor  # the agent's part of the sampled actions (B, a_i)
+    old_means: Tensor  # means of the sampling policy (B, a_i)
+    old_log_std: Tensor  # log standard deviations of the sampling policy (B, a_i)
+    old_log_probs: Tensor  # log-density of the agent's part under the sampling policy (B,)
+    gain: Tensor  # advantages that the agent maximises (B,)
+    weights: Tensor  # weights as in the batch (B,)
 
     def select(self, index: Tensor) -> "AgentBatch":
         """Return the samples at ``index``."""

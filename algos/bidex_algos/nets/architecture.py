@@ -20,7 +20,9 @@ _TRUNKS: dict[str, MakeNetwork] = {
     "soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer,
     "towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0),
 }  # fmt: skip
-_MODULES = 4  # modules of a layer of soft_modules, parameter sets of paco, experts of moore, heads of attention
+# Number of modules in a layer of soft_modules, parameter sets of paco, experts of moore, attention heads of
+# transformer.
+_MODULES = 4
 
 
 class Networks(Protocol):
@@ -75,7 +77,7 @@ def check_networks(config: Networks) -> None:
     architecture = config.architecture
     if architecture in ("multi_head", "towers", "separate"):
         for heads in ("policy_heads", "value_heads"):
-            object.__setattr__(config, heads, True)  # so that a checkpoint's config has them too
+            object.__setattr__(config, heads, True)  # stores the value, so that a checkpoint's config contains it
     if shares_a_trunk(architecture):
         return
     if vars(config).get("task_embedding"):

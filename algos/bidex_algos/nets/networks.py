@@ -15,8 +15,8 @@ from bidex_meta.utils.validation import Width
 
 Activation = Literal["elu", "relu", "tanh"]
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
-Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
-Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; none makes a linear map
+Autocast = Literal["auto", "on", "off"]  # precision of the hidden layers: on is bfloat16
+Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; an empty tuple gives a linear map
 MakeNetwork = Callable[..., Any]
 """Takes the arguments of :class:`MLP`; the result has ``output_bias``, the biases of the output (outputs,)."""
 
@@ -122,7 +122,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """Make a layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
-    # The layer is made without memory first: the default initialisation would draw from the global generator.
+    # The layer is created without memory, because the default initialisation would draw from the global generator.
     layer = Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
@@ -133,7 +133,7 @@ def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
     """Select from outputs (..., heads * n) the outputs (..., n) of the head that a one-hot (..., heads) names."""
     if heads == 1:
         return out
-    with torch.autocast(out.device.type, enabled=False):  # like the output layer: means would be rounded
+    with torch.autocast(out.device.type, enabled=False):  # as in the output layer, because bfloat16 would round means
         return torch.einsum("...h,...ha->...a", one_hot.to(out.dtype), out.unflatten(-1, (heads, -1)))
 
 

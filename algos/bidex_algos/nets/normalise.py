@@ -9,8 +9,8 @@ from bidex_algos.nets.inputs import Columns, Inputs
 from bidex_meta.training.distributed import pool_moments
 from bidex_meta.training.learner import LearnerConfig
 
-_FLOOR = 3e-3  # of a standard deviation: a column that was constant so far must not amplify noise a thousandfold
-_FOREVER = 1e18  # a count so large that further observations have no weight
+_FLOOR = 3e-3  # smallest standard deviation: a column that was constant so far must not amplify noise a thousandfold
+_FOREVER = 1e18  # so large a count that further observations have no weight
 
 
 class RunningStats(nn.Module):
@@ -71,7 +71,7 @@ class ObservationNormaliser(nn.Module):
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
-        # float32 copies for forward, refreshed by update.
+        # These are float32 copies for forward, refreshed by update.
         self.shift: Tensor
         self.scale: Tensor
         self.register_buffer("shift", torch.zeros(inputs.width))

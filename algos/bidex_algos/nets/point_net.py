@@ -14,8 +14,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
-_SPREAD = 0.2  # metres; divides distances from a cloud's centre: about a hand's length
-_CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
+_SPREAD = 0.2  # metres, about a hand's length; it divides distances from a cloud's centre
+_CACHED = 1 << 19  # number of values of a layer that a CPU computes at once
 
 
 class PointNet(nn.Module):
@@ -35,7 +35,7 @@ class PointNet(nn.Module):
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0), generator=generator)
             nn.init.zeros_(layer.bias)
             layers += [layer, nn.ReLU()]
-        self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
+        self.shared = nn.Sequential(*layers[:-1])  # the maximum serves as the last non-linearity
 
     def forward(self, x: Tensor) -> Tensor:
         """Encode clouds."""
@@ -51,8 +51,8 @@ class PointNet(nn.Module):
         last = cast(nn.Linear, self.shared[-1])
         if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
-        # Only the point with the maximum of a feature has a gradient: find these points first, then differentiate only
-        # them.
+        # Only the point with the maximum of a feature has a gradient, so we find these points first and differentiate
+        # only them.
         with torch.no_grad():
             found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
         chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
@@ -84,7 +84,7 @@ def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
             continue
         if "point_widths" not in options:
             raise BidexError(
-                f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
+                f"{config.algo} does not read point clouds. Use another learner, such as mtppo or mtsac, or leave "
                 "--points (a suite's table [points]) out."
             )
         make = partial(PointNet, widths=tuple(options["point_widths"]), channels=channels)

@@ -86,7 +86,7 @@ class Batches:
     def draw(self, batches: int, generator: torch.Generator) -> Tensor:
         """Draw indices, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
         shape = (batches, len(self._count), self._per_task)
-        # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
+        # A remainder of this large number favours no transition by more than 1 in 2^40 / transitions.
         drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]
         return self._of_task[self._first[:, None] + drawn].flatten(1)
 
@@ -245,6 +245,6 @@ class Offline(Learner):
         if here and state["data"] and here != state["data"]:
             differ = next(name for name in here if here[name] != state["data"].get(name))
             raise BidexError(
-                f"{self.name}: the checkpoint's data have {differ} {state['data'].get(differ):,.6g}, these "
+                f"{self.name}: the checkpoint's data sets have {differ} {state['data'].get(differ):,.6g}, these "
                 f"{here[differ]:,.6g} (sums; transitions: their number). Resume with the run's own data sets."
             )

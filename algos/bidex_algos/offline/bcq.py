@@ -25,7 +25,7 @@ from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-_FARTHEST = 0.5  # bound of the codes of proposed actions: the model has seen most data near the middle
+_FARTHEST = 0.5  # bound of the codes of proposed actions, because the model has seen most data near the middle
 _LOG_STD = (-4.0, 15.0)
 
 
@@ -208,7 +208,7 @@ class BCQ(Offline):
 
     def _parts(self) -> Parts:
         parts = super()._parts()
-        del parts["critic"]  # the policy's
+        del parts["critic"]  # the critic is a part of the policy
         return parts
 
     def _own_parts(self) -> Parts:

@@ -136,7 +136,7 @@ class OffPolicy(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
         self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
-        # Rewards that have left the replay also fade from the statistics.
+        # Rewards that the replay no longer holds also fade from the statistics.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)

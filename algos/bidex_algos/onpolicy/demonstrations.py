@@ -9,10 +9,10 @@ from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.training.distributed import own_seed, sum_gradients, world_size
 
-WEIGHT = 0.1  # of the term at the start
+WEIGHT = 0.1  # initial weight of the term
 HALF_LIFE = 500_000.0  # environment steps in which the weight falls to half
 
-_DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
+_DEMONSTRATED = 0xDE30  # seed offset, so that demonstrations do not change the learner's own draws
 
 
 class Demonstrations:
@@ -42,7 +42,7 @@ class Demonstrations:
         size = (self.batch_size,)
         device = self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
-        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
+        # A remainder of this large number favours no entry by more than 1 in 2^40 / transitions.
         place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
         chosen = self._of_task[self._first[task] + place]
         return self._obs[chosen], self._actions[chosen]

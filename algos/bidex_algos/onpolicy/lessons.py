@@ -18,8 +18,8 @@ from bidex_meta.world.contract import VectorWorld
 # does not outweigh all others. It is 1.5 % of an action's range, or about 0.02 rad of a finger joint.
 _FLOOR = 0.03
 
-SUCCESS = 0.8  # of a class's last 100 episodes, from which its teacher counts nothing beside PPO
-# The first few episodes say little: up to this number, the missing episodes count as failures.
+SUCCESS = 0.8  # success in a class's last 100 episodes from which its teacher's labels have no weight
+# The first few episodes say little, so up to this number the missing episodes count as failures.
 _EPISODES = 20.0
 
 

@@ -62,8 +62,8 @@ class PolicyLoss(NamedTuple):
 
     surrogate: Tensor  # minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)
     entropy: Tensor  # entropy of the policy
-    kl: Tensor  # KL of the sampling policy from the present one; without a gradient
-    outside: Tensor  # share of the ratios outside the clip range; without a gradient
+    kl: Tensor  # KL divergence between the sampling policy and the current one, without a gradient
+    outside: Tensor  # share of the ratios outside the clip range, without a gradient
     earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
     def numbers(self, value: Tensor) -> list[Tensor]:

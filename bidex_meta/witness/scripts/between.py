@@ -35,7 +35,7 @@ class Take:
     firm: tuple[float, float]
 
 
-_CLOSING = 0.015  # how far ahead a hand is led that does not press yet, metres
+_CLOSING = 0.015  # distance in metres that a hand is led ahead while it does not press yet
 
 
 def ramp(value: float, first: float, last: float) -> float:

@@ -3,11 +3,11 @@
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, beside
 
-_DOWN = 0.2  # bend of the wrist that brings straight fingers below the forearm, rad
+_DOWN = 0.2  # bend of the wrist, rad, that brings straight fingers below the forearm
 
 
-# Of a fork: from its block to the hand's point where it pushes, and where it lets go of it; height above the floor;
-# angles that spread forefinger and little finger. Metres, rad.
+# These are a fork's values in metres and rad: distance from its block to the hand's point while it pushes, and when it
+# lets go; height above the floor; angles that spread forefinger and little finger.
 _BEHIND = 0.06
 _CLEAR = 0.09
 _LOW = 0.642
@@ -42,7 +42,7 @@ def push_blocks(hands: HandController) -> Actions:
                 lead = way * 0.0
             else:
                 lead = way * 1.0
-            # Where the fork is, if it follows its block; it never runs ahead.
+            # The fork is at this position if it follows its block; it never runs ahead.
             ahead = float(lead[0])
             behind_block = _BEHIND + ahead if ahead < -0.004 else _CLEAR
             points.append(beside(place, behind_block, float(lead[1]), _LOW))

@@ -9,8 +9,9 @@ from torch import Tensor
 from bidex_meta.utils.maths import rotate
 from bidex_meta.witness.controller import Actions, HandController, Point, beside, point
 
-_TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
-_HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
+_TIP = 0.035  # distance in metres from a finger's last joint to the part of its tip that touches a cap's axis
+# Joint angles, rad, at which the right thumb stays behind the bottle.
+_HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 _FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"), (1, 2))}
 
 
@@ -61,19 +62,20 @@ def _ahead(hands: HandController) -> Tensor:
     return way / way.norm()
 
 
-_PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
-# Of a peg's circle about the cup, and of the right fingertips', metres; how far either is behind an ear that it pushes;
-# angle of the left ear from which on the right hand pushes it: the left thumb would meet the lid, rad.
+_PEG = 0.015  # height in metres of a peg above the cup's origin; pushing higher tips the cup
+# These are the radii in metres of a peg's circle about the cup and of the right fingertips' circle, the distance that
+# both keep behind the ear that they push, and the angle in rad of the left ear from which on the right hand pushes it,
+# because the left thumb would meet the lid.
 _RADIUS = 0.068
 _TIP_RADIUS = 0.078
 _TOUCH = 0.2
 _FAR = 0.5
-_FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
+_FINGERTIP = 0.031  # distance in metres from a finger's last joint to its tip
 
 
 def swing_cup(hands: HandController) -> Actions:
     """Pull the left ear around with the left little finger, bent to a peg; the right fingers push it on from behind."""
-    # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
+    # When the hand pushes an ear, the cup turns in place before it slides, because of the friction at its foot.
     away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
     hands.hold("right")
@@ -121,7 +123,7 @@ def _push_on(hands: HandController) -> Actions:
         yield from hands.lead(tip(_TOUCH, 0.03), aside, speed=0.4)
     while hands.steps_left and _missing(hands) > 0.05:
         yield from hands.lead(tip(_TOUCH - min(0.3, _missing(hands))), aside, speed=0.2)
-    # The hand stays: a cup that is bumped on its way back turns on.
+    # The hand stays, because a cup that is touched on the way back turns further.
     yield from hands.lead(point(hands.at("right")), aside, hands.episode_steps)
 
 

@@ -2,18 +2,21 @@
 
 from bidex_meta.witness.controller import Actions, HandController, point
 
-# Joint angles of the right hand before and after it closes on the egg, rad, and the steps that it takes.
+# These are joint angles of the right hand in rad, before and after it closes on the egg, and the number of steps of
+# closing.
 _OPEN = (0.5, 0.5)
 _FIST = (1.3, 1.35)
 _CLOSING = 10
 _THUMB = {"THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
-_SETTLING = 25  # steps in which the hand stays below the egg, before it moves on
-_ASIDE = 0.01  # of the hand's point from the egg in x while it closes, metres: eggs escape on the thumb's side
+_SETTLING = 25  # number of steps that the hand waits below the egg before it moves
+# Distance in metres of the hand's point from the egg in x while it closes; eggs escape on the thumb's side.
+_ASIDE = 0.01
 
 
 def carry_egg(hands: HandController) -> Actions:
     """Close the right hand on the egg and carry it to its goal; the left hand makes way."""
-    # A throw that is caught and then brought to the goal is quicker, but a script cannot foresee where an egg flies.
+    # Catching a throw and then carrying the egg to the goal would be quicker, but a script cannot predict where an egg
+    # flies.
     hands.bend("left", 0.0, 0.0)
     for side in ("right", "left"):
         hands.hold(side)

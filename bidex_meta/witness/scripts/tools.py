@@ -9,13 +9,13 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, Point, point
 from bidex_meta.witness.scripts.between import ramp
 
-_LEVER = 0.035  # from a rocker's hinge to its button, metres
+_LEVER = 0.035  # distance in metres from a rocker's hinge to its button
 
 
 def press_switches(hands: HandController) -> Actions:
     """Press each button with a fingertip until its rocker has the requested angle, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
-    buttons = ("switch2", "switch1")  # of the right and the left hand
+    buttons = ("switch2", "switch1")  # switches of the right and of the left hand
     for side in SIDES:
         hands.bend(side, 0.9, 0.5, THJ3=0.5)
         hands.hold(side)
@@ -87,7 +87,7 @@ def _around(hands: HandController, side: str, along: Tensor, way: float, closed:
     return float(goal[0]), float(goal[1]), above + closed * (0.65 - above)
 
 
-_HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
+_HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other hand
 
 
 def open_scissors(hands: HandController) -> Actions:
