@@ -109,6 +109,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Named set of defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if
     the learner has this preset; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    """Options of the learner (in Python also a dict of the values that differ from its preset)."""
     num_envs: Environments = UNRESOLVED
     """Number of environments that each process steps together, over all tasks."""
     steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)

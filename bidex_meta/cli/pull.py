@@ -29,9 +29,9 @@ from bidex_meta.utils.files import absolute
 class PullFlags:
     """Fetch a policy or a data set that `bidex-meta push` published.
 
-    `bidex-meta evaluate` then plays the policy, and `bidex-meta data info` describes the data set.
-
     Example: bidex-meta pull me/mt4-mtppo
+
+    `bidex-meta evaluate` then plays the policy, and `bidex-meta data info` describes the data set.
     """
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]

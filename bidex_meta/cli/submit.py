@@ -86,7 +86,7 @@ def _check(flags: SubmitFlags, path: Path) -> None:
     """Repeat an entry, and print differences and the verdict; return exit code 1 if something differs."""
     if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
         raise BidexError(
-            "--check takes an entry, its runs and --device. Everything else comes from the entry. Leave other flags out."
+            "--check takes an entry, its runs and --device. All else comes from the entry. Leave other flags out."
         )
     found = check(path, _folders(flags), flags.device)
     table = Sheet(["task", "outcome", "success", "again"], "Results that are not equal")

@@ -226,5 +226,5 @@ def test_plot_takes_several_runs_and_compare_draws(tmp_path: Path, capsys, monke
     assert main(["compare", *names, "--out", str(tmp_path / "c.svg")]) == 0
     assert "success, IQM" in (tmp_path / "c.svg").read_text()
     assert main(["plot", *names, "--adaptation"]) == 2
-    assert "draws one run, got 2" in capsys.readouterr().err
+    assert "draws a single run, got 2" in capsys.readouterr().err
     assert main(["plot"]) == 2

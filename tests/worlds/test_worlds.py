@@ -23,7 +23,7 @@ def named(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, object]:
     return {"threads": 1, "suite": str(file)}
 
 
-# Of each split: slots, tasks of each, rows of an evaluation world, observations, actions.
+# For each split: slots, tasks of each, rows of an evaluation world, observations and actions.
 WORLDS: list[Any] = [
     ({"suite": "MT4"}, {"train": (4, 50, 200, 450, 52)}),
     ({"suite": "ML1"}, {"train": (1, 3, 3, 422, 52), "test": (1, 1, 1, 422, 52)}),
