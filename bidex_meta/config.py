@@ -100,14 +100,13 @@ class RunConfig(Generic[LearnerSettings]):
     """With --suite: number of train tasks of each class. 0: draw a new task for each episode, or for each trial of a
     learner that adapts (docs/own-suite.md). None: the number in the suite's file."""
     start_from: Text | None = None
-    """Start training from the policy in the last checkpoint of this run (network and observation statistics). None: a
-    new policy."""
+    """Start from the policy in this run's last checkpoint (network and observation statistics). None: a new policy."""
     algo: Text = "mtppo"
     """Learner to train: a name (see `bidex-meta list algos`), or package.module:Class for your own
     (docs/own-learner.md)."""
     preset: Text = "auto"
-    """Named set of defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if
-    the learner has this preset; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
+    """Named defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if the
+    learner has it; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Options of the learner (in Python also a dict of the values that differ from its preset)."""
     num_envs: Environments = UNRESOLVED
@@ -120,9 +119,9 @@ class RunConfig(Generic[LearnerSettings]):
     first. Building the world and evaluations do not count; in short runs they can take longer than training. None: no
     limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations and keep the best policy as checkpoints/best.pt. Each evaluation plays one episode of
-    up to ten tasks per class (at least ten episodes overall); learners that adapt are tested on train tasks after two
-    shots. Evaluations do not affect training. None: never."""
+    """Evaluate every N iterations and keep the best policy as checkpoints/best.pt, without effect on training. An
+    evaluation plays one episode of up to ten tasks per class, at least ten in all; learners that adapt play train tasks
+    after two shots. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations; films go into videos/ and to the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
@@ -148,8 +147,8 @@ class RunConfig(Generic[LearnerSettings]):
     """Stop as soon as the mean return reaches this value, measured in evaluations with --evaluate-every, otherwise in
     training. None: never."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
-    """Stop as soon as this fraction of the episodes succeeds, such as 0.8, measured in evaluations with
-    --evaluate-every, otherwise in training, with exploration noise. None: never."""
+    """Stop as soon as this fraction of episodes succeeds, such as 0.8: in evaluations with --evaluate-every, otherwise
+    in training with exploration noise. None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
     """Stop as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
     --evaluate-every. None: never."""
