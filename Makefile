@@ -1,12 +1,12 @@
-# The three things a person does here: make run, make test, make format.
-# Needs Python 3.11 to 3.13 and nothing else; everything goes into .venv.
+# Most people need three targets: make run, make test and make format.
+# They need only Python 3.11 to 3.13; everything is installed into .venv.
 
-# One class of version 2 that PPO learns within minutes. The discount sees a whole episode of 250 steps, and small noise
-# lets the policy hold still; four door classes at once had 2 % success after as many steps.
+# make run trains on a class of version 2 that PPO learns within minutes. The discount covers a whole episode of 250
+# steps, and low noise lets the policy hold still. Four door classes together had 2 % success after the same steps.
 MINUTES ?= 4.6
 RUN_FLAGS ?= --task DoorOpenOutward-v2 --algo ppo --num-envs 256 --learner.gamma 0.99 --learner.init-std 0.3
 
-# The first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` chooses one by hand.
+# This is the first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` names another one.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	"$$p" -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null && echo "$$p" && break; \
 	done)
@@ -21,32 +21,34 @@ SOURCES := bidex_meta algos tools examples tests docs/site
 
 help:
 	@echo "make run       train PPO on a door of version 2 for MINUTES=$(MINUTES) and compare it with a random policy"
-	@echo "make test      format, lint, types, tests (what CI runs)"
-	@echo "make quick     unit tests in less than a minute"
-	@echo "make test-all  the same with the slow tests"
-	@echo "make test-parity  compare both engines on every class (what CI runs too)"
+	@echo "make test      check format, lint and types, and run the tests (CI runs this)"
+	@echo "make quick     run the unit tests in less than a minute"
+	@echo "make test-all  run make test with the slow tests"
+	@echo "make test-parity  compare both engines on every class (CI runs this too)"
 	@echo "make results   fill the tables and pictures of README.md, docs/pretrained.md and docs/results/ from results/"
-	@echo "make collect, experts, gallery  keep runs as data, look up experts, write docs/tasks.md (ARGS=\"...\" or ARGS=--help)"
-	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
+	@echo "make collect   store runs as data in results/data/ (ARGS=--help lists the flags)"
+	@echo "make experts   choose the best known policy of each class (ARGS=--help lists the flags)"
+	@echo "make gallery   write docs/tasks.md and its pictures"
+	@echo "make goldens   record the golden trajectories again after a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
-	@echo "make witness ARGS=\"plan --task CLASS\"  search actions that solve a task (plan, steady, whole or script; ARGS=-h)"
-	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
-	@echo "make format    format the code and mend what ruff can mend"
-	@echo "make bench     measure the project itself: make bench ARGS=\"stability --task HandOver\", ARGS=--help lists what"
-	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
-	@echo "make clean     remove .venv, caches and built files (never runs/)"
+	@echo "make witness ARGS=\"plan --task CLASS\"  search for actions that solve a task (plan, steady, whole or script; ARGS=-h)"
+	@echo "make dist      build wheel and sdist into dist/, check them, and test the wheel on its own (docs/releasing.md)"
+	@echo "make format    format the code and fix what ruff can fix"
+	@echo "make bench ARGS=\"stability --task HandOver\"  measure speed or stability (ARGS=--help lists the measurements)"
+	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure the speed of a GPU (docs/gpu.md)"
+	@echo "make clean     remove .venv, caches and built files, but not runs/"
 
 run: .venv/.installed
 	$(BIN)/bidex-meta run $(RUN_FLAGS) --minutes $(MINUTES) --episodes 1
 
-# pyright needs one core for a minute, so it runs beside the tests.
+# pyright needs one core for a minute, so it runs at the same time as the tests.
 test: style
 	@$(MAKE) --no-print-directory -j 2 types tests
 
-# Hundreds of tests start a process: it reads compiled modules, even where the environment forbids writing them.
+# Hundreds of tests start a process, which starts faster from compiled modules, so writing them must be allowed.
 quick tests test-all test-parity: export PYTHONDONTWRITEBYTECODE :=
 
-# Tests without physics that end within a minute on two free cores.
+# These tests need no physics and end within a minute on two free cores.
 QUICK := tests/utils tests/runs tests/test_suite.py tests/test_imports.py tests/evaluation/test_scores.py tests/evaluation/test_statistics.py
 
 quick: .venv/.installed-dev
@@ -64,8 +66,8 @@ test-parity: .venv/.installed-dev
 goldens: .venv/.installed-dev
 	$(BIN)/python -m tests.goldens write
 
-# What to measure on a GPU; each target goes on where it stopped. On a machine that has the packages already, name its
-# interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
+# These targets measure a GPU; an interrupted target continues when it is called again. On a machine that has the
+# packages already, name its interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
 DEVICE ?= cuda:0
 OUT ?= gpu-results
 SIZES ?= 1024 8192 32768 131072
@@ -87,7 +89,7 @@ bench-gpu-sweep: $(INSTALLED)
 	mkdir -p $(OUT)
 	$(BENCH) gpu --suite MT20 --device $(DEVICE) --engine warp --sizes $(SIZES) --learning --out $(OUT)/sweep.json --json
 
-# 225 seconds a suite; 124 says that the time was up.
+# Each suite trains for 225 seconds; timeout then ends it with exit code 124.
 bench-gpu-train: $(INSTALLED)
 	for suite in MT4 MT20; do \
 		if test -d $(OUT)/$$suite; then what="--resume $(OUT)/$$suite"; \
@@ -118,7 +120,7 @@ format: .venv/.installed-dev
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
-# The site needs neither torch nor this package: an environment of its own.
+# The site needs neither torch nor this package, so it has a separate environment.
 docs: .venv-docs/.installed
 	.venv-docs/bin/python docs/site/build.py
 
@@ -129,7 +131,8 @@ docs: .venv-docs/.installed
 	.venv-docs/bin/python -m pip install --disable-pip-version-check -c constraints.txt -r .venv-docs/needed.txt
 	@touch $@
 
-# The wheel is made from the sdist, as an index would make it. Then it is installed alone, and used outside the checkout.
+# The wheel is built from the sdist, as a package index would do. It is then installed on its own and used outside the
+# checkout.
 dist: .venv-dist/.installed
 	rm -rf dist
 	.venv-dist/bin/python -m build --no-isolation --outdir dist
@@ -153,7 +156,7 @@ clean:
 	rm -rf .venv .venv-docs .venv-dist dist build site .pytest_cache .ruff_cache .hypothesis
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# torch goes first and alone: the other packages then meet the build that fits this machine instead of choosing one.
+# torch is installed first, so that the other packages accept the build for this machine and do not choose another.
 .venv/.installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Expected Python 3.11, 3.12 or 3.13, found none. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@echo "Installing PyTorch and the other packages, 2 GB, into .venv: two minutes or more. pip prints each package."

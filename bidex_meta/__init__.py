@@ -70,11 +70,12 @@ except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0.0.0"
 
 if "OMP_WAIT_POLICY" not in os.environ:
-    # A thread that spins takes a core from whatever else wants it. Read once, when torch loads its OpenMP library:
-    # spins of GNU's, milliseconds of LLVM's and Intel's.
+    # A waiting thread that spins takes a core from other work. torch reads these settings once, when it loads its
+    # OpenMP library: the first is a number of spins for GNU's library, the second is in milliseconds for LLVM's and
+    # Intel's.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     os.environ.setdefault("KMP_BLOCKTIME", "1")
-# Groups of classes side by side need a queue each; CUDA reads it once, before its first call.
+# Groups of classes that step at the same time need one queue each. CUDA reads this setting once, before its first call.
 os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 
 set_aside_what_is_missing()

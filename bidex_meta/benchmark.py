@@ -232,7 +232,7 @@ class Benchmark:
         return World(slots, config)
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
-        # By the class's name, so that all objects of a class have the same goals.
+        # The class's name seeds the draws, so that all objects of a class have the same goals.
         task_class = self._classes[entry.name]
         space = task_class.variation_space
         key = entry.class_name
@@ -366,7 +366,7 @@ def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
 
 
 def _generator(*key: object) -> np.random.Generator:
-    # sha256 rather than hash(): the latter differs from process to process.
+    # sha256 is used because hash() differs from process to process.
     digest = hashlib.sha256("\x1f".join(map(str, ("bidex-meta task", *key))).encode()).digest()
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
 

@@ -92,7 +92,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Number of points of the cloud that observations show in place of objects' states, as if from a depth camera
     (docs/points.md; the original has 768). 0: observations show the states, unless the suite's file says otherwise."""
     touch: Switch = False
-    """Observations also show touch sensors: normal forces at the fingertips and palms, 14 entries (docs/world.md)."""
+    """Add touch sensors to observations: 14 normal forces at fingertips and palms (docs/world.md)."""
     object: Text | None = None
     """With --task: the object to throw in place of the class's own object: a name of `bidex-meta list objects`, or the
     path of an MJCF file (docs/objects.md)."""
@@ -100,29 +100,29 @@ class RunConfig(Generic[LearnerSettings]):
     """With --suite: number of train tasks of each class. 0: a new task in each episode, or in each trial of a learner
     that adapts (docs/own-suite.md). By default the suite's file decides."""
     start_from: Text | None = None
-    """Begin with the policy of this run's last checkpoint (its network and observation statistics) instead of a new
-    policy."""
+    """Start from the policy in this run's last checkpoint (network and observation statistics). None: a new policy."""
     algo: Text = "mtppo"
     """Learner (see `bidex-meta list algos`), or your own class as package.module:Class (docs/own-learner.md)."""
     preset: Text = "auto"
-    """Values of the learner's options that no flag sets. auto: metaworld for Meta-World's suites; v2 for version 2 if
-    the learner has it; else laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
+    """Named defaults for the learner's options. auto: metaworld for Meta-World's suites; v2 for version 2, if the
+    learner has it; otherwise laptop on a CPU and paper on a GPU (maml and promp: laptop on both)."""
     learner: LearnerSettings = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    """Options of the learner (in Python also a dict of the values that differ from its preset)."""
     num_envs: Environments = UNRESOLVED
-    """Environments stepped together by each process, over all tasks."""
+    """Number of environments that each process steps together, over all tasks."""
     steps: Steps = field(default=UNRESOLVED, metadata=MAY_CHANGE)
     """Environment steps to train for, over all environments of all processes; may be written 2e7. With --dataset:
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
-    """Minutes to train for, summed over all resumes; training ends after --minutes or --steps, whichever is reached
-    first. Building the world and evaluations are not counted; in short runs they can take longer than training. None:
-    no limit."""
+    """Minutes to train for, summed over all resumes. Training ends after --minutes or --steps, whichever is reached
+    first. Building the world and evaluations do not count; in short runs they can take longer than training. None: no
+    limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation has an episode of up
     to ten tasks of each class, at least ten in all; learners that adapt are evaluated after two shots on train tasks.
     Evaluations do not affect training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Film one environment of each class every N iterations, into videos/ and the logger. None: never."""
+    """Film one environment of each class every N iterations; films go into videos/ and to the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
@@ -140,8 +140,8 @@ class RunConfig(Generic[LearnerSettings]):
     scripts (the scripts of all classes that have one), or the folder of a run on the same suite or on one of the
     suite's classes. If given several times: each class takes the first teacher that knows it."""
     record: Steps = 0
-    """Keep about this many transitions of the training as the data set replay/ in the run's folder; they are whole
-    episodes of some of the environments (docs/data.md). 0: none."""
+    """Store about this number of training transitions as the data set replay/ in the run's folder, in whole episodes of
+    some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
     """``record`` divided by the steps that the run began with: if the run is resumed for more steps, the same
     environments are recorded."""
@@ -149,21 +149,23 @@ class RunConfig(Generic[LearnerSettings]):
     """End as soon as the mean return reaches this value: in evaluations with --evaluate-every, otherwise in
     training."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as this fraction of the episodes succeeds, such as 0.8: in evaluations with --evaluate-every,
-    otherwise in training, where actions explore."""
+    """Stop as soon as this fraction of episodes succeeds, such as 0.8: in evaluations with --evaluate-every, otherwise
+    in training with exploration noise. None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
-    --evaluate-every."""
+    """Stop as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
+    --evaluate-every. None: never."""
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
     seed: Seed = 0
-    """Seed of tasks, starts and learner."""
+    """Seed that draws tasks and start states and initialises the learner."""
     device: Text = "auto"
-    """auto, cpu or cuda:N."""
+    """Device to train on: auto (a GPU if there is one), cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics engine: C MuJoCo (CPU only) or mujoco_warp (CPU or GPU); auto: the faster one on the device."""
+    """Physics engine: c (C MuJoCo, CPU only), warp (mujoco_warp, CPU or GPU), or auto (the faster one on the
+    device)."""
     deterministic: bool = False
-    """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
+    """Make a run on a GPU repeatable bit for bit, which slows physics and learning down. Runs on a CPU are always
+    repeatable."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
     processes. A resumed run keeps its number of threads."""
@@ -239,11 +241,11 @@ def config_of(content: object, where: str) -> RunConfig[JsonObject]:
     """Return a run's config from a file's content; raise BidexError, which names ``where``, if it is not a config."""
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
-        raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Name a run.")
+        raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Give a run folder.")
     config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
-        raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
-    # A copy, because msgspec leaves defaults to the class and does not write those.
+        raise BidexError(f"{where}: expected either a suite or a task, with null for the other. Give a run folder.")
+    # Defaults are copied into the config, because msgspec does not write defaults that only the class holds.
     return dataclasses.replace(config, threads=config.threads or 1)
 
 

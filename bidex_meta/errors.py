@@ -16,7 +16,7 @@ class BidexError(ValueError):
     """Bad input from a user. The command line prints it as one line and exits with code 2."""
 
     def __init__(self, message: str) -> None:
-        # Values that were given may be printed over several lines.
+        # Given values may contain line breaks, which would spread the message over several lines.
         super().__init__(" ".join(message.split()) if "\n" in message else message)
 
 

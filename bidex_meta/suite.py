@@ -48,7 +48,7 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
         "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3", "drawer-close-v3",
         "button-press-topdown-v3", "peg-insert-side-v3", "window-open-v3", "window-close-v3",
     ),
-    # No suite of Meta-World's: three of its classes that are learned within minutes.
+    # Meta-World does not have this suite. Its three classes can be learned within minutes.
     "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
 }  # fmt: skip
 """Suites of Meta-World's own environments, with their classes in Meta-World's order."""
@@ -139,7 +139,7 @@ class Suite:
         """
         content = {name: value for name, value in _chosen(self).items() if name not in _OF_THE_FILE}
         if self.rules.wide:
-            content["placements"] = "episode"  # tasks fixed them before 0.3.0
+            content["placements"] = "episode"  # before 0.3.0 the tasks fixed the placements
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 
     @property
@@ -292,7 +292,7 @@ def load_randomisation(path: str | Path) -> Randomisation:
     return parse(content["randomisation"], Randomisation, f"{path}: randomisation", exact=True)
 
 
-# What stands in a file, as msgspec checks it. No number is larger than a million: beyond it nothing is meant.
+# These types describe the contents of a suite file for msgspec. No sensible value is larger than a million.
 _Text = Annotated[str, Meta(min_length=1, max_length=500)]
 _Count = Annotated[int, Meta(ge=1, le=MOST_TASKS)]
 _Number = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
@@ -313,7 +313,8 @@ class _ClassEntry:
     reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
     gamma: Annotated[float, Meta(ge=0.0, lt=1.0)] | None = None
     tasks: Annotated[list[_TaskEntry], _Tables] = field(default_factory=list)
-    options: dict[str, _Count | _Number | _Text] = field(default_factory=dict)  # a whole number may count something
+    # An option that counts something must be a whole number.
+    options: dict[str, _Count | _Number | _Text] = field(default_factory=dict)
     objects: Annotated[list[_Text], _Tables] = field(default_factory=list)
 
 
@@ -355,7 +356,7 @@ class _File:
 def _parse(file: Path) -> Suite:
     content = parse(read_toml(file, "a suite file"), _File, str(file), exact=True)
     for place, text in content.texts():
-        # Terminals obey what is not printable.
+        # Control characters would change the terminal, so only printable characters are allowed.
         if not isinstance(text, str) or not text.strip() or not text.isprintable():
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)

@@ -110,7 +110,7 @@ def advantages(rewards: Tensor, values: Tensor, next_values: Tensor, ended: Tens
 def main(args: Args) -> list[float]:
     """Trains; returns the episodes' returns in the order in which they ended."""
     torch.manual_seed(args.seed)
-    # Rows do not end together; shortened first episodes do not count in info["_episode"].
+    # Rows do not end together. Shortened first episodes do not count in info["_episode"].
     envs = gymnasium.make_vec(args.env_id, num_envs=args.num_envs, seed=args.seed, stagger=True)
     device = envs.unwrapped.device
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0]).to(device)
@@ -135,7 +135,7 @@ def main(args: Args) -> list[float]:
                 obs_buffer[t], action_buffer[t], log_probs[t] = obs, action, policy.log_prob(action)
                 values[t] = agent.value(obs)
                 obs, rewards[t], terminated, truncated, info = envs.step(action)
-                # final_obs is what the step led to; obs is the next episode's where one ended.
+                # final_obs is the observation after the step; if an episode ended, obs belongs to the next episode.
                 next_values[t] = agent.value(info["final_obs"]) * ~terminated
             ends[t], valid[t] = terminated | truncated, ~info["unstable"]
             if "episode" in info:
@@ -144,7 +144,7 @@ def main(args: Args) -> list[float]:
                 successes += info["episode"]["success"][over].float().tolist()
 
         gained = advantages(rewards, values, next_values, ends, args)
-        keep = valid.flatten()  # the transition into broken physics teaches nothing
+        keep = valid.flatten()  # the transition into broken physics is ignored
         batch = [x.flatten(0, 1)[keep] for x in (obs_buffer, action_buffer, log_probs, gained, gained + values)]
         for _ in range(args.epochs):
             for part in torch.randperm(len(batch[0]), device=device).chunk(args.minibatches):

@@ -21,9 +21,7 @@ def main(task: str = "CatchUnderarm", steps: int = 500_000, num_envs: int = 256,
         num_envs: Rows of the world.
         seed: Of everything.
     """
-    env = SB3VecEnv(
-        make_task_world(task, num_envs=num_envs, seed=seed), stagger=True
-    )  # SB3 counts whole episodes alone
+    env = SB3VecEnv(make_task_world(task, num_envs=num_envs, seed=seed), stagger=True)  # SB3 counts only whole episodes
     rollout = 16
     learner = PPO(
         "MlpPolicy",

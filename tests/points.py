@@ -171,7 +171,7 @@ class Finder(Still):
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
         self._know(len(obs))
-        # Rows go different ways, and hold them.
+        # Rows move in different directions and keep these.
         angle = torch.arange(len(obs)) * 2.399
         drift = torch.stack([angle.cos(), angle.sin()], 1)
         return 0.7 * drift + 0.3 * super().adapt_action(obs)[0], {}
@@ -179,7 +179,7 @@ class Finder(Still):
     def adapt(self) -> None:
         super().adapt()
         for told in self.steps:
-            # From Meta-World neither comes: there all rows always play.
+            # Meta-World passes neither, because all its rows always play.
             valid = torch.ones(len(told.reward), dtype=torch.bool) if told.valid is None else told.valid
             reached = told.observation[:, :2] + SPEED * told.action.clamp(-1, 1)
             for row in valid.nonzero().squeeze(1).tolist():

@@ -272,7 +272,7 @@ def test_a_reset_mask_starts_just_these(case: Case) -> None:
     obs, told = world.reset(options={"reset_mask": mask})
     assert told == {} and torch.equal(obs[~mask], before["obs"][~mask]) and (obs[mask] != before["obs"][mask]).any()
     after = flat(world.step(given[5]))
-    # Nobody's last step was its episode's end in SAME_STEP mode, or they begin at 1 as well.
+    # In SAME_STEP mode, no environment's last step ended its episode; otherwise they would begin at 1 too.
     lengths = after["info/running/l"]
     assert (lengths[mask] == 1).all()
     if case.mode == "DISABLED":

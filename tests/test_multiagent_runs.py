@@ -47,7 +47,7 @@ def test_a_run_a_resume_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["run", "--resume", str(run), "--agents", "hands"]) == 2
     assert "a resumed run keeps its config" in capsys.readouterr().err
     assert main([*words[:5], "--agents", "right=right/palm", "--run-dir", str(tmp_path / "bad"), *SMALL]) == 2
-    assert "is of no agent" in capsys.readouterr().err and not (tmp_path / "bad").exists()
+    assert "belongs to no agent" in capsys.readouterr().err and not (tmp_path / "bad").exists()
 
 
 def test_presets_are_the_tables() -> None:

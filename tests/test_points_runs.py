@@ -35,7 +35,7 @@ def test_a_run_reads_clouds_and_is_evaluated_on_them(algo, tmp_path, capsys):
     state, _ = checkpoint(folder, "last")
     shapes = [each.shape for name, each in state["learner"]["policy"]["weights"].items() if "shared.0.weight" in name]
     assert torch.Size([4, 3]) in shapes, "the actor has a PointNet"
-    # Whoever looks at the run sees its own points.
+    # Commands that show the run use its own points.
     assert main(["evaluate", str(tmp_path / "a"), "--episodes", "1"]) == 0
     capsys.readouterr()
 

@@ -22,7 +22,7 @@ SMALL += ["--learner.hidden", "16", "--learner.rollout-steps", "4", "--learner.n
 ITERATION = 8 * 4
 ROOT = Path(__file__).parents[1]
 
-# Checkpoints come once a minute; here, after every iteration.
+# Checkpoints come once a minute, but here after every iteration.
 _OFTEN = """
 import functools, sys
 import bidex_meta.training.runner as runner

@@ -30,7 +30,7 @@ SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu
 SMALL += ["--learner.hidden", "16", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
 ITERATION = 2 * 4 * 4
 
-# Checkpoints come once a minute; here, after every iteration. The weights of each process are kept for a look.
+# Checkpoints come once a minute, but here after every iteration. The weights of each process are kept for comparison.
 _SCRIPT = """
 import os, sys
 import torch
@@ -112,7 +112,7 @@ def test_a_killed_process_ends_the_run_which_then_resumes_bit_for_bit(victim: in
     killed = time.monotonic()
     code, said = finish(process)
     assert code == 1
-    # Seconds on a quiet machine; in any case long before a collective operation gives up by itself.
+    # This takes seconds on a quiet machine, and in any case ends long before a collective operation times out.
     assert time.monotonic() - killed < TIMEOUT.total_seconds() / 3
     [message] = [line for line in said if line.startswith("bidex-meta: ")]
     assert message.startswith(f"bidex-meta: process {victim} of 2 is gone or stuck")
@@ -135,7 +135,7 @@ def test_a_stuck_process_is_named_when_the_run_is_asked_to_stop(tmp_path: Path) 
     os.kill(stuck, signal.SIGSTOP)
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
-    # It says so before torchrun, which kills 30 s after it asked, would end it without a word.
+    # The message must come before torchrun, which kills 30 s after its request, ends the process silently.
     while process.poll() is None and 0 in workers(process):
         time.sleep(0.1)
     with contextlib.suppress(ProcessLookupError):

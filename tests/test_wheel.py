@@ -50,7 +50,8 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    # By way of the source distribution, as the package index gets it: a file must survive both.
+    # The wheel is built from the source distribution, as for a package index, because each file must survive both
+    # steps.
     folder = tmp_path_factory.mktemp("dist")
     run("-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=ROOT)
     (built,) = folder.glob("*.whl")

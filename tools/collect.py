@@ -134,7 +134,7 @@ def _parameters(folder: RunFolder) -> int | None:
 def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> None:
     """Raise BidexError for a run whose results nobody could trust or reproduce."""
     if not rows:
-        raise BidexError(f"{folder.metrics_path} holds nothing: not a run that has trained. Name another.")
+        raise BidexError(f"{folder.metrics_path} is empty: the run has not trained. Name another run.")
     steps = rows[-1]["step"]
     if evaluation.steps is not None:
         steps = min(steps, evaluation.steps)
@@ -145,9 +145,9 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> No
         )
     versions = versions_of(folder)
     if versions.git is None or not versions.git.commit:
-        raise BidexError(f"{folder.path / 'versions.json'} names no commit: nobody could make this run again.")
+        raise BidexError(f"{folder.path / 'versions.json'} names no commit, so the run cannot be repeated.")
     if evaluation.split != "train":
-        raise BidexError(f"{folder.evaluation_path} is of {evaluation.split} tasks. Write it anew: {folder.again}")
+        raise BidexError(f"{folder.evaluation_path} is of {evaluation.split} tasks. Write it again: {folder.again}")
     other = [str(each) for each in differences(versions, evaluation.conditions) if each.is_of_worlds]
     if other:
         raise BidexError(
@@ -158,7 +158,7 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> No
     trained = {tag.removeprefix(_TRAINED) for tag in tags if tag.startswith(_TRAINED)}
     if isinstance(evaluation, MetaTestEvaluation):
         if "train" not in evaluation.splits:
-            return  # a meta-test of test tasks alone (--split test) may have no class in common
+            return  # a meta-test of test tasks only (--split test) may have no class in common
         evaluated = set[str]()
         for part in evaluation.splits.values():
             evaluated |= part.after.classes.keys()
@@ -167,7 +167,7 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> No
     missing = trained - evaluated
     if missing:
         raise BidexError(
-            f"{folder.evaluation_path} is of another run: it lacks {min(missing)}. Write it anew: {folder.again}"
+            f"{folder.evaluation_path} is of another run: it lacks {min(missing)}. Write it again: {folder.again}"
         )
 
 

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 RULES = tomllib.loads((ROOT / "tools" / "english.toml").read_text(encoding="utf-8"))
 
 _HIDDEN = re.compile(r"^```.*?^```$|<!--.*?-->", re.MULTILINE | re.DOTALL)
+_NO_PROSE = ("|", "![", "<details", "<summary", "</details")
 _GENERATED = re.compile(r"<!-- results:.*?<!-- end -->", re.DOTALL)
 _SENTENCE = re.compile(r"(?:[^.?!]|[.?!](?!\s|$)|(?<=et al)\.|(?<=e\.g)\.|(?<=i\.e)\.)+[.?!]?")
 _NUMBER = re.compile(r"(?<![\w.:-])\d[\d,.]*(?:(?: %)? \[[^]]*\])?")
@@ -46,7 +47,7 @@ def _blanked(pattern: re.Pattern[str], text: str) -> str:
 def prose(text: str) -> str:
     """Return a page's text without code blocks, comments, tables and pictures; line numbers do not change."""
     lines = _blanked(_HIDDEN, text).split("\n")
-    return "\n".join("" if line.lstrip().startswith(("|", "![")) else line for line in lines)
+    return "\n".join("" if line.lstrip().startswith(_NO_PROSE) else line for line in lines)
 
 
 def _plain(text: str) -> str:

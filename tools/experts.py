@@ -71,7 +71,7 @@ def _of_run(run: Run) -> list[tuple[str, Json]]:
             f"Expected the evaluation of one policy, but that of {run.path} is a meta-test. Name a run of "
             "mtppo, mttrpo or mtsac."
         )
-    # Time, a return or a score may have ended the run before the steps of its config.
+    # A limit of time, return or score may have ended the run before the steps of its config.
     steps = config.steps if evaluation.steps is None else evaluation.steps
     told = f"{config.algo} on {source.name}, {steps:,} steps, seed {config.seed}"
     rows = []

@@ -49,9 +49,9 @@ def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 2
     """Write the page of all task classes, and its pictures into ``images/tasks/`` next to the page.
 
     Args:
-        out: The Markdown file.
-        width: Width of the pictures, pixels.
-        height: Height of the pictures, pixels.
+        out: Markdown file to write.
+        width: Width of the pictures in pixels.
+        height: Height of the pictures in pixels.
     """
     for name in registry.names():
         for view in VIEWS:
@@ -92,7 +92,7 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
     """Draw the shown frames side by side, (height, STRIP * width, 3) uint8."""
     first = replay(name, witness).first_success  # the file's value may be from older physics
     if first is None:
-        raise BidexError(f"The witness of {name} does not succeed any more. Search it anew.")
+        raise BidexError(f"The witness of {name} does not succeed any more. Search for a new one.")
     wanted = moments(first, len(witness.actions))
     drawn = frames(name, witness, wanted, width=width, height=height)
     shown = dict(zip(sorted(set(wanted)), drawn, strict=True))

@@ -111,7 +111,7 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
     mu = 0.1 * (even @ mean).clamp_min(1e-30)
     diagonal = torch.eye(len(even), dtype=gram.dtype, device=gram.device)
-    for _ in range(24):  # the last mu is 1e-8 of the mean gradient's square
+    for _ in range(24):  # 24 halvings leave a mu of 1e-8 of the mean gradient's square
         own = gram @ weights
         root = (mu.square() + square * (weights @ own).clamp_min(0.0)).sqrt()
         pull = square / (mu + root)

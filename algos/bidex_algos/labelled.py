@@ -45,7 +45,7 @@ class Labelled:
         shape = (batches, len(self.tasks), per_task)
         device = self.rows.device
         step = torch.randint(self.filled, shape, generator=generator, device=device)
-        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
+        # A remainder of this large number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=generator, device=device) % self._count[:, None]
         return (step * len(self.rows) + self._first[:, None] + row).flatten(1)
 

@@ -48,9 +48,9 @@ class Learner(Contract):
     one-hot if an option needs it.
     """
 
-    remedy: ClassVar[str]  # advice when a loss is no longer finite
-    config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
-    unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
+    remedy: ClassVar[str]  # advice printed when a loss is no longer finite
+    config_type: ClassVar[type[LearnerConfig]]  # class of its config, a dataclass
+    unit_embeddings: ClassVar[bool] = False  # True if the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
     policy_of: ClassVar[Callable[..., nn.Module]]
@@ -135,7 +135,7 @@ class Learner(Contract):
 
     def _first_observations(self) -> Tensor:
         """Begin the training: return raw observations (N, d) of the world's first reset."""
-        # The same seed gives the same weights in every process, unless a machine computes differently.
+        # The same seed gives the same weights in every process, unless machines compute differently.
         modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
         broadcast(list(chain.from_iterable(module.parameters() for module in modules)))
         obs, _ = self.world.reset(seed=own_seed(self.seed))
@@ -167,7 +167,7 @@ class Learner(Contract):
         total = sum(weight.numel() for weight in weights.values())
         if max(size for size in sizes.values() if isinstance(size, int)) > total:
             raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
-        # Options that a later version dropped do not shape the network.
+        # Options that a later version removed do not affect the network's shape.
         names = {option.name for option in fields(cls.config_type)}
         config = cls.config_type(**{name: value for name, value in state["config"].items() if name in names})
         shape = Shape.load(sizes)
@@ -197,7 +197,8 @@ class Learner(Contract):
                 "other weights. Name another run."
             )
         if isinstance(self.policy, SquashedPolicy):
-            # Its network's output is a position between these bounds; a Gaussian policy has its std as a weight.
+            # The network of this learner outputs a position between these bounds; a Gaussian policy has its std as a
+            # weight.
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
         self.policy.observations.keep()
@@ -275,7 +276,7 @@ def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
                 mend = f"Add {flag} as there"
             raise BidexError(
                 f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
-                f"{mend}, or start afresh."
+                f"{mend}, or train from scratch."
             )
 
 

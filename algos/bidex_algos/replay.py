@@ -49,7 +49,8 @@ class Replay:
         self.num_tasks = num_tasks
         self.device = device
         self.added = 0
-        self.slots = steps + 1  # one more than transitions, because the newest observation has none yet
+        # One more than transitions, because no action has been taken from the newest observation yet.
+        self.slots = steps + 1
         self.cuts_kept = _cuts_kept(steps, rows, cut_share)
 
         # The ring is not filled: memory is allocated at the first write, and no entry is read earlier.
@@ -62,10 +63,10 @@ class Replay:
             "rewards": ring(self.slots, rows),
             "terminated": ring(self.slots, rows, dtype=torch.bool),
             "valid": ring(self.slots, rows, dtype=torch.bool),
-            # Running number, from 1, of the time limit that cut the episode here; 0 without a cut.
+            # This is the number, counted from 1, of the time limit that cut the episode here; 0 without a cut.
             "cut": ring(self.slots, rows, dtype=torch.int64),
         }
-        # The last cell is a dummy: it takes writes that are never read.
+        # The last cell is a dummy for writes that are never read.
         self._final_obs = ring(self.cuts_kept + 1, observations)
         self._cuts = torch.zeros((), dtype=torch.int64, device=device)
         self._rows_of_task = torch.argsort(task_id, stable=True)
@@ -93,7 +94,8 @@ class Replay:
         valid = ~info["unstable"]
         cut = truncated & ~terminated & valid
         number = self._cuts + cut.cumsum(0)
-        # All rows write; rows whose episode goes on write into the dummy cell. Selecting rows would make the host wait.
+        # All rows write, and rows whose episode continues write into the dummy cell. Selecting rows would make the host
+        # wait.
         cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
         self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
@@ -113,7 +115,7 @@ class Replay:
         def uniform(high: int) -> Tensor:
             return torch.randint(high, shape, generator=generator, device=self.device)
 
-        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
+        # A remainder of this large number favours no row by more than 1 in 2^40 / rows.
         row = self._rows_of_task[self._first[:, None] + uniform(2**40) % self._count[:, None]]
         return self.places(row, uniform(self.filled)).flatten(1)
 
@@ -197,7 +199,8 @@ def steps_within(memory: float, steps: int, rows: int, observations: int, action
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
-    # At least one vector step's worth: all episodes may end together, and a step must not write a cell twice.
+    # There is space for at least one vector step, because all episodes may end together, and a step must not write a
+    # cell twice.
     return max(rows, math.ceil(cut_share * steps * rows))
 
 
@@ -215,7 +218,7 @@ class Stretches:
         self.rewards: Tensor | None = None
         if n == 1:
             return
-        newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
+        newest = replay.added % replay.slots  # slot of an observation from which no step has been taken yet
         self.rewards = replay.at("rewards", self.first)
         self.steps = torch.ones_like(self.first)
         going = replay.at("valid", self.first) & ~self._ended(self.first)
@@ -253,7 +256,9 @@ def replay_within(
     steps = steps_within(memory * 1e9, asked, rows, observations, actions, share)
     needed = replay_bytes(asked, rows, observations, actions, share) / 1e9
     if steps == 0:
-        raise BidexError(f"{learner}: replay_memory {memory:g} GB holds not one step of {rows} environments. Raise it.")
+        raise BidexError(
+            f"{learner}: replay_memory {memory:g} GB is too little for one step of {rows} environments. Raise it."
+        )
     if steps < asked and is_main():
         kept = f"it keeps {steps:,} ({steps * rows:,} transitions)."
         said = f"{learner}: a replay of {asked:,} vector steps ({asked * rows:,} transitions) needs {needed:.1f} GB; "

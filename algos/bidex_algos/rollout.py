@@ -22,7 +22,7 @@ class EpisodeStatistics:
         self.task_id = task_id
         self.task_names = task_names
         self.window = window
-        # Rows: return, length, success, count.
+        # The rows are return, length, success and count.
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
     def update(self, info: Info) -> None:
@@ -83,10 +83,11 @@ class Rollout:
         self.rewards = zeros(steps, num_envs)  # 0 if not valid
         self.terminated = zeros(steps, num_envs, dtype=torch.bool)  # the episode came to a true end
         self.ended = zeros(steps, num_envs, dtype=torch.bool)  # terminated, truncated or not valid
-        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False if physics broke: the transition teaches nothing
-        # Values of the last observations of episodes cut by a time limit, else 0; with several critics one value each.
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False if physics broke: the transition is ignored
+        # These are values of the last observations of episodes cut by a time limit, otherwise 0; with several critics
+        # one value each.
         self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
-        self.last_obs = zeros(num_envs, observations)  # raw, after the last step
+        self.last_obs = zeros(num_envs, observations)  # raw observations after the last step
 
 
 @torch.no_grad()

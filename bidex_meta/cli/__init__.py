@@ -38,28 +38,28 @@ class Command(NamedTuple):
 
 COMMANDS: dict[str, Command] = {
     "run": Command("bidex_meta.cli.run", "train a learner on a suite or a task, then evaluate it"),
-    "sweep": Command("bidex_meta.cli.sweep", "many runs from one file, resumed where they were stopped"),
-    "evaluate": Command("bidex_meta.cli.evaluate", "success and return of a trained run, per task class"),
-    "verify": Command("bidex_meta.cli.verify", "evaluate a run again and compare with what it recorded"),
-    "submit": Command("bidex_meta.cli.submit", "an entry of the leaderboard, of runs that it plays or of a meta-test"),
-    "compare": Command("bidex_meta.cli.compare", "several runs beside each other, intervals over seeds"),
-    "control": Command("bidex_meta.cli.control", "held-out tasks, adapted to their own data and to others'"),
-    "transfer": Command("bidex_meta.cli.transfer", "held-out classes: learned from a run's policy and from nothing"),
-    "record": Command("bidex_meta.cli.record", "record a data set: episodes of a policy, for offline learners"),
-    "data": Command("bidex_meta.cli.data", "the data sets there are, one of them, or a check of it"),
-    "list": Command("bidex_meta.cli.listing", "the suites, tasks, algos or objects there are"),
-    "render": Command("bidex_meta.cli.render", "a picture or a film of a task, or of all of a run"),
-    "play": Command("bidex_meta.cli.play_live", "a policy at work, live: in a window or in the browser"),
-    "demo": Command("bidex_meta.cli.demo", "the policy that comes with bidex-meta: live, or as a film"),
+    "sweep": Command("bidex_meta.cli.sweep", "train many runs from one file; run it again to resume"),
+    "evaluate": Command("bidex_meta.cli.evaluate", "measure success and return of a trained run, per task class"),
+    "verify": Command("bidex_meta.cli.verify", "repeat a run's evaluation and compare it with the recorded one"),
+    "submit": Command("bidex_meta.cli.submit", "write a leaderboard entry for runs or for a meta-test"),
+    "compare": Command("bidex_meta.cli.compare", "compare groups of runs, with intervals over seeds"),
+    "control": Command("bidex_meta.cli.control", "test whether adaptation uses a task's own data"),
+    "transfer": Command("bidex_meta.cli.transfer", "learn held-out classes from a run's policy and from scratch"),
+    "record": Command("bidex_meta.cli.record", "record episodes of a policy as a data set for offline learners"),
+    "data": Command("bidex_meta.cli.data", "list, describe or check data sets"),
+    "list": Command("bidex_meta.cli.listing", "list suites, tasks, hidden parts of tasks, algos or objects"),
+    "render": Command("bidex_meta.cli.render", "draw a picture or a film of a task, or of all classes of a run"),
+    "play": Command("bidex_meta.cli.play_live", "watch a policy live, in a window or in the browser"),
+    "demo": Command("bidex_meta.cli.demo", "watch the policy that comes with bidex-meta, live or as a film"),
     "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
-    "baseline": Command("bidex_meta.cli.baseline", "measure the references of the normalised score"),
-    "validity": Command("bidex_meta.cli.validity", "whether there is something to learn about a suite's tasks"),
-    "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
-    "export": Command("bidex_meta.cli.export", "a policy as an ONNX file, checked against torch"),
-    "push": Command("bidex_meta.cli.push", "publish a policy or a data set, with its card"),
+    "baseline": Command("bidex_meta.cli.baseline", "measure the reference returns of the normalised score"),
+    "validity": Command("bidex_meta.cli.validity", "measure whether a suite's tasks must be identified to be solved"),
+    "plot": Command("bidex_meta.cli.plot", "draw learning curves of runs"),
+    "export": Command("bidex_meta.cli.export", "write a policy as an ONNX file and check it against torch"),
+    "push": Command("bidex_meta.cli.push", "publish a policy or a data set with its card"),
     "pull": Command("bidex_meta.cli.pull", "fetch a published policy or data set"),
-    "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
-    "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),
+    "report": Command("bidex_meta.cli.report", "write an HTML page about runs: tables, curves, films"),
+    "completion": Command("bidex_meta.cli.completion", "print a script that completes commands and flags in a shell"),
     "bench": Command("bidex_meta.cli.bench", "measure the speed of a suite's world"),
 }
 
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 return _dispatch(given)
             finally:
-                sys.stdout.flush()  # when Python exits, nobody would catch a failing write
+                sys.stdout.flush()  # a write that fails when Python exits would not be caught
     except BidexError as error:
         return _failed(str(error), EXIT_BAD_INPUT, debug)
     except FloatingPointError as error:
@@ -95,7 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
-        # A reader that closes only stdout has seen enough (`| head`). If stderr is closed, work may have been aborted.
+        # A reader that closes only stdout has seen enough (`| head`). If stderr is closed too, work may have been
+        # aborted.
         if unread(sys.stderr):
             code = errors.EXIT_UNREAD
         else:
@@ -109,12 +110,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             place = ""
         else:
             place = f"{os.fsdecode(error.filename)}: "
-        return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+        return _failed(f"{place}{error.strerror or error}. Fix the path, or make room.", EXIT_BAD_INPUT, debug)
     except (Exception, SystemExit) as error:
         message = own_fault(error)
         if message is None:
             raise
-        return _failed(f"{message} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
+        return _failed(f"{message} Fix it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -128,7 +129,8 @@ class _Terminated(KeyboardInterrupt):
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
     """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and the reason is printed."""
-    # With several processes signals stay as they are: a collective operation waits outside Python and delays handlers.
+    # With several processes, signals keep their handlers, because a collective operation waits outside Python and would
+    # delay ours.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
         return
@@ -205,7 +207,7 @@ def _dispatch(arguments: list[str]) -> int:
     for place, word in enumerate(rest):
         if not word or re.fullmatch(r"--[\w.-]+=", word):
             flag = word.rstrip("=") or (rest[place - 1] if place else "a word")
-            raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
+            raise BidexError(f"{flag} after bidex-meta {name} has no value. Add a value, or leave the flag out.")
     with watched(f"bidex-meta {name}, starting") if launch().rank == 0 else contextlib.nullcontext():
         importlib.import_module(COMMANDS[name].module).main(rest)
     return 0

@@ -26,15 +26,15 @@ class BaselineFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
-    """random: uniform actions; zero: the action 0, which holds joints in the middle of their range and bases at rest;
-    witness: the actions that solve task 0 of a class, in all its tasks; script: a hand-written controller that sees the
-    whole state (eight classes have one)."""
+    """Policy to measure. random: uniform actions; zero: the action 0, which holds joints in the middle of their range
+    and bases at rest; witness: the actions that solve task 0 of a class, played in all its tasks; script: a
+    hand-written controller that sees the whole state (eight classes have one)."""
     suite: str = "MT20"  # Suite whose train tasks are played.
     episodes: Few = 4  # Episodes of each task.
-    seed: Seed = 0  # Seed of tasks, starts and actions.
-    threads: Threads | None = None  # Threads of the physics; None: one per core.
+    seed: Seed = 0  # Seed that draws tasks, start states and actions.
+    threads: Threads | None = None  # CPU threads for the physics; None: one per core.
     out: Path | None = None
-    """JSON file to which the results are added; its results of other classes stay. None: only print the results.
+    """JSON file to which the results are added; it keeps its results of other classes. None: only print the results.
     `evaluate` reads assets/references/ of the installation, which is only written if this flag names it."""
     json: JsonSwitch = False
 

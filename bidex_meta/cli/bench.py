@@ -17,22 +17,22 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Threads
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure how fast a suite's world is stepped here, and how fast its physics alone would be.
+    """Measure the speed of a suite's world on this machine, and of its physics without the rest.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world")]
-    """world: environment steps per second of the world and of its bare physics, and their ratio."""
+    """world: measure environment steps per second of the world and of its physics without the rest, and their ratio."""
     suite: str = "MT4"  # Suite to measure.
     num_envs: Environments = 1024  # Environments stepped together.
     steps: Steps = 40  # Environment steps of each repeat.
-    repeats: Few = 7  # Interleaved repeats; medians are reported.
-    threads: Threads | None = None  # Threads of the physics on a CPU; None takes all cores.
+    repeats: Few = 7  # Number of interleaved repeats; medians are reported.
+    threads: Threads | None = None  # CPU threads for the physics; None: all cores.
     device: Device = "cpu"
-    engine: str = "auto"  # auto, c or warp.
-    deterministic: bool = False  # Measure physics that repeats bit for bit on a GPU.
-    seed: Seed = 0  # Seed of world and actions.
+    engine: str = "auto"  # Physics engine: auto, c or warp.
+    deterministic: bool = False  # On a GPU, measure physics that repeats bit for bit.
+    seed: Seed = 0  # Seed of the world and of the actions.
     json: JsonSwitch = False
 
 

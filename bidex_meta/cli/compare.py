@@ -22,9 +22,10 @@ class CompareFlags:
     Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
     """
 
-    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
+    runs: RunPaths  # Run folders, or studies in results/data: FILE for all runs of a study, FILE:RUN for one.
     json: JsonSwitch = False
-    out: Path | None = None  # Also draw the groups' success and score, with intervals, into this .png, .svg or .pdf.
+    out: Path | None = None
+    """Also draw success and score of the groups, with intervals, into this .png, .svg or .pdf file."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ class CompletionFlags:
     zsh: write it to a file _bidex-meta in a folder of $fpath; fish: to ~/.config/fish/completions/bidex-meta.fish.
     """
 
-    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]  # The shell.
+    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]  # Shell to complete in: bash, zsh or fish.
 
 
 def main(arguments: Sequence[str]) -> None:

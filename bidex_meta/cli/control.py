@@ -22,13 +22,13 @@ class ControlFlags:
     This is for suites whose classes are in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
     """
 
-    runs: RunPaths  # Run folders that differ in the seed alone.
-    trials: Few = 25  # Adaptations of each task, each from the start and to other episodes.
+    runs: RunPaths  # Run folders that differ only in the seed.
+    trials: Few = 25  # Number of adaptations to each task, each from the unadapted policy and with new episodes.
     episodes: Few = 80  # Evaluation episodes after each adaptation.
     shots: Shots = 2  # Adaptation rounds, one after the other.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, but 40 at most.
-    num_envs: Environments = 1024  # Environments stepped together at most; bounds memory.
-    seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
+    rollouts: Few | None = None  # Episodes of each task in one adaptation round; None: as in training, at most 40.
+    num_envs: Environments = 1024  # Maximum number of environments stepped together; it bounds memory.
+    seed: Seed = EVALUATION_SEED  # Seed of the start states of the episodes. Training never uses the default seed.
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False

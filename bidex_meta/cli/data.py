@@ -29,11 +29,13 @@ class DataFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="list|info|check")]
-    """list: all, a line each; info: episodes, returns, success and coverage of one; check: every file of one has the
-    digest it was written with, every episode is whole and consistent, and its rewards follow from what was observed,
-    where that can be computed."""
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""  # info, check: name or folder.
-    episodes: Few | None = None  # check: at most so many episodes, evenly spread; None: all.
+    """list: print all data sets, one per line. info: print episodes, returns, success and coverage of one data set.
+    check: test that every file of a data set has its recorded digest, that every episode is whole and consistent, and,
+    if rewards can be computed from the observations, that rewards are correct."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
+    """With info and check: name or folder of the data set."""
+    episodes: Few | None = None
+    """With check: maximum number of episodes to check, evenly spread over the data set; None: all."""
     json: JsonSwitch = False
 
 

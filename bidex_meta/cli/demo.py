@@ -23,7 +23,8 @@ class DemoFlags:
     """
 
     out: Path | None = None
-    """File to write: .webp, .mp4 or .png; None: the screen, or bidex-meta-demo.webp where there is none."""
+    """File to write: .webp, .mp4 or .png. None: show the policy on the screen, or write bidex-meta-demo.webp if there
+    is no screen."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -23,18 +23,21 @@ class EvaluateFlags(Options):
 
     Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
 
-    Learners that adapt (maml, promp, rl2, ...) are shown after 0, 1, ..., --shots shots, on train and on test tasks.
+    Learners that adapt (maml, promp, rl2, ...) are evaluated on train and on test tasks, before adaptation and after
+    each shot up to --shots.
     """
 
-    run: RunPath  # Run folder.
-    checkpoint: str = "last"  # Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
+    run: RunPath  # Folder of the run to evaluate.
+    checkpoint: str = "last"
+    """Checkpoint to evaluate: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks to play: those trained on, a meta suite's unseen ones, or for learners that adapt others of the train
-    classes; auto: train, and train and test for learners that adapt."""
-    random: Switch = False  # Also play a random policy, and show the difference.
-    other_tasks: Switch = False  # Also play as many tasks that no run trained on, drawn by another seed.
+    """Tasks to play. train: the tasks of training; test: a meta suite's unseen tasks; others: for learners that adapt,
+    unseen tasks of the train classes; both: train and test. auto: train, and for learners that adapt train and test."""
+    random: Switch = False  # Also play a random policy on the same tasks and print the difference.
+    other_tasks: Switch = False
+    """Also play an equal number of tasks that the run was not trained on, drawn from another seed."""
     randomisation: Path | None = None
-    """Randomise the worlds by the table of this TOML file (docs/randomisation.md); None: not at all."""
+    """Randomise the worlds by the table in this TOML file (docs/randomisation.md); None: no randomisation."""
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False
@@ -66,7 +69,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
     if flags.random:
-        raise BidexError(f"{algo} is compared with itself before adaptation. Leave --random out.")
+        raise BidexError(f"{algo} adapts, so it is compared with itself before adaptation. Leave --random out.")
     if flags.other_tasks:
         raise BidexError(f"{algo} adapts: --split others plays unseen tasks of its train classes.")
 
@@ -74,6 +77,8 @@ def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
 def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:
     flags.refuse_adaptation(algo)
     if flags.split == "both":
-        raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
+        raise BidexError(
+            f"{algo} does not adapt to tasks: each split is evaluated separately. Use --split train or test."
+        )
     if flags.split == OTHERS:
-        raise BidexError(f"{algo} does not adapt to tasks: --other-tasks plays others beside its own.")
+        raise BidexError(f"{algo} does not adapt to tasks: --other-tasks plays unseen tasks in addition to its own.")

@@ -18,9 +18,9 @@ class ExportFlags:
     computes in float32; for a policy that computes in bfloat16 here, the command prints the largest difference.
     """
 
-    run: RunPath  # Run folder.
-    out: Path | None = None  # The file; None: policy.onnx in the run's folder.
-    checkpoint: str = "last"  # Which policy: last, best or a file.
+    run: RunPath  # Folder of the run to export.
+    out: Path | None = None  # ONNX file to write; None: policy.onnx in the run's folder.
+    checkpoint: str = "last"  # Checkpoint to export: last, best or a file.
 
 
 def main(arguments: Sequence[str]) -> None:

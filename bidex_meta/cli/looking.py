@@ -58,7 +58,7 @@ def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[s
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     worlds = open_worlds(config)
     slots = slots_of(worlds)
-    classes = worlds.task_classes()  # raises BidexError for worlds that are not ours
+    classes = worlds.task_classes()  # raises BidexError for worlds of other libraries
     if flags.actor not in ("zero", "random"):
         say_other_rules(RunFolder.open(Path(flags.actor)), worlds)
     if flags.task:

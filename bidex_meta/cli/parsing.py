@@ -24,7 +24,7 @@ from bidex_meta.utils.validation import Seed, check_fields
 Options = TypeVar("Options")
 
 
-_HELP_COLUMN = 26  # where texts of the short help begin
+_HELP_COLUMN = 26  # column at which texts of the short help begin
 _END = re.compile(r"[.;](?: |$)(?![^(]*\))")
 """End of the first sentence of a help text: a full stop or semicolon outside parentheses."""
 
@@ -55,12 +55,12 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
     raise TypeError(f"{command.__module__}.main parses no flags")
 
 
-JsonSwitch = Annotated[Switch, tyro.conf.arg(help="Print JSON.")]
-Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
+JsonSwitch = Annotated[Switch, tyro.conf.arg(help="Print the result as JSON.")]
+Device = Annotated[str, tyro.conf.arg(help="Device: auto, cpu or cuda:N.")]
 Engine = Annotated[
-    Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
+    Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics engine: c, warp, or auto (the faster one on the device).")
 ]
-RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # A run folder, as the first word
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # a run folder, the first word
 RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
 """Run folders, or studies of ``results/data/``: ``FILE``, or ``FILE:RUN`` for one of its runs."""
 
@@ -70,15 +70,17 @@ class LookFlags:
     """Flags that choose the world in which a policy is shown."""
 
     run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder whose policy is shown; the same as --policy RUN."""
-    task: str | None = None  # Task class; None: the run's first one. In a browser it can be changed.
+    """Folder of the run whose policy is shown; the same as --policy RUN."""
+    task: str | None = None
+    """Task class to show. None: the first class of the run. The browser's page can switch to another class."""
     object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
-    or the class's own."""
-    policy: str = "zero"  # zero, random, or a run folder.
-    checkpoint: str = "last"  # Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file.
-    suite: str | None = None  # Show the task as this suite has it; None: on its own, or as in the run.
-    seed: Seed = 0  # Seed of tasks and starts.
+    """With --task and without --suite: throw this object, a name from `bidex-meta list objects` or an MJCF file
+    (docs/objects.md). None: the object of the run, or the class's own."""
+    policy: str = "zero"  # Policy to show: zero (the action 0), random, or the folder of a run.
+    checkpoint: str = "last"  # Checkpoint of a run: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
+    suite: str | None = None
+    """Show the task with the rules and tasks of this suite. None: as in the run, or the single class."""
+    seed: Seed = 0  # Seed that draws tasks and start states.
 
     @property
     def actor(self) -> str:
@@ -111,7 +113,7 @@ def parse(
     complaint = io.StringIO()
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     try:
-        # tyro prints a box of several lines and exits; we keep its words and drop the box.
+        # tyro prints a box of several lines and exits. We print its words without the box.
         with contextlib.redirect_stderr(complaint):
             parsed, unknown = tyro.cli(
                 options, args=list(arguments), prog=f"bidex-meta {command}", return_unknown_args=True, **keywords

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlayFlags(LookFlags):
-    """Look at a policy live: in MuJoCo's viewer, or in the browser if there is no screen.
+    """Watch a policy live in MuJoCo's viewer, or in the browser if there is no screen.
 
     Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
 
@@ -26,11 +26,12 @@ class PlayFlags(LookFlags):
     bidex-meta play --task SwingCup --policy random needs no run either.
     """
 
-    speed: Positive = 1.0  # Of the clock; 0.5 is slow motion.
-    browser: Switch = False  # In the browser, also where there is a screen.
-    host: str = "127.0.0.1"  # Address the browser's page is served at; 0.0.0.0 lets other machines in.
-    port: Port = 8080  # Port of that page; where it is taken, the next free one.
-    seconds: NonNegative | None = None  # End after so many seconds; None: when the window is closed, or Ctrl-C.
+    speed: Positive = 1.0  # Playback speed relative to real time; 0.5 is slow motion.
+    browser: Switch = False  # Show the policy in the browser, even if there is a screen.
+    host: str = "127.0.0.1"  # Address at which the browser's page is served; 0.0.0.0 admits other machines.
+    port: Port = 8080  # Port of the browser's page; if it is taken, the next free port is used.
+    seconds: NonNegative | None = None
+    """Stop after this number of seconds; None: when the window is closed or at Ctrl-C."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -20,14 +20,18 @@ class PlotFlags:
 
     Example: bidex-meta plot runs/MT4/mtppo/* --out curves.png
 
-    Runs that differ only in the seed are one line, with the 95 % bootstrap interval over runs.
+    Runs that differ only in the seed share one line, with the 95 % bootstrap interval over runs.
     """
 
-    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
-    adaptation: Switch = False  # Against shots of adaptation, from the meta-test in evaluation.json; of one run.
+    runs: RunPaths  # Run folders, or studies in results/data: FILE for all runs of a study, FILE:RUN for one.
+    adaptation: Switch = False
+    """Plot against shots of adaptation, from the meta-test in the evaluation.json of one run."""
     evaluation: Path | None = None
-    """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
-    out: Path | None = None  # The picture; None: curves.png or adaptation.png, in the run folder or, of several, here.
+    """With --adaptation: output of `bidex-meta evaluate RUN --shots K --json` to plot instead of the run's
+    evaluation.json."""
+    out: Path | None = None
+    """Picture to write. None: curves.png or adaptation.png, in the run's folder or, for several runs, in the current
+    folder."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -38,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
         out = output(flags.out, runs, "curves.png")
         plot(runs, out)
     elif len(runs) > 1:
-        raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
+        raise BidexError(f"--adaptation draws a single run, got {len(runs)}. bidex-meta report shows all.")
     else:
         out = output(flags.out, runs, "adaptation.png")
         run = runs[0]

@@ -27,14 +27,17 @@ from bidex_meta.utils.files import absolute
 
 @dataclass(frozen=True)
 class PullFlags:
-    """Fetch what was pushed: `bidex-meta evaluate` plays a policy, `bidex-meta data info` describes a data set.
+    """Fetch a policy or a data set that `bidex-meta push` published.
 
     Example: bidex-meta pull me/mt4-mtppo
+
+    `bidex-meta evaluate` then plays the policy, and `bidex-meta data info` describes the data set.
     """
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """Repository of the Hugging Face Hub, of a data set datasets/OWNER/NAME; or folder:PATH."""
-    out: Path | None = None  # The new folder; None: pulled/NAME.
+    """Repository on the Hugging Face Hub: OWNER/NAME for a policy, datasets/OWNER/NAME for a data set; or
+    folder:PATH."""
+    out: Path | None = None  # Folder to create; None: pulled/NAME.
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -48,14 +51,16 @@ def main(arguments: Sequence[str]) -> None:
         root = source.parents[1]  # a snapshot in the cache links to files next to the snapshots' folder
     files = files_of(source, wanted, root)
     if not {"config.json", "data/metadata.json"} & files.keys():
-        raise BidexError(f"{flags.name} holds neither a run's config.json nor a data set. Name what was pushed.")
+        raise BidexError(
+            f"{flags.name} holds neither a run's config.json nor a data set. Give the name that was pushed."
+        )
     out = flags.out or Path("pulled") / Path(flags.name.removeprefix(FOLDER)).name
     with new_folder(absolute(out)) as folder:
         copied(files, folder)
         try:
             found = checked(folder)
         except BidexError as error:
-            raise BidexError(f"{flags.name} is damaged, and was not kept: {error}") from None
+            raise BidexError(f"{flags.name} is damaged and was deleted: {error}") from None
         if isinstance(found, RunFolder):
             _name_suite(found, absolute(out))
     print(out)

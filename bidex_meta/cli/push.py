@@ -35,10 +35,11 @@ class PushFlags:
     Example: bidex-meta push runs/MT4/mtppo/2026-11-21_10-00-00_seed0 me/mt4-mtppo
     """
 
-    run: RunPath  # Folder of a run, or of a data set.
+    run: RunPath  # Folder of a run or of a data set.
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """Repository of the Hugging Face Hub, of a data set datasets/OWNER/NAME; or folder:PATH."""
-    private: Switch = False  # A repository that is made now is private.
+    """Repository on the Hugging Face Hub: OWNER/NAME for a policy, datasets/OWNER/NAME for a data set; or
+    folder:PATH."""
+    private: Switch = False  # Make the repository private if this command creates it.
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -46,11 +47,11 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(PushFlags, arguments, "push")
     of_data = bool(files_of(flags.run, OF_DATA))
     if not flags.name.startswith(FOLDER) and of_data != flags.name.startswith(DATASETS):
-        raise BidexError(f"Expected {DATASETS}OWNER/NAME for a data set alone, got {flags.name} for {flags.run}.")
+        raise BidexError(f"Expected {DATASETS}OWNER/NAME only for a data set, got {flags.name} for {flags.run}.")
     files = files_of(flags.run, OF_DATA if of_data else OF_A_RUN)
     found = checked(flags.run)
     if not of_data and not any(name.endswith(".pt") for name in files):
-        raise BidexError(f"{flags.run} has no checkpoint, so that there is no policy to publish. Train it on.")
+        raise BidexError(f"{flags.run} has no checkpoint, so there is no policy to publish. Continue its training.")
     if isinstance(found, RunFolder):
         card = run_card(found, flags.name)
     else:

@@ -13,10 +13,10 @@ class RecordFlags(RecordConfig):
 
     Example: bidex-meta record random --task CatchUnderarm
 
-    If the command is killed or interrupted, run it again: it continues where it stopped and ends with the same data.
+    If the command is killed or interrupted, run it again: it continues and ends with the same data.
     """
 
-    estimate: Switch = False  # Print what it would take, and stop.
+    estimate: Switch = False  # Print how much time and disk space the recording would take, then exit.
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -19,25 +19,27 @@ class RenderFlags(LookFlags):
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
 
-    bidex-meta render RUN --tiled puts a film of every class it was trained on into RUN/videos/.
+    bidex-meta render RUN --tiled writes a film of all classes that the run was trained on into RUN/videos/.
     """
 
     out: Path | None = None
-    """File: .png (picture), .mp4 (film) or .webp (film for web pages); None, of a run: a film in its videos/."""
+    """File to write: .png (picture), .mp4 (film) or .webp (film for web pages). None: for a run, a film in its
+    videos/."""
     tiled: Switch = False
-    """All classes of the suite beside each other; where an episode ends the next one begins. A name is green while
-    the episode counts as a success: from its first success on; in version 2 while the goal is held."""
+    """Show all classes of the suite side by side; when an episode ends, the next one begins. A class's name is green
+    while the episode counts as a success: from the first success on, in version 2 while the goal is held."""
     large: Switch = False
-    """With --tiled: one class at a time large beside all."""
+    """With --tiled: show one class at a time large next to all tiles."""
     steps: Steps | None = None
-    """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
-    every: Few | None = None  # Steps from one frame of a film to the next; None: 1, with --tiled 2.
-    width: Pixels | None = None  # Pixels, of a tile with --tiled; None: 640, with --tiled 240.
-    height: Pixels | None = None  # Pixels, likewise; None: three quarters of the width.
-    camera: str | None = None  # front, side, top or back; None: front.
+    """Environment steps to film, 60 per second. None: none for a picture, one episode for a film, and with --tiled the
+    longest episode."""
+    every: Few | None = None  # Environment steps between two frames of a film; None: 1, with --tiled 2.
+    width: Pixels | None = None  # Width in pixels, with --tiled of one tile; None: 640, with --tiled 240.
+    height: Pixels | None = None  # Height in pixels, with --tiled of one tile; None: three quarters of the width.
+    camera: str | None = None  # Camera: front, side, top or back; None: front.
     points: Switch = False
-    """Beside each picture the point cloud of the class's depth camera, seen from there and from the side; as many
-    points as the run's observations have, else 768."""
+    """Next to each picture, draw the point cloud of the class's depth camera, from the camera and from the side. The
+    cloud has the same number of points as the run's observations, otherwise 768."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -19,11 +19,12 @@ class ReportFlags:
 
     Example: bidex-meta report runs/MT4/mtppo/* runs/MT4/mttrpo/* --out mt4.html
 
-    The page needs no network and no other file. Runs that differ only in the seed are one line, with intervals.
+    The page needs no network and no other file. Runs that differ only in the seed share one line, with intervals.
     """
 
-    runs: RunPaths  # Run folders, or studies of results/data: FILE or FILE:RUN.
-    out: Path | None = None  # The page; None: report.html, in the run folder or, of several, here.
+    runs: RunPaths  # Run folders, or studies in results/data: FILE for all runs of a study, FILE:RUN for one.
+    out: Path | None = None
+    """HTML file to write. None: report.html, in the run's folder or, for several runs, in the current folder."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> None:
     except Stopped as stop:
         command = resume_command(stop.folder.path, launch().count)
         say(f"Stopped after {stop.step:,} steps and saved. Continue: {command}")
-        # A batch system's SIGTERM requests a checkpoint, which is saved now. Other signals also stop the caller.
+        # SIGTERM from a batch system requests a checkpoint, which is saved by now. Other signals also stop the caller.
         if stop.number != signal.SIGTERM:
             raise SystemExit(128 + stop.number) from None
         return

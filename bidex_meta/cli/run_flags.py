@@ -33,10 +33,10 @@ class RunFlags(Generic[LearnerSettings]):
     config: Annotated[RunConfig[LearnerSettings], tyro.conf.arg(name="")]
     run_dir: Path | None = None  # Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED.
     resume: Path | None = None
-    """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
-    count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
-    evaluate: bool = True  # Evaluate at the end.
-    print_config: Switch = False  # Print the resolved config as JSON and stop.
+    """Continue the run in this folder from its last checkpoint, with its stored config. Only --steps and --minutes
+    (totals, including what is already done), --logger, --evaluate-every, --video-every and --stop-at-... may change."""
+    evaluate: bool = True  # Evaluate the policy when training ends.
+    print_config: Switch = False  # Print the resolved config as JSON and exit without training.
     final: Annotated[FinalEvaluation, tyro.conf.arg(name="")] = USUAL_EVALUATION
 
 
@@ -49,7 +49,7 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
     if resume := peek(arguments, "--resume"):
         folder = RunFolder.open(Path(resume))
     default = _defaults(arguments, folder)
-    # The learner's flags are among those of its config; lists begin empty, since flags add to them.
+    # The learner's flags belong to its config. Lists begin empty, because flags append to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
     start = RunFlags(replace(default, dataset=(), demonstrations=(), teacher=()))
     settings = [f"--learner.{name.replace('_', '-')}" for name in USUAL_SETTINGS]

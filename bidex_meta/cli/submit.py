@@ -19,7 +19,7 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry of runs, which play their own tasks and equally many new tasks, or of a meta-test.
+    """Write a leaderboard entry for a meta-test or for runs, which play their own tasks and equally many new tasks.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
@@ -34,11 +34,11 @@ class SubmitFlags:
     """Folder of `bidex-meta transfer` for the run, to rank how much its policy helps on held-out classes."""
     evaluation: Path | None = None  # Instead of runs: the file of a meta-test, from meta_test(agent, suite).save(FILE).
     track: AdaptationTrack | None = None
-    """Training of the agent of --evaluation: reward-only (rewards of its own episodes) or privileged (also teachers,
-    hidden parts of tasks or rewards of other goals)."""
-    name: str | None = None  # Name on the leaderboard; None: the algorithm, or the agent's class.
-    out: Path = Path("results/leaderboard")  # Folder of entries.
-    episodes: Few | None = None  # Of each task; None: 1, of learners that adapt 10 after each shot.
+    """With --evaluation: data that the agent was trained on. reward-only: rewards of its own episodes; privileged: also
+    teachers, hidden parts of tasks or rewards of other goals."""
+    name: str | None = None  # Name on the leaderboard; None: the algorithm, or the class of the agent.
+    out: Path = Path("results/leaderboard")  # Folder of leaderboard entries to write to.
+    episodes: Few | None = None  # Episodes of each task; None: 1, and for learners that adapt 10 after each shot.
     device: Device = "auto"
 
 
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> None:
     """Check, play, write, print."""
     flags = parse(SubmitFlags, arguments, "submit")
     if flags.runs and flags.evaluation is not None:
-        raise BidexError("Expected run folders or --evaluation, got both. Submit them apart.")
+        raise BidexError("Expected run folders or --evaluation, got both. Submit them separately.")
     if not flags.runs and flags.evaluation is None:
         raise BidexError("Expected run folders to submit, got none. Name them: bidex-meta submit runs/MT20/mtppo/*")
     if flags.track is not None and flags.evaluation is None:
@@ -80,7 +80,7 @@ def _tuning(text: str | None) -> tuple[int, int]:
     if numbers is None:
         raise BidexError(
             "--tuning: expected the number of settings that you tried before you chose these, times the seeds of each, "
-            f"got {shortened(text) if text else 'none'}. Say for example --tuning 12x1, or 1x1 if you tried no others."
+            f"got {shortened(text) if text else 'none'}. For example: --tuning 12x1, or 1x1 if you tried no others."
         )
     return int(numbers[1]), int(numbers[2])
 

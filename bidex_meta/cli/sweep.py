@@ -27,15 +27,18 @@ class SweepFlags:
     docs/sweeps.md explains the file.
     """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]  # The sweep.
-    workers: Few | None = None  # Runs at a time, each on a core of its own; None: one, or one for each of --cores.
-    cores: str | None = None  # Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first there are.
-    out: Path = Path("runs")  # Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN.
-    status: Switch = False  # Print what is done, what runs, what is left and how long it takes, and stop.
-    dry_run: Switch = False  # Check the file, print the commands of what is left, and stop.
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
+    """TOML file that lists the runs (docs/sweeps.md)."""
+    workers: Few | None = None
+    """Number of runs at a time, each on its own core. None: one run, or one run per core in --cores."""
+    cores: str | None = None
+    """Cores that the runs are bound to (Linux only), such as 1 or 0,2-3. None: the first available cores."""
+    out: Path = Path("runs")  # Parent of the sweep's folder; its runs are OUT/NAME/SUITE-ARM-seedN.
+    status: Switch = False  # Print which runs are done, running and left and how long they take, then exit.
+    dry_run: Switch = False  # Check the file, print the commands of the runs that are left, and exit.
     submit: Literal["slurm", "local"] | None = None
-    """Hand the runs to a cluster by submitit (extra slurm), with the parameters of the file's [slurm], instead of
-    running them; local: submitit's executor on this machine."""
+    """Submit the runs to a cluster through submitit (extra slurm), with the parameters of the file's [slurm] table.
+    slurm: the cluster; local: submitit's executor on this machine."""
 
 
 def main(arguments: Sequence[str]) -> None:

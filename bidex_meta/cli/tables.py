@@ -17,10 +17,10 @@ from bidex_meta.evaluation.statistics import NONE, Interval
 from bidex_meta.runs.evaluations import Gains, SplitSummary, Summary
 from bidex_meta.utils.streams import output_width
 
-if TYPE_CHECKING:  # torch, which lists and help do without
+if TYPE_CHECKING:  # torch is not imported, because lists and help do not need it
     from bidex_meta.experiments.evaluating import PlayedTasks, RunEvaluation, RunMetaTest
 
-Json = dict[str, Any]  # an object of JSON
+Json = dict[str, Any]  # a JSON object
 _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
     "unknown: of the worst finished episode)"
@@ -97,12 +97,12 @@ class Sheet:
 
 _RANGED = re.compile(r"([-+]?(?:[\d.,]+(?:e[-+]?\d+)?|nan|inf)(?: %)?) (\[.*\])")
 _NUMBER = re.compile(rf"{NONE}|[-+>]? ?[\d.]+.*|\[.*\]|[-+]?(nan|inf).*|")
-_PROSE = 24  # letters from which a cell of several words is wrapped
+_PROSE = 24  # a cell of several words is wrapped from this number of letters on
 
 
 @dataclass
 class _Column:
-    place: int  # of the header that it belongs to
+    place: int  # index of the header that the column belongs to
     header: str
     cells: list[str]
     is_interval: bool = False
@@ -126,7 +126,7 @@ class _Column:
 
 
 def _needed(columns: Sequence[_Column]) -> int:
-    return sum(column.least + 3 for column in columns) + 1  # with a rule and two spaces between columns
+    return sum(column.least + 3 for column in columns) + 1  # columns are separated by a rule and two spaces
 
 
 def _widths(columns: Sequence[_Column], width: int) -> list[int]:

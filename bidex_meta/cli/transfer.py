@@ -20,27 +20,30 @@ _SPARE = ("seeds", "return")  # columns that a narrow terminal leaves out first
 
 @dataclass(frozen=True)
 class TransferFlags:
-    """Learn held-out classes from a run's policy and from scratch: by reinforcement, and from a few demonstrations.
+    """Learn held-out classes from a run's policy and from scratch, by reinforcement learning and from demonstrations.
 
     Example: bidex-meta transfer results/ML20-mtppo-seed0 --classes LiftUnderarm --out runs/transfer
 
-    If the command is interrupted, run it again to continue. Flags after -- are flags of `bidex-meta run` for every run,
-    such as `-- --learner.critic-first 20000` (docs/transfer.md).
+    If the command is interrupted, run it again to continue. Flags after -- are passed to `bidex-meta run` for every
+    run, such as `-- --learner.critic-first 20000` (docs/transfer.md).
     """
 
-    run: RunPath  # Run folder on a suite with held-out classes: its policy is measured.
-    out: Path  # Folder of the runs, transfer.json and figures.
-    start_from: tuple[Path, ...] = ()  # Other runs to start from, on observations of the same form.
-    classes: tuple[str, ...] = ()  # Held-out classes; none: all of the run's suite.
-    steps: Steps = 1_000_000  # Environment steps of a run by reinforcement; 0: no such runs.
-    demonstrations: tuple[Whole, ...] = (0, 1, 5, 25)  # Episodes to learn from; --demonstrations alone: no such runs.
+    run: RunPath  # Folder of the run whose policy is measured; its suite must have held-out classes.
+    out: Path  # Folder that receives the runs, transfer.json and figures.
+    start_from: tuple[Path, ...] = ()  # Further runs to start from; their observations must have the same form.
+    classes: tuple[str, ...] = ()  # Held-out classes to learn; none: all held-out classes of the run's suite.
+    steps: Steps = 1_000_000  # Environment steps of each reinforcement-learning run; 0: no such runs.
+    demonstrations: tuple[Whole, ...] = (0, 1, 5, 25)
+    """Numbers of demonstrations to learn from, one run per number; --demonstrations without a number: no such runs."""
     data: Several = ()
-    """Data set of a class's demonstrations (a name of `bidex-meta data list`, or a folder), in place of its script's.
-    Given several times: of several classes."""
-    seeds: Few = 3  # Runs of each kind, with seeds 0, 1, ...
+    """Data set of demonstrations of one class (a name from `bidex-meta data list`, or a folder), instead of its
+    script's demonstrations. Repeat the flag for several classes."""
+    seeds: Few = 3  # Number of runs of each kind, with seeds 0, 1, ...
     num_envs: Environments = 256  # Environments stepped together in each run.
-    workers: Few | None = None  # Runs at a time, as of `bidex-meta sweep`.
-    cores: str | None = None  # Cores that runs are bound to, likewise.
+    workers: Few | None = None
+    """Number of runs at a time, each on its own core. None: one run, or one run per core in --cores."""
+    cores: str | None = None
+    """Cores that the runs are bound to (Linux only), such as 1 or 0,2-3. None: the first available cores."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -24,23 +24,25 @@ class ValidityFlags:
 
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
-    For each class: the success on unseen tasks that a policy can have at best without knowing what a task hides; how
-    often a first observation names the task (chance: one over the number of tasks); how often the rewards of one
-    exploring episode (rough actions, a witness's or a misled script's with noise) identify the hidden parts; the
-    success of policies that have learned nothing, and of scripts and runs that know the task; and whether return and
-    success agree over all their episodes.
+    The table has five measures per class. (1) The highest success on unseen tasks that a policy can reach without
+    knowing what a task hides. (2) The share of first observations that identify the task; chance is one over the
+    number of tasks. (3) The share of exploring episodes whose rewards identify the hidden parts; exploration plays
+    rough actions, or a witness or a misled script with noise. (4) The success of untrained policies, and of scripts
+    and runs that know the task. (5) The agreement of return and success over all these episodes.
     """
 
     suite: str = "ML20-v2"
-    """Suite, or a suite file; its train tasks are measured, of a meta suite its test tasks too."""
+    """Suite to measure: a name or a suite file. Its train tasks are measured, and the test tasks of a meta suite
+    too."""
     policy: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """Folder of a run whose policy knows the tasks: of this suite's rules, or of some of its classes."""
+    """Folder of a run whose policy knows the tasks; the run must have the rules of this suite, and may know only some
+    of its classes. Repeat the flag for several runs."""
     seed: Seed = 0
-    """Seed of tasks, starts and actions."""
+    """Seed that draws tasks, start states and actions."""
     threads: Threads | None = None
-    """Threads of the physics; None: one per core."""
+    """CPU threads for the physics; None: one per core."""
     out: Path | None = None
-    """JSON file that takes the table."""
+    """JSON file to write the table to."""
     json: JsonSwitch = False
 
 

@@ -22,11 +22,15 @@ class VerifyFlags:
     The exit code is 0 if all is equal bit for bit or within the intervals, and 1 if something differs.
     """
 
-    run: RunPath  # Run folder.
-    evaluation: Path | None = None  # What `bidex-meta evaluate --json` wrote of the run; None: its evaluation.json.
-    device: str = "auto"  # auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU.
-    engine: Engine | None = None  # auto, c or warp; None: as the evaluation was made, on another device auto.
-    num_envs: Environments | None = None  # Environments stepped together; None: as the evaluation was made.
+    run: RunPath  # Folder of the run to verify.
+    evaluation: Path | None = None
+    """Output of `bidex-meta evaluate --json` for this run to compare with; None: the run's evaluation.json."""
+    device: str = "auto"
+    """Device: auto, cpu or cuda:N. auto: the device of the recorded evaluation if it is available, otherwise the
+    CPU."""
+    engine: Engine | None = None
+    """Physics engine: auto, c or warp. None: as in the recorded evaluation; on another device auto."""
+    num_envs: Environments | None = None  # Environments stepped together; None: as in the recorded evaluation.
     json: JsonSwitch = False
 
 

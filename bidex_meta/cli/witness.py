@@ -22,12 +22,12 @@ class WitnessFlags:
     Example: bidex-meta witness --task CatchUnderarm
     """
 
-    task: str | None = None  # Task class.
-    all: Switch = False  # All classes.
-    file: Path | None = None  # Replay this file, not the stored witness.
+    task: str | None = None  # Task class whose witness is replayed.
+    all: Switch = False  # Replay the witnesses of all classes.
+    file: Path | None = None  # Replay this file instead of the stored witness.
     out: Path | None = None  # Also write a film (.mp4, .webp) of the witness, or a picture (.png) of its last step.
-    camera: str | None = None  # front, side, top or back.
-    threads: Threads | None = None  # Threads of the physics; None: one per core.
+    camera: str | None = None  # Camera of the film or picture: front, side, top or back.
+    threads: Threads | None = None  # CPU threads for the physics; None: one per core.
     json: JsonSwitch = False
 
 

@@ -64,7 +64,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         twice.
         """
         if self._over:
-            raise BidexError("Expected reset() before step(): no episode runs.")
+            raise BidexError("Expected reset() before step(): there is no running episode.")
         obs, reward, terminated, truncated, batch = self.world.step(one_row(action))
         info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}

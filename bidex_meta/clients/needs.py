@@ -18,7 +18,7 @@ def extra(name: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         fault = f"Expected the extra {name!r}, but {error.name} is not installed"
-        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[{name}]'.") from error
+        raise BidexError(f"{fault}. Install it: pip install 'bidex-meta[{name}]'.") from error
 
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:

@@ -55,7 +55,7 @@ class PolicyClient:
         self._timeout = timeout
         self._begins = torch.ones(world.num_envs, dtype=torch.bool)
         try:
-            # A server that computes in its only thread answers no pings.
+            # A server that computes in its only thread does not answer pings.
             self._connection = connect(
                 url, open_timeout=timeout, close_timeout=1.0, ping_interval=None, max_size=None, compression=None,
                 proxy=None,

@@ -96,7 +96,7 @@ class RslRlVecEnv(VecEnv):
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, Info]:
         """Take actions (num_envs, a); return observations, rewards and dones (num_envs,), and extras."""
-        with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
+        with torch.inference_mode(False), torch.no_grad():  # the world's tensors outlive the runner's inference mode
             self._obs, reward, terminated, truncated, info = self.world.step(actions)
             extras = {"time_outs": truncated, "log": self._log.update(info, terminated, truncated)}
             return self.get_observations(), reward, terminated | truncated, extras

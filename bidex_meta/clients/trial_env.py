@@ -84,7 +84,7 @@ class TrialWorld(PooledWorldWrapper):
         ended = own["_final_obs"]
         over = ended & (is_last | own["unstable"])
         last = torch.cat((given, reward[:, None], ended[:, None].float()), dim=1)
-        # The end of a trial is not marked, because the value of its last observation is that of an episode going on.
+        # The end of a trial is not marked, because its last observation has the value of an ongoing episode.
         final_last = torch.where(own["unstable"][:, None], self._last, last)
         final_last[:, -1] = final_last[:, -1].masked_fill(over & ~own["unstable"], 0.0)
         final = torch.cat((torch.where(over[:, None], own["final_obs"], obs), final_last), dim=1)
@@ -184,7 +184,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = self._env.action_space
         self._num_actions = self._env.task_class.action_size
         self.observation_space = _extended(self._env.observation_space, self.action_space)
-        self._left = 0  # episodes that the running trial has yet to end
+        self._left = 0  # number of episodes that the running trial has left
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Start a trial of another task; return an observation and an empty info. A seed always gives the same trial.
@@ -208,7 +208,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises BidexError if no trial runs.
         """
         if self._left == 0:
-            raise BidexError("Expected reset() before step(): no trial runs.")
+            raise BidexError("Expected reset() before step(): there is no running trial.")
         obs, reward, terminated, truncated, info = self._env.step(action)
         self._solved |= info["success"] > 0.0
         ended = terminated or truncated
@@ -220,7 +220,7 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             info["is_success"] = self._solved
         elif ended:
             obs = self._begin_episode()
-        # The end of a trial is not marked, because the value of its last observation is that of an episode going on.
+        # The end of a trial is not marked, because its last observation has the value of an ongoing episode.
         seen = self._seen(obs, action, reward, ended and not over)
         return seen, reward, terminated and over, truncated and over, info
 

@@ -58,8 +58,8 @@ class Actor:
             drawing = policy
         else:
             drawing = None
-        # Each kind of draw has its own generator; the policy's generator is on the network's device. With the same seed
-        # the noise would repeat the policy's own normal draws.
+        # Each kind of draw has its own generator. The policy's generator is on the network's device. With the same
+        # seed, the noise would repeat the policy's own normal draws.
         inner = torch.Generator(world.device).manual_seed(seed)
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
@@ -137,7 +137,7 @@ def collect(
     now = progress(writer, len(actors))
     collector = EpisodeCollector(world, writer.add)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     while min(now.steps) < share:
-        # The actor with the fewest steps acts next, so that shares are about equal if the collection is ended early.
+        # The actor with the fewest steps acts next, so that the shares are about equal if the collection ends early.
         which = int(np.argmin(now.steps))
         rows, repeats = _plan(world, share - now.steps[which], now, which)
         number = np.random.SeedSequence((seed, writer.parts)).generate_state(1, np.uint64)[0]

@@ -17,11 +17,12 @@ from bidex_meta.world.checked import clean
 from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
-_FIRST_ROOM = 64  # steps of an episode in a world without time limit; doubled when one is longer
+# Initial buffer, in steps of an episode, in a world without time limit; it doubles when an episode is longer.
+_FIRST_ROOM = 64
 BROKEN, SHORTENED, CUT = "broken_transitions", "shortened_episodes", "cut_episodes"
 """Reasons for leaving data out: physics broke in a transition; an episode began after its first step, as can happen in
 a training world; a reset cut an episode."""
-_KEY = "recorder"  # entry of a checkpoint's world state
+_KEY = "recorder"  # name of our entry in a checkpoint's world state
 
 
 class EpisodeCollector(PooledWorldWrapper):
@@ -62,12 +63,12 @@ class EpisodeCollector(PooledWorldWrapper):
         num = len(self.rows)
         room = _FIRST_ROOM
         if isinstance(self.world, TaskWorld) and num:
-            # The system allocates no memory for pages that no episode reaches.
+            # The operating system allocates no memory for pages that no episode reaches.
             room = int(self.world.max_episode_steps[self._where].max())
         d, a = (int(s.shape[0]) for s in (self.world.single_observation_space, self.world.single_action_space))
         self._observations = np.zeros((num, room + 1, d), np.float32)
         self._actions = np.zeros((num, room, a), np.float32)
-        self._rewards = np.zeros((2, num, room), np.float32)  # as given, and unscaled
+        self._rewards = np.zeros((2, num, room), np.float32)  # scaled rewards, and unscaled ones
         self._running = np.zeros(num, bool)
         self._length = np.zeros(num, np.int64)
         self._task = np.zeros(num, np.int64)
@@ -150,7 +151,7 @@ class EpisodeCollector(PooledWorldWrapper):
         if self._pools:
             variation = self._pools[slot][task].copy()
         describe = getattr(self.world, "instruction", None)
-        if describe is not None:  # worlds of other classes have no sentences
+        if describe is not None:  # worlds of other libraries have no sentences
             instruction = describe(slot, variation)
         self._sink(
             Episode(
@@ -200,7 +201,9 @@ class EpisodeCollector(PooledWorldWrapper):
         self._forget()
         sizes = [given[name].shape[-1] for name in ("observations", "actions")]
         if given["rows"].tolist() != self.rows or sizes != [self._observations.shape[-1], self._actions.shape[-1]]:
-            raise BidexError("The episodes in this checkpoint are of other rows or sizes. Start a new run.")
+            raise BidexError(
+                "The recorded episodes in this checkpoint have other environments or sizes. Start a new run."
+            )
         most = given["actions"].shape[1]
         while self._actions.shape[1] < most:
             self._make_room(self._actions.shape[1] + 1)

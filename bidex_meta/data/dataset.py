@@ -113,7 +113,7 @@ def open_dataset(name_or_path: str | Path) -> "Dataset":
                 parse(content, _Metadata, str(path))
                 return Dataset(inner, content, sealed)
             if is_file(inner / part_files.RECORDING):
-                raise BidexError(f"The recording of {folder} has not ended. Give its command again to go on.")
+                raise BidexError(f"The recording of {folder} has not ended. Run its command again to continue.")
     raise unknown_name("data set", str(name_or_path), dataset_names())
 
 

@@ -148,7 +148,9 @@ class _Form:
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
             fault = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
-            raise BidexError(f"{fault}. Record it with the same bases (--base), or learn for what it was recorded of.")
+            raise BidexError(
+                f"{fault}. Record it with the same bases (--base), or train on the tasks that it was recorded on."
+            )
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for start, stop in dict(shown).get("task_id", ()))
         self._width = plain
@@ -157,7 +159,7 @@ class _Form:
         self._theirs = _Columns.of(groups, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
-        slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
+        slots: Sequence[Slot] = getattr(world, "slots", ())  # Meta-World's worlds have no slots
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         check_touch(dataset, any(slot.task_class.touch for slot in slots))
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
@@ -180,7 +182,7 @@ class _Form:
         there = len(theirs.state)
         if here > there or (here < there and not may_pad):
             fault = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
-            raise BidexError(f"{fault}. Learn for what it was recorded of.")
+            raise BidexError(f"{fault}. Train on the tasks that it was recorded on.")
 
     def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
         """Yield all episodes, each with its slot and its observations in the world's form."""
@@ -213,7 +215,7 @@ def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[
         yield from [0] * len(names)
         return
     known: Mapping[str, int] = {name: slot for slot, name in enumerate(world.task_names)}
-    classes = {slot.name: slot.task_class for slot in getattr(world, "slots", ())}  # of Meta-World's there are none
+    classes = {slot.name: slot.task_class for slot in getattr(world, "slots", ())}  # Meta-World's worlds have no slots
     for name in names:
         here = name_among(name, classes)
         if here not in known:

@@ -34,9 +34,9 @@ H5 = Any  # h5py's file, group, array or buffer; h5py is optional and has no typ
 MAIN = "main_data.hdf5"
 METADATA = "metadata.json"
 RECORDING = "recording.json"
-FORMAT = 1  # increased when older code can no longer read the files
+FORMAT = 1  # raised when older code can no longer read the files
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 4300  # overhead of an episode in HDF5, bytes: measured with an instruction of 100 letters
+EPISODE_BYTES = 4300  # overhead of an episode in HDF5 in bytes, measured with an instruction of 100 letters
 ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
 ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
@@ -76,7 +76,7 @@ def hdf5() -> ModuleType:
         import h5py
     except ModuleNotFoundError:
         fault = "Expected h5py for data sets, but it is not installed"
-        raise BidexError(f"{fault}. Add it: pip install 'bidex-meta[data]'.") from None
+        raise BidexError(f"{fault}. Install it: pip install 'bidex-meta[data]'.") from None
     return h5py
 
 
@@ -194,7 +194,7 @@ class PartWriter:
             group = file.create_group(f"episode_{len(self._rows)}")
             for name, ours in ARRAYS.items():
                 group.create_dataset(name, data=getattr(episode, ours))
-            group.create_group("infos")  # Minari prints its keys
+            group.create_group("infos")  # Minari prints the keys of this group
             shown = ("task", "task_index", "policy", "success", "broken")
             group.attrs.update({name: row[name] for name in shown} | named)
         self._rows.append(row)

@@ -14,7 +14,7 @@ from typing import IO
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.files import open_regular
 
-BLOCK = 512  # bytes of the user block: the least that HDF5 accepts
+BLOCK = 512  # bytes of the user block; HDF5 accepts no smaller one
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
@@ -41,7 +41,7 @@ def check_file(path: Path) -> bool:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):
             return False
-        # The length is checked first, so that a huge empty file is not read.
+        # The length is checked first, so that a huge file is rejected without being read.
         if not first.startswith(_line(file.seek(0, 2), "")) or first != block(file):
             raise _changed(path, "Bring it back from a copy, or delete it and record it again")
     return True

@@ -25,8 +25,8 @@ from bidex_meta.utils.files import absolute, exists, expanded, is_file, read_jso
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Threads, parse
 
-_MARGIN = 1.05  # file systems take about 5 % in addition to the files
-_MINARI = "0.5.0"  # the version of Minari whose layout is written
+_MARGIN = 1.05  # file systems need about 5 % more space than the files
+_MINARI = "0.5.0"  # version of Minari whose layout is written
 _NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
 """Names that Minari accepts: words of letters, digits, - and _, separated by /, and a version such as -v0."""
 
@@ -153,7 +153,7 @@ def claimed(folder: Path, plan: Json) -> Iterator[None]:
             has_begun(folder, plan)
             yield
         finally:
-            with contextlib.suppress(OSError):  # not empty
+            with contextlib.suppress(OSError):  # the folder is not empty
                 for above in missing:
                     above.rmdir()
 
@@ -186,7 +186,7 @@ def has_begun(folder: Path, plan: Json) -> bool:
     """
     inner = folder / "data"
     path = inner / part_files.RECORDING
-    # If metadata and plan both exist, the process was killed between its last two steps: the index is written again.
+    # If metadata and plan both exist, the process was killed between its last two steps, so the index is written again.
     if is_file(inner / part_files.METADATA) and not is_file(path):
         raise BidexError(f"{folder} holds a complete data set. Name another by --out, or delete it.")
     if is_file(path):
@@ -195,10 +195,10 @@ def has_begun(folder: Path, plan: Json) -> bool:
         if differ:
             old, new = (shortened(stored.get(differ[0])) for stored in (before, plan))
             fault = f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}"
-            raise BidexError(f"{fault}. Give its own command to go on, or name another path by --out.")
+            raise BidexError(f"{fault}. Run its own command to continue, or name another path by --out.")
         return True
     if inner.is_dir():
-        remove_leftovers(inner)  # left by a collection that was killed as it began
+        remove_leftovers(inner)  # a killed collection may have left files
     if folder.exists() and any(folder.iterdir()) and not (inner.is_dir() and not any(inner.iterdir())):
         raise BidexError(f"{folder} exists and is not empty. Name another path by --out.")
     check_writable(path)
@@ -247,9 +247,10 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
         new = folder / "data"
         content = read_json(inner / part_files.METADATA, "a data set's metadata")
         if "bidex" not in content:
-            raise BidexError(f"{inner} holds no recording of a run. Train one that records: bidex-meta run --record N.")
+            raise BidexError(f"{inner} holds no recording of a run. Record during training: bidex-meta run --record N.")
         for path in [*part_files.parts_of(inner), inner / part_files.MAIN]:
-            (new / path.name).unlink(missing_ok=True)  # left by a command that was killed or found no room
+            # A command that was killed or ran out of space may have left the file.
+            (new / path.name).unlink(missing_ok=True)
             try:
                 os.link(path, new / path.name)
             except OSError:

@@ -19,7 +19,7 @@ from bidex_meta.engine.protocol import Engine
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
-# A full arena drops contacts or constraints in silence, which is as bad as a number out of bounds.
+# A full arena drops contacts or constraints without an error, which is as harmful as a number out of bounds.
 _TROUBLE = mujoco.mjtWarning.__members__
 _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")]
 
@@ -81,8 +81,8 @@ class CpuEngine(Engine):
         """Return the batch of simulations; raise BidexError if another process made the batch and has its threads."""
         if self._forked:
             raise BidexError(
-                "Expected a world in the process that made it, got one with engine threads in a forked child, where "
-                "they are not. Make it with threads=1, or in the child."
+                "Expected a world in the process that made it, got one in a forked child, which lacks the engine's "
+                "threads. Make it with threads=1, or in the child."
             )
         return self._batch
 
@@ -90,7 +90,8 @@ class CpuEngine(Engine):
         return (self._state[name].data_ptr() - self._numbers.data_ptr()) // self._numbers.element_size()
 
     def _bind(self, name: str) -> Tensor:
-        with warnings.catch_warnings():  # torch warns that outputs of the batch are read-only; nothing here writes them
+        # Torch warns that outputs of the batch are read-only; no code here writes to them.
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return torch.from_numpy(self._batch.bind(name))
 
@@ -100,12 +101,13 @@ class CpuEngine(Engine):
         try:
             self.batch.step(ids=ids, nstep=substeps, stage=self._after_step)
         except mujoco.batch.SimulationError as error:
-            # A broken row can have more contacts than its memory holds. It keeps its old state; other rows are stepped.
+            # A broken row can have more contacts than its memory holds. It keeps its old state, and the other rows are
+            # stepped.
             self._failed[torch.as_tensor(error.ids)] = True
 
     def _quarantine(self) -> None:
         """Put rows into a safe state if a number, written by hand or left by the last step, is out of bounds."""
-        # Few operations over all rows: a row whose norm is within the least bound is within all of them.
+        # This avoids most operations over all rows: a row whose norm is within the smallest bound is within all bounds.
         size = torch.linalg.vector_norm(self._numbers, dim=1)
         turns = self._numbers.index_select(1, self._quaternions).unflatten(1, (-1, 4))
         lengths = torch.linalg.vector_norm(turns, dim=2)
@@ -125,7 +127,7 @@ class CpuEngine(Engine):
             bad = counts.take(_BAD, axis=1).any(axis=1)
         else:
             bad = np.zeros(self.num, dtype=bool)
-        # One non-finite addend makes the sum non-finite.
+        # One non-finite addend makes the whole sum non-finite.
         return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
@@ -163,7 +165,8 @@ class CpuEngine(Engine):
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
-        # A batch has either models or fields per simulation: fields in which the models differ become per-row fields.
+        # A batch holds either several models or fields per simulation, so fields in which the models differ become
+        # per-row fields.
         self.batch.set_models(None)
         differing = set[str]().union(*(differing_fields(self._models[0], model) for model in self._models))
         wanted = set(names)
@@ -185,7 +188,7 @@ class CpuEngine(Engine):
 
     def contact_depth(self, row: int) -> float:
         model = self._models[self._model_of[row]]
-        # Copying the batch's model and data would take forty times as long.
+        # Copying the batch's model and data would take forty times longer.
         data = self._probe = self._probe or mujoco.MjData(model)
         data.qpos[:] = self.qpos[row].numpy()
         if self._mocap:

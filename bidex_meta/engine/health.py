@@ -12,7 +12,7 @@ from bidex_meta.errors import BidexError
 LARGEST = 1e6
 """Bound of positions (m, rad) and velocities (m/s, rad/s), far above the values of healthy rows (hands/README.md).
 Forces, accelerations, controls and time are bounded by MuJoCo's own 1e10."""
-# bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
+# Bounds of a quaternion's length. MuJoCo treats a shorter quaternion as no rotation.
 SHORTEST = 1e-3
 LONGEST = 1e3
 STATE = (
@@ -51,7 +51,7 @@ def dense(given: object, device: torch.device, dtype: torch.dtype | None = None)
     Returns None if the input is no array of real numbers.
     """
     try:
-        # C order, because torch does not accept arrays with negative strides.
+        # The copy is in C order, because torch does not accept arrays with negative strides.
         if isinstance(given, Tensor):
             tensor = given.detach()
         else:

@@ -13,7 +13,7 @@ import warp as wp
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, quaternion_columns
 
-# Arrays by world (first index), and for some by number of the world (second).
+# The first index of these arrays is the world; some have a second index for a number within the world.
 Flags = wp.array[bool]
 Times = wp.array[float]
 Numbers = wp.array2d[float]

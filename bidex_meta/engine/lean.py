@@ -65,21 +65,21 @@ def lean(m: mjw.Model) -> Lean:
     integration = "integration"
     refresh = "refresh"
     everywhere = (early, last, integration, refresh)
-    # Each entry: the parts, the counts set to zero, and whether that changes nothing.
+    # Each entry has the parts, the changes to their models, and the condition under which no result changes.
     table: list[tuple[tuple[str, ...], dict[str, Any], bool]] = [
-        # Lights only serve pictures.
+        # Lights are only needed for pictures.
         (everywhere, {"nlight": 0}, True),
         # Limits and equalities read the results of mjw.tendon by separate lists; all other kernels would add zeros.
         (everywhere, {"ntendon": 0, "nJten": 0}, implicit and _tendons_limit_only(m)),
-        # Without friction of joints and tendons there are no rows.
+        # Without friction in joints and tendons there are no friction rows.
         (everywhere, {"disable": mjw.DisableBit.FRICTIONLOSS}, not _any(m.dof_frictionloss, m.tendon_frictionloss)),
-        # mujoco_warp computes every body's share of every degree of freedom; few shares are not zero.
+        # mujoco_warp computes the share of every body in every degree of freedom, although few shares are non-zero.
         ((early, last), {"callback": replace(m.callback, passive=_carrier(m))}, implicit and _gravity_apart(m)),
         # Only the last substep's sensors are read, and the refresh recomputes the position and velocity sensors.
         ((early,), {"disable": mjw.DisableBit.SENSOR}, True),
         ((early,), {"nsite": 0}, not _sites_act(m)),
         ((last,), {"sensor_pos_adr": none, "sensor_vel_adr": none}, True),
-        # The derivative of the actuator forces by velocity is zero, and no activation changes.
+        # Actuator forces do not depend on velocity, and there are no activations, so these derivatives are zero.
         ((integration,), {"nactuator": 0}, not _actuators_damp(m)),
     ]
     parts: dict[str, mjw.Model] = dict.fromkeys(everywhere, m)

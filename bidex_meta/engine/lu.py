@@ -42,7 +42,7 @@ def _solve(
             factor = lu[world, updates[k, 0]] / pivot
             lu[world, updates[k, 2]] = lu[world, updates[k, 2]] - lu[world, updates[k, 1]] * factor
         _wait()
-        ancestors = diagonal[i]  # every ancestor's row has been updated; the factors stay
+        ancestors = diagonal[i]  # every ancestor's row has been updated, and the factors stay
         for a in range(lane, ancestors, lanes):
             k = updates[first_update[i] + a * ancestors, 0]
             lu[world, k] = lu[world, k] / pivot
@@ -84,7 +84,7 @@ class ImplicitSolver:
             ancestors = columns[rows[i] : rows[i] + diagonal[i]].tolist()
             updates += [(place[j, i], place[i, k], place[j, k]) for j, k in product(ancestors, repeat=2)]
             first.append(len(updates))
-        by_level = np.argsort(diagonal, kind="stable")  # an ancestor has fewer ancestors
+        by_level = np.argsort(diagonal, kind="stable")  # an ancestor has fewer ancestors than its descendants
         levels = np.searchsorted(diagonal[by_level], np.arange(diagonal.max() + 2))
         arrays = (rows, diagonal, columns, first, np.reshape(updates, (-1, 3)), levels, by_level)
         self._arrays = [wp.array(np.asarray(a, dtype=np.int32), dtype=int, device=m.D_colind.device) for a in arrays]

@@ -45,8 +45,8 @@ def _rounded(values: np.ndarray) -> bytes:
     return (np.where(np.abs(values) < 1e-12, 0.0, np.round(values / unit)) + 0.0).tobytes() + size.tobytes()
 
 
-# Numbers that mujoco_warp 4.0 keeps per world (arrays of its Model with a first dimension "*"); the C engine takes a
-# whole model per simulation and is freer, but both engines must group models in the same way.
+# mujoco_warp 4.0 keeps these numbers per world (arrays of its Model with a first dimension "*"). The C engine takes a
+# whole model per simulation and could vary more, but both engines must group models in the same way.
 _PER_WORLD_FIELDS = """
     qpos0 qpos_spring
     body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia body_invweight0 body_gravcomp
@@ -62,7 +62,7 @@ _PER_WORLD_FIELDS = """
     actuator_lengthrange
 """
 _PER_WORLD = frozenset(_PER_WORLD_FIELDS.split())
-# Names, pictures, and numbers that are derived from the fields above.
+# These fields are names, pictures, or numbers derived from the fields above.
 _FREE_PREFIXES = ("name", "light_", "cam_", "mat_", "tex_", "vis", "bvh_", "site_rgba")
 _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
@@ -87,7 +87,7 @@ def _arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _sizes(model: mujoco.MjModel) -> Mapping[str, object]:
-    # Lengths of text and of picture assets are no part of the dynamics.
+    # Lengths of texts and of picture assets do not affect the dynamics.
     free = ("nname", "ntex", "npath", "nmat", "nlight", "ncam", "nbuffer")
     sizes = {name: value for name, value in _members(model).items() if name.startswith("n") and isinstance(value, int)}
     counts = {name: value for name, value in sizes.items() if not name.startswith(free)}

@@ -27,11 +27,12 @@ from bidex_meta.engine.protocol import Engine
 from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
 
-# The arrays that a step changes and that later steps or readers see.
+# These arrays are changed by a step and used by later steps or by readers.
 _STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
-# Bits of a world whose contacts or constraints were dropped. An iteration limit is no fault: C stops there too.
+# These bits mark a world whose contacts or constraints were dropped. An iteration limit is not an error, because C
+# MuJoCo also stops there.
 _LOST = sum(int(mjw.OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD"))
-# Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would not update other sensors.
+# Kinematics, body velocities or the last substep give these sensors. ``_refresh`` would not update other sensors.
 _SENSOR_NAMES = (
     "JOINTPOS JOINTVEL JOINTACTFRC FRAMEPOS FRAMEQUAT FRAMEXAXIS FRAMEYAXIS FRAMEZAXIS FRAMELINVEL FRAMEANGVEL "
     "FORCE TORQUE TOUCH"
@@ -61,13 +62,13 @@ class WarpEngine(Engine):
         ``deterministic`` orders contacts, constraints and sums, so that simulations on a GPU repeat bit for bit.
         """
         self._deterministic = deterministic
-        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # prints no banner and no line per kernel
         self.num = len(rows)
         self.device = torch.device(device)
         self._models = list(models)
         self._rows = list(rows)
         self._device = wp.get_device(str(self.device))
-        # torch makes the stream: CUDA's legacy stream, torch's default, waits for streams that Warp makes.
+        # torch must create the stream: torch's default, CUDA's legacy stream, waits for streams that Warp creates.
         priority = -1 if _is_slow(models[0]) else 0
         if self._device.is_cuda:
             self._lent = torch.cuda.Stream(self.device, priority=priority)
@@ -84,7 +85,7 @@ class WarpEngine(Engine):
             self._substeps = 1
             self._scratch = Scratch(self._device)
             with self._from_scratch():
-                self._advance()  # compiles all kernels and allocates memory, which a capture must not do
+                self._advance()  # compiles all kernels and allocates memory, which a capture cannot do
                 self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
@@ -99,9 +100,9 @@ class WarpEngine(Engine):
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
         if self._deterministic:
             self._m.opt.deterministic = mjw.DeterminismType.ALL
-        self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
-        # The normals of an egg's contacts differed from C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with
-        # this one; with 1e-10 some contacts were lost.
+        self._m.opt.warn_overflow = 0  # unstable() reports overflows; printing from kernels is slow
+        # With C MuJoCo's 1e-6, the normals of an egg's contacts differed from C by 5e-3 rad (99th percentile); with
+        # this value by 1.5e-3 rad. With 1e-10 some contacts were lost.
         self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
         self._lean = lean(self._m)
@@ -306,8 +307,9 @@ def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy of a model with the options that give the same physics in mujoco_warp."""
     model = copy.copy(model)
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    # C has a separate routine for two boxes with up to eight contacts. So has mujoco_warp with this flag (which
-    # has no other effect there); without it, boxes go through the convex collider, which gives four.
+    # C MuJoCo has a separate routine for two boxes with up to eight contacts. mujoco_warp uses such a routine only with
+    # this flag, which has no other effect there; otherwise boxes go through the convex collider, which gives four
+    # contacts.
     model.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
     model.opt.disableflags &= ~int(
         mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -63,16 +63,17 @@ def _outcome(recorded: ClassSummary, again: ClassSummary, wider: float) -> str:
         count = again.tasks
     else:
         count = again.episodes or 1
-    # An interval of a success rate follows from the rate. The limit is half as wide again.
+    # The interval of a success rate follows from the rate. The limit is 1.5 times as wide.
     deviation = math.sqrt(max(recorded.success * (1 - recorded.success), 0.0) / count)
     half = min(_half(recorded.success_interval), 1.5 * 1.96 * deviation)
     gap = abs(recorded.success - again.success)
     if gap > _rounding(recorded.success) + wider * math.hypot(_half(again.success_interval), half):
         return DIFFERS
-    from scipy.stats import f  # not at the top, because it takes half a second
+    from scipy.stats import f  # not at the top of the module, because the import takes half a second
 
-    # Recorded returns have the spread of the returns played now. In one of a thousand pairs of samples the recorded
-    # interval is wider by more than the root of F's quantile. The limit is twice as wide because of heavy tails.
+    # We assume that recorded returns have the same spread as the returns played now. The recorded interval is wider by
+    # more than the root of F's quantile in one of a thousand pairs of samples. The limit is twice as wide because
+    # returns have heavy tails.
     own = _half(again.return_interval)
     widest = own and 2 * own * math.sqrt(f.ppf(0.999, count - 1, count - 1))
     half = min(_half(recorded.return_interval), widest)

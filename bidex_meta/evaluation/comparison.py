@@ -23,17 +23,17 @@ from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
 _SETTINGS += ("base", "points", "touch", "object", "tasks_per_class")
-_MADE = "made with"  # entry of a kind: versions that differ from other runs on the same worlds
-_POINTS = 200  # of a curve over several runs
+_MADE = "made with"  # entry for versions that differ from those of other runs on the same worlds
+_POINTS = 200  # number of points of a curve over several runs
 
 
 @dataclass(frozen=True)
 class Group:
     """Runs that differ only in the seed; single-task runs of several classes are one group."""
 
-    label: str  # the algo, and settings that differ from other groups of that algo
+    label: str  # the algo, and the settings that differ from other groups with the same algo
     seeds: list[int]  # in rising order; rows of the arrays below
-    classes: list[str]  # columns of the arrays below
+    classes: list[str]  # class names, columns of the arrays below
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
     scores: np.ndarray | None  # normalised score, (seeds, classes); None if a class has no reference
@@ -133,7 +133,7 @@ def _check_copies(runs: Sequence[Run]) -> None:
     for run in runs:
         times = tuple(row["time"] for row in run.metrics() if row.get("time") is not None)
         if len({*times}) > 1 and known.setdefault(times, run.path) != run.path:
-            raise BidexError(f"{run.path} is a copy of {known[times]}: one run is not two seeds. Name it once.")
+            raise BidexError(f"{run.path} is a copy of {known[times]}: a run counts as one seed. Name it once.")
 
 
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
@@ -201,8 +201,8 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         evaluated = run.evaluation().steps
         if evaluated is not None and evaluated < goal:
             raise BidexError(
-                f"The evaluation of {run.path} is of {evaluated:,} steps, but the run goes on to {goal:,}. Let it end, "
-                f"or write it again: {run.again}"
+                f"The evaluation of {run.path} is of {evaluated:,} steps, but the run continues to {goal:,}. Let it "
+                f"end, or write it again: {run.again}"
             )
         if twice := by_seed[seed].keys() & own.keys():
             raise BidexError(f"{run.path} is the second run of {label} with seed {seed} on {min(twice)}.")
@@ -215,7 +215,7 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         if set(by_seed[seed]) != set(classes):
             raise BidexError(
                 f"Expected the same classes from every seed of {label}, but seed {seeds[0]} has {', '.join(classes)} "
-                f"and seed {seed} {', '.join(by_seed[seed])}. Leave out what is not complete."
+                f"and seed {seed} {', '.join(by_seed[seed])}. Leave incomplete seeds out."
             )
 
     def table(measure: str) -> np.ndarray:
@@ -245,14 +245,14 @@ def read_histories(runs: Sequence[Run]) -> list[History]:
     groups = _by_kind([run_kind(run.config()) for run in runs], runs)
     histories = [History(label, members, curves_of(members)) for label, members in groups]
     if not any(history.curves for history in histories):
-        raise BidexError(f"{runs[0].path} holds nothing yet: nothing to draw. Let the run go on.")
+        raise BidexError(f"{runs[0].path} has no metrics to draw yet. Let the run continue.")
     return histories
 
 
 def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
     """Return the curve over runs (:func:`over_runs`) of each tag that at least one run has logged."""
     logged = [run.metrics() for run in runs]
-    tags: dict[str, None] = {}  # in the order in which they were logged first
+    tags: dict[str, None] = {}  # tags in the order in which they were first logged
     for rows in logged:
         for row in rows:
             tags |= dict.fromkeys(row)
@@ -278,7 +278,7 @@ def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
     if len(known) == 1:
         return Curve(*known[0], None, None)
     last = min(steps[-1] for steps, _ in known)
-    first = min(last, max(steps[0] for steps, _ in known))  # they may have no step in common
+    first = min(last, max(steps[0] for steps, _ in known))  # the runs may have no step in common
     grid = np.unique(np.linspace(first, last, _POINTS))
     table = np.array([np.interp(grid, steps, values) for steps, values in known])
     low, high = bootstrap_band(table)

@@ -16,8 +16,8 @@ from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
 from bidex_meta.utils.validation import Count, Few, NonNegative, Seed, Whole
 
 FORMAT = 3
-SHOTS = 2  # of a meta-test: a trial has three episodes
-TASKS = 20  # of a class in a meta-test, the first of its pool
+SHOTS = 2  # shots of a meta-test, so a trial has three episodes
+TASKS = 20  # tasks per class in a meta-test, the first of its pool
 MULTI_TASK = "multi-task"
 TRANSFER = "transfer"
 TRANSFER_STEPS = 1_000_000  # of training on each held-out class
@@ -349,7 +349,9 @@ def _suite(name: str) -> Suite | None:
     if name in METAWORLD_SUITES:
         return None
     if name not in suite_names():
-        raise BidexError(f"expected a shipped suite, got {name}: nobody else can play it. Submit a run on another.")
+        raise BidexError(
+            f"expected a shipped suite, got {name}: other people cannot play it. Submit a run on a shipped suite."
+        )
     return load_suite(name)
 
 

@@ -109,7 +109,7 @@ def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, l
 def with_clouds(world: PooledWorld) -> PooledWorld:
     """Return a world of hands whose pictures also show point clouds; raise BidexError for another world."""
     if not isinstance(world, World):
-        raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
+        raise BidexError("Only bidex-meta's own scenes have point clouds, not Meta-World's. Leave --points out.")
     count = (world.points or PointsRule()).count
     return CloudView(world, count)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
 
@@ -126,7 +126,7 @@ class CloudView(PooledWorldWrapper):
         self._count = count
         self._clouds: dict[int, Cloud] = {}
         for part in world.parts:
-            part.group.engine.body_poses()  # from now on the engine gives them
+            part.group.engine.body_poses()  # from this call on, the engine computes the poses
 
     def render(self, env_id: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """Return three pictures side by side, (height, 3 width, 3), uint8; arguments are those of ``World.render``."""

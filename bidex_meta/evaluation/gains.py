@@ -35,7 +35,7 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
     for measure, values_of in MEASURES.items():
         means: list[float] = []
         resampled: list[np.ndarray] = []
-        # One generator serves all classes: the same draws in each class would correlate their errors.
+        # One generator serves all classes, because equal draws in each class would correlate their errors.
         generator = generator_of_resamples()
         for name, result in after.classes.items():
             new = values_of(result)

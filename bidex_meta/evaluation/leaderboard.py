@@ -59,7 +59,7 @@ def read_entry(path: Path) -> AnyEntry:
     _check(entry, str(path))
     name = entry_name(entry.suite, entry.name)
     if portable(content) != content:
-        raise BidexError(f"{path}: expected no path of a machine. Submit it again.")
+        raise BidexError(f"{path}: expected no path on a machine. Submit it again.")
     if path.name != name:
         raise BidexError(f"{path}: expected a file named {name}. Submit it again.")
     if entry.receipt.evaluation != _digest_of(entry):
@@ -71,7 +71,7 @@ def _check(entry: AnyEntry, where: str) -> None:
     """Raise BidexError, which begins with ``where``, for the first contradiction in an entry."""
     try:
         fault = next(entry.faults(), None)
-    except BidexError as error:  # of a suite that is not here, or not so
+    except BidexError as error:  # the suite of the entry may be unknown here, or may have changed
         raise BidexError(f"{where}: {error}") from None
     if fault is not None:
         raise BidexError(f"{where}: {fault}. Submit it again.")
@@ -104,7 +104,7 @@ def agent_part(evaluation: MetaTestEvaluation, where: str) -> tuple[int, Part]:
     """
     again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
     if evaluation.agent is None or evaluation.suite is None:
-        raise BidexError(f"{where}: expected a meta-test of an agent that is no run, got no agent or suite. {again}")
+        raise BidexError(f"{where}: expected a meta-test of an agent that is not a run, got no agent or suite. {again}")
     if evaluation.randomisation is not None:
         raise BidexError(f"{where}: expected {evaluation.suite} without randomisation, got another. {again}")
     test = evaluation.splits.get("test")

@@ -190,7 +190,7 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
         remaining = remaining - playing.long()
         first = False
     note("Adapting")
-    with torch.enable_grad():  # adaptation needs gradients, whatever the mode of the caller
+    with torch.enable_grad():  # adaptation needs gradients, even if the caller switched them off
         agent.adapt()
     return steps
 
@@ -208,7 +208,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)
         valid = running & ~info["unstable"]
-        # The world goes on with environments that were cut here; they are ignored until their next reset.
+        # The world continues with environments whose episodes were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
         agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
         steps += valid.sum()

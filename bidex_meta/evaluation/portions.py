@@ -32,7 +32,7 @@ class Portions:
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
         self._pool_sizes = list(world.num_slot_tasks)
-        # The task of each adaptation, for each slot.
+        # This is the task of each adaptation, for each slot.
         self._adaptations = [np.tile(np.arange(min(tasks or size, size)), trials) for size in self._pool_sizes]
         rows = [part.stop - part.start for part in world.slot_env_ids]
         fit = [max(1, number // (rollouts or 1)) for number in rows]
@@ -55,7 +55,7 @@ class Portions:
                     f"{list(world.num_slot_tasks)}. Give it as many by set_tasks."
                 )
         if self.count == 1 and [len(adaptations) for adaptations in self._adaptations] == self._pool_sizes:
-            yield iter(range(1))  # the world's own pools
+            yield iter(range(1))  # the world keeps its own pools
             return
         pooled = [world for world in worlds if isinstance(world, PooledWorld)]
         for world in worlds:

@@ -26,7 +26,7 @@ class ClassResult:
     unstable: int  # episodes that ended because the physics broke
     reference: Reference | None = None  # for the normalised score and broken episodes, if known
     once: float | None = None  # share of episodes solved at any step
-    at_end: float | None = None  # share solved in their last steps (``suite.HELD_STEPS``)
+    at_end: float | None = None  # share of episodes solved in their last steps (``suite.HELD_STEPS``)
 
     @property
     def episodes(self) -> int:
@@ -95,7 +95,7 @@ class Evaluation:
     """The results of ``evaluate``."""
 
     classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
-    episodes_per_task: int  # episodes of every task
+    episodes_per_task: int  # number of episodes of every task
 
     @property
     def success(self) -> float:

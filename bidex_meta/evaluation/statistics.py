@@ -69,7 +69,8 @@ def percentile_interval(resampled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _quantile(ordered: np.ndarray, share: float) -> np.ndarray:
-    # This is the arithmetic of scipy.stats.quantile, which stored intervals are from; np.quantile rounds otherwise.
+    # This is the arithmetic of scipy.stats.quantile, which computed the stored intervals; np.quantile rounds
+    # differently.
     position = share * len(ordered) + (1.0 - share)
     weight = position % 1
     below = int(position) - 1

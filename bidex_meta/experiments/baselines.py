@@ -46,7 +46,7 @@ def baseline(
         check_writable(out)
     worlds = open_worlds(WorldsConfig(suite=suite, seed=seed, threads=threads))
     if not worlds.moving_bases:
-        raise BidexError(f'References are of moving bases, but {suite} has fixed ones. Write base = "moving".')
+        raise BidexError(f'References are for moving bases, but {suite} has fixed ones. Write base = "moving".')
     if policy == "script":
         found = _scripted(worlds, episodes)
     else:

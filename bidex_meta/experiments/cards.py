@@ -64,7 +64,7 @@ def _made(versions: Versions) -> Json:
 
 
 def _card(header: Json, title: str, use: str, facts: Json) -> str:
-    # Every line of JSON is one of YAML.
+    # Every line of JSON is also a line of YAML.
     lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in header.items()]
     table = "\n".join(f"| {key} | {_cell(value)} |" for key, value in facts.items())
     return "\n".join(

@@ -46,7 +46,7 @@ def algo_rows() -> list[Json]:
     return rows
 
 
-# Classes are read from their source: their modules load torch and mujoco.
+# Classes are read from their source code, because their modules load torch and mujoco.
 
 
 @cache
@@ -124,7 +124,7 @@ def object_rows() -> list[Json]:
     """Return a row per object that the throwing classes throw: mass (g), box (mm), number of geoms."""
     from bidex_meta.tasks.objects.held import held_object, shelf
 
-    # The egg's figures: docs/figures.md, objects.
+    # docs/figures.md lists the sources of the egg's figures.
     rows: list[Json] = [{"name": "egg", "mass_g": 75.4, "box_mm": "60 x 60 x 80", "geoms": 1}]
     for name in shelf():
         if found := held_object(name):

@@ -44,7 +44,7 @@ def say_differences(folder: RunFolder) -> None:
     try:
         found = differences_of(folder)
     except BidexError:
-        return  # its suite is not here: the weights alone may be enough, and who needs the suite says so
+        return  # the run's suite is missing here; the weights may suffice, and code that needs the suite reports it
     if found:
         say(f"{folder.path} was made with {_texts(found)}.")
 

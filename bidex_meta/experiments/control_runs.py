@@ -115,6 +115,6 @@ def _check(folders: Sequence[RunFolder]) -> None:
             raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
         if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
             raise BidexError(
-                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
+                f"Expected runs that differ only in the seed, but {folders[0].path} and {folder.path} differ in "
                 f"{', '.join(differing)}. Name them in separate calls."
             )

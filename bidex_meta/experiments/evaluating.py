@@ -144,8 +144,8 @@ class FinalEvaluation:
     """Episodes of each task in the final evaluation. None: 4, or 1 if a task has a fixed start (metaworld/...); for
     learners that adapt, the number of --rollouts."""
     other_tasks: Switch = False
-    """Also evaluate on an equal number of tasks that the run was not trained on. Learners that adapt use --split
-    others."""
+    """In the final evaluation, also play an equal number of tasks that the run was not trained on. For learners that
+    adapt, use --split others instead."""
     split: Literal["auto", "train", "test", "others", "both"] = "auto"
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks (on
     ML20, tasks of fifteen train classes and of five unseen classes). others: tasks of the train classes that the run
@@ -227,7 +227,7 @@ def evaluate(
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
     if Capability.ADAPTS in learner_kind(config.algo, config.task).make.capabilities:
-        raise BidexError(f"{config.algo} adapts to tasks: its policy alone says little. Use meta_test(run).")
+        raise BidexError(f"{config.algo} adapts to tasks, so its unadapted policy says little. Use meta_test(run).")
     state, steps = load_checkpoint(folder, checkpoint)
     policy = policy_of(folder, state, config.device)
     size = Options(episodes=episodes, num_envs=num_envs, seed=seed)
@@ -298,7 +298,7 @@ def meta_test(
     if isinstance(agent, RunFolder | str | Path):
         for name, value in (("suite", suite), ("task_seed", task_seed)):
             if value is not None:
-                raise BidexError(f"meta_test: {name}: a run brings its own, got {value}. Leave {name} out.")
+                raise BidexError(f"meta_test: {name}: a run has its own, got {value}. Leave {name} out.")
         folder = _opened(agent)
         config, worlds = _set_up(folder, device, engine, randomisation)
         if Capability.ADAPTS not in learner_kind(config.algo, config.task).make.capabilities:

@@ -85,14 +85,14 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     as_played = network.eval_action(obs).numpy()
     low_precision = getattr(network, "low_precision", False)
     network.low_precision = False
-    # mkldnn would choose a matrix product by the size of a batch, which the export leaves open.
+    # mkldnn would choose a matrix product by the batch size, which the export leaves open.
     with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
         try:
             content = _onnx(network, _observations(2, shape), metadata)
-        except Exception as error:  # the exporter raises many kinds
+        except Exception as error:  # the exporter raises many kinds of errors
             raise BidexError(
                 f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
-                "look at numbers; --debug shows where."
+                "branch on values of tensors; --debug shows the line."
             ) from error
         wanted = network.eval_action(obs).numpy()
     network.low_precision = low_precision
@@ -100,7 +100,9 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     actions = session.run(None, {"observations": obs.numpy()})[0]
     gap = float(abs(actions - wanted).max())
     if not gap <= TOLERANCE:
-        raise BidexError(f"The exported actions differ by {gap:.2g} from torch's, more than {TOLERANCE:g}: none kept.")
+        raise BidexError(
+            f"The exported actions differ from torch's by {gap:.2g}, more than {TOLERANCE:g}. Export fails."
+        )
     return content, gap, float(abs(actions - as_played).max())
 
 
@@ -111,7 +113,7 @@ def _onnx(policy: Any, obs: torch.Tensor, metadata: dict[str, str]) -> bytes:
             self.policy = policy
 
         def forward(self, observations: torch.Tensor) -> torch.Tensor:
-            # Some products of zero rows crash onnxruntime's process by SIGFPE, so one row is always added.
+            # Some products with zero rows crash onnxruntime's process with SIGFPE, so one row is always added.
             padded = torch.cat([observations, observations.new_zeros(1, observations.shape[1])])
             return self.policy.eval_action(padded)[:-1]
 
@@ -125,7 +127,7 @@ def _onnx(policy: Any, obs: torch.Tensor, metadata: dict[str, str]) -> bytes:
         raise TypeError("torch.onnx.export returned no program")
     program.model.metadata_props.update(metadata)
     for node in program.model.graph.all_nodes():
-        node.metadata_props.clear()  # the metadata quote lines of code, with paths of this machine
+        node.metadata_props.clear()  # the metadata quote lines of code with paths of this machine
     return program.model_proto.SerializeToString()
 
 

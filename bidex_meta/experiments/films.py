@@ -66,7 +66,7 @@ class Film:
         every = self.every or (2 if self.tiled else 1)
         frames = counted(self._frames(agent, world, rows, steps, every), self._count(steps, every), "frames")
         if self.is_picture:
-            for frame in frames:  # a tiled picture comes after the first frame
+            for frame in frames:  # a tiled picture needs a frame after the first one
                 video.write_image(self.out, frame)
         else:
             video.write_film(self.out, frames, CONTROL_RATE / every)

@@ -107,7 +107,7 @@ def new_folder(path: Path) -> Iterator[Path]:
             temporary.rename(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        with contextlib.suppress(OSError):  # not empty
+        with contextlib.suppress(OSError):  # the folder is not empty
             for above in missing:
                 above.rmdir()
 
@@ -135,7 +135,7 @@ def library() -> Any:
         raise BidexError(
             f"The hub needs huggingface_hub: pip install 'bidex-meta[hub]'. {FOLDER}PATH does not."
         ) from None
-    # It reports each of its tries.
+    # The library reports each attempt.
     logging.getLogger("huggingface_hub").setLevel(logging.CRITICAL)
     return huggingface_hub
 
@@ -150,8 +150,8 @@ def called(function: str, name: str, **options: Any) -> Any:
         return getattr(library(), function)(name.removeprefix(DATASETS), repo_type=kind, **options)
     except BidexError:
         raise
-    except Exception as error:  # the library's own, and of what it sends by: none of them has a base of its own
+    except Exception as error:  # errors of the library and of its transports have no common base class
         raise BidexError(
-            f"{name}: {type(error).__name__}, {one_line(error)[:200]} Mend the name or the network, log in by "
+            f"{name}: {type(error).__name__}, {one_line(error)[:200]} Fix the name or the network, log in by "
             f"`hf auth login`, or use {FOLDER}PATH."
         ) from error

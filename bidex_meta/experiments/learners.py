@@ -29,16 +29,16 @@ ALGOS: dict[str, str] = {
     "happo": "bidex_algos.multiagent.happo:HAPPO",
     "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
     "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
-    # For a single task.
+    # These learners train on a single task.
     "ppo": "bidex_algos.onpolicy.single_task:PPO",
     "trpo": "bidex_algos.onpolicy.mttrpo:TRPO",
     "sac": "bidex_algos.offpolicy.mtsac:SAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
     "td3": "bidex_algos.offpolicy.td3:TD3",
-    # From teachers (`--teacher`), of one class or of many.
+    # These learners imitate teachers (`--teacher`), on one class or several.
     "dagger": "bidex_algos.imitation.dagger:DAgger",
     "icl": "bidex_algos.meta.icl:ICL",
-    # These learn from data sets (`--dataset`), of one class or of many.
+    # These learners train on data sets (`--dataset`), on one class or several.
     "bc": "bidex_algos.offline.bc:BC",
     "bcq": "bidex_algos.offline.bcq:BCQ",
     "td3bc": "bidex_algos.offline.td3bc:TD3BC",
@@ -58,7 +58,7 @@ class LearnerKind:
 
     name: str  # in ALGOS, or package.module:Class
     make: type[Learner]
-    presets: Mapping[str, Any]  # configs by name, all of one dataclass
+    presets: Mapping[str, Any]  # configs by name, all of the same dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
         """Return the autoreset mode of the learner's training world; ``config`` has fields of the learner's config."""
@@ -155,7 +155,7 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
     known_device(asked)
     here = launch()
     if here.count > 1 and asked.startswith("cuda:"):
-        raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")
+        raise BidexError(f"Expected device auto, cpu or cuda, because each process takes its own GPU; got {asked}.")
     if here.count > 1 and asked == "cuda" and here.local_count > torch.cuda.device_count():
         raise BidexError(
             f"Expected a GPU for each of the {here.local_count} processes on this machine, found "
@@ -163,7 +163,7 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
         )
     try:
         torch.zeros(1, device=here.own_device(asked))
-    except Exception as error:  # torch raises RuntimeError, AssertionError or its own kinds
+    except Exception as error:  # torch raises RuntimeError, AssertionError or its own errors
         reason = str(error).splitlines()[0]
         raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu, cuda or cuda:N.") from None
     return asked

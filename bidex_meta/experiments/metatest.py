@@ -20,7 +20,7 @@ TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a
 # default episodes of a task in a shot, if the config sets no number; the largest number taken from a config
 _ROLLOUTS = 10
 _MOST_ROLLOUTS = 40
-_ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
+_ENVIRONMENTS = 1024  # default maximum of environments stepped together; the world needs half a GB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +38,13 @@ class Options:
     five adaptations per class. Several are needed because the episodes after one adaptation show nothing about other
     adaptations."""
     num_envs: Environments | None = None
-    """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
-    class). For learners that adapt, the maximum number, which bounds memory but does not alter the protocol; None:
+    """Environments stepped together, a multiple of the number of tasks. None: one per task (metaworld/...: 5 per
+    class). For learners that adapt: the maximum number, which bounds memory and does not change the protocol; None:
     1024."""
-    seed: Seed = EVALUATION_SEED  # Seed of the episodes' starts; training does not use the default.
-    hidden_rewards: Switch = False  # Learners that adapt also play the evaluation episodes with their rewards hidden.
+    seed: Seed = EVALUATION_SEED
+    """Seed of the start states of the evaluation episodes. Training never uses the default seed."""
+    hidden_rewards: Switch = False
+    """For learners that adapt: also play the evaluation episodes with their rewards hidden."""
 
     def refuse_adaptation(self, algo: str) -> None:
         """Raise BidexError if an option is given that only concerns adaptation."""
@@ -124,7 +126,7 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
     tasks = min(options.tasks or TASKS, max(counts))
     protocol = Protocol(
         split, options.seed, tasks, rollouts=rollouts,
-        episodes_per_task=options.episodes or rollouts,  # which the same environments play at once
+        episodes_per_task=options.episodes or rollouts,  # the same environments play these episodes at once
         trials=options.trials or -(-TASKS // tasks), hidden_rewards=options.hidden_rewards,
         max_adapt_steps=adaptation.max_adapt_steps
     )  # fmt: skip
@@ -152,7 +154,7 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:
-        # A divisor, so that every environment plays in every round.
+        # The number is a divisor, so that every environment plays in every round.
         return classes * max(number for number in range(1, of_class + 1) if rollouts % number == 0)
     portions = -(-adaptations // (of_class // rollouts))
     return classes * -(-adaptations // portions) * rollouts

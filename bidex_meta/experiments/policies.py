@@ -49,7 +49,9 @@ def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
         return folder.checkpoints.load_one(own if is_file(own) else Path(which))
     loaded = folder.checkpoints.load()
     if loaded is None:
-        raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
+        raise BidexError(
+            f"{folder.path} has no checkpoint yet. Continue its training: bidex-meta run --resume {folder.path}"
+        )
     return loaded
 
 
@@ -104,7 +106,7 @@ def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[
 
 def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
     """Say in one line how the rules under which a run trained differ from the rules of some worlds, if they differ."""
-    with contextlib.suppress(BidexError):  # the suite's file of the run may be gone
+    with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
         learned = open_worlds(folder.config().to_json())
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
             say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")

@@ -48,9 +48,9 @@ RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, 
 """Kinds of data sets, and the number of runs that each kind takes."""
 SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
 _USUAL_SIZE = 1_000_000
-_DEMONSTRATORS = {"witness": 32, "tasks": 200}  # environments of demonstrations by default, by ``starts``
-_MOST_HELD = 1_200_000_000  # most bytes of running episodes, without the world
-_PATIENCE = 3  # rounds of demonstrations that may all fail
+_DEMONSTRATORS = {"witness": 32, "tasks": 200}  # default number of environments for demonstrations, by ``starts``
+_MOST_HELD = 1_200_000_000  # maximum number of bytes of running episodes, without the world
+_PATIENCE = 3  # maximum number of rounds without a successful demonstration
 _OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "touch": False, "seed": None}
 """Entries of a run's config that decide which tasks are played."""
 
@@ -76,7 +76,8 @@ class RecordConfig:
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, if the policy has one; mean: the policy's mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Standard deviation of Gaussian noise on the actions of a witness, or of a policy without a distribution."""
+    """Standard deviation of the Gaussian noise added to the actions of a witness, or of a policy without a
+    distribution."""
     starts: Literal["witness", "tasks"] = "witness"
     """demonstrations: with witness, replay the witness in its own task, from its own start with shifted objects. With
     tasks, replay it in all tasks of the class, from their starts: it succeeds less often, but the data are more
@@ -136,7 +137,9 @@ def say_estimate(config: RecordConfig) -> None:
     """Log the maximum disk space and memory that a recording takes, without recording anything."""
     kind = _checked(config)
     if kind == "replay":
-        raise BidexError("The transitions of a replay are stored already. Leave --estimate out.")
+        raise BidexError(
+            "The transitions of a replay are already stored, so there is nothing to estimate. Leave --estimate out."
+        )
     collection = _collection(config, kind)
     world = collection.world()
     _announce(collection, world, writer.dataset_path(config.out, collection.source.name, collection.name)[1])
@@ -228,7 +231,8 @@ def _episodes(settings: RecordConfig, kind: str) -> _Collection:
         )
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
-    rows = settings.num_envs or tasks * math.ceil(200 / tasks)  # one per task; several if there are few tasks
+    # One environment per task, or several if there are few tasks.
+    rows = settings.num_envs or tasks * math.ceil(200 / tasks)
     size = settings.size or SIZE.get(kind, _USUAL_SIZE)
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": settings.noise, "policies": policies}
     plan |= config | {"starts": settings.seed}
@@ -239,7 +243,7 @@ def _episodes(settings: RecordConfig, kind: str) -> _Collection:
             say(f"Going on after {before:,} transitions in {out.parts} parts.")
         collect(world, actors, out, size, settings.seed, partial(_report, size, before))
 
-    # Episodes that may end early are shorter: falls end at about a third of the time limit (measured).
+    # Episodes that may end early are shorter: we measured falls at about one third of the time limit.
     return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
 
 
@@ -265,7 +269,7 @@ def _source_config(settings: RecordConfig) -> Json:
         for run in settings.runs:
             stored = RunFolder.open(run).config()
             configs.append({name: value for name, value in stored.to_json().items() if name in _OF_RUN})
-            if stored.task_seed is not None:  # an offline learner plays the tasks of its data
+            if stored.task_seed is not None:  # an offline learner plays the tasks of its data set
                 configs[-1]["seed"] = stored.task_seed
         config = configs[0]
         last = configs[-1]
@@ -291,7 +295,7 @@ def _actor(settings: RecordConfig, path: Path, device: str) -> tuple[Actor, Json
     folder = RunFolder.open(path)
     algo = folder.config().algo
     if Capability.ADAPTS in learner_kind(algo).make.capabilities:
-        raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
+        raise BidexError(f"{algo} adapts to tasks: it has no single policy to record. Name a run of another learner.")
     policy, steps = load_policy(folder, device, settings.checkpoint)
     sampled = settings.actions == "sampled" and isinstance(policy, SamplingAgent)
     about = {"algo": algo, "run": folder.path.resolve().name, "steps": steps, "checkpoint": settings.checkpoint}
@@ -306,14 +310,14 @@ def _demonstrations(settings: RecordConfig) -> _Collection:
     """
     if settings.base == "fixed" or settings.engine == "warp" or settings.device not in ("auto", "cpu"):
         raise BidexError(
-            "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
+            "Witnesses are for moving bases and C MuJoCo on the CPU. Leave --base, --engine, --device out."
         )
     source = open_worlds({"task": settings.task, "base": "moving", "seed": 0, "threads": settings.threads})
     name = source.name
     size = settings.size or SIZE["demonstrations"]
     rows = settings.num_envs or _DEMONSTRATORS[settings.starts]
     if name not in source.task_classes() or ":" in name:
-        raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
+        raise BidexError(f"{name} is not a class with a witness (bidex-meta witness --all).")
     if settings.script:
         witness = {}
     else:
@@ -365,7 +369,9 @@ def _publish_replay(settings: RecordConfig) -> tuple[Path, str]:
     folder = RunFolder.open(run)
     config = folder.config()
     if not config.record:
-        raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
+        raise BidexError(
+            f"{run} has no recording of its training. Record during training: bidex-meta run --record 1e6 ..."
+        )
     dataset = open_dataset(folder.path / "replay")
     out, name = writer.dataset_path(settings.out, open_worlds(config.to_json()).name, "replay")
     writer.adopt(dataset.folder, out, name)

@@ -24,7 +24,7 @@ from bidex_meta.runs.stored import Run
 from bidex_meta.runs.video import FILMS
 from bidex_meta.utils.files import is_file, portable
 
-FILM_BYTES = 40_000_000  # most bytes of all films of a page; the page only names further films
+FILM_BYTES = 40_000_000  # maximum number of bytes of all films of a page; further films are only named
 _SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
 
 
@@ -156,7 +156,7 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
     for run in runs:
         newest: dict[str, Path] = {}
         named = (path for path in run.videos_path.glob("*") if path.suffix.lower() in FILMS)
-        films = filter(is_file, named)  # a pipe of that name would never end
+        films = filter(is_file, named)  # reading a pipe with such a name would never end
         for path in sorted(films, key=lambda path: path.stat().st_mtime):
             kind, _, step = path.stem.rpartition("_")
             newest[kind if step.isdigit() and kind else path.stem] = path

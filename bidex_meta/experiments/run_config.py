@@ -18,7 +18,8 @@ from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
 from bidex_meta.worlds import open_worlds
 
-_WIDTH = 1200  # numbers that a step of one environment holds at most: two observations, actions, what is computed
+# Maximum count of numbers that one step of an environment holds: two observations, actions and computed values.
+_WIDTH = 1200
 
 
 def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
@@ -42,7 +43,7 @@ def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
     if kind.make.environments_per_class and device == "cpu":
         num_envs = kind.make.environments_per_class * len(source.tasks("train"))
     if Capability.OFFLINE in kind.make.capabilities:
-        num_envs = max(1, len(source.tasks("train")))  # it takes sizes and names from its world
+        num_envs = max(1, len(source.tasks("train")))  # the learner takes sizes and names from its world
         steps = run_data.UPDATES
     given: dict[str, Any] = {}
     if config.suite is not None:
@@ -81,9 +82,11 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
     kind = learner_kind(config.algo, config.task)
     worlds = open_worlds(config.to_json())
     if config.stop_at_score is not None and config.evaluate_every is None:
-        raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
+        raise BidexError(
+            "--stop-at-score is measured in evaluations during training. Add for example --evaluate-every 50."
+        )
     if config.record:
-        part_files.hdf5()  # refuses it where it is not installed
+        part_files.hdf5()  # raises BidexError if h5py is not installed
     run_data.check_offline(kind, config.record, run_data.open_datasets(config.dataset), worlds)
     run_data.check_demonstrations(kind, config.demonstrations, worlds)
     run_teachers.check_teachers(kind, config, worlds)
@@ -157,5 +160,5 @@ def _learner_config(preset: Any, config: AnyConfig, where: str) -> Any:
         return replace(preset, **values)
     except BidexError as error:
         raise BidexError(f"{where}: {error}") from None
-    except (TypeError, ValueError) as error:  # of a learner from elsewhere
+    except (TypeError, ValueError) as error:  # a learner of another package may raise these
         raise BidexError(f"{where}: learner: {one_line(error)}.") from None

@@ -20,7 +20,7 @@ from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
-UPDATES = 300_000  # updates of an offline run by default
+UPDATES = 300_000  # default number of updates of an offline run
 _FORM = ("suite", "task", "base", "object", "points", "touch")
 
 
@@ -126,9 +126,11 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
     if not datasets:
         raise BidexError(f"{kind.name} learns from data. Add --dataset NAME (see bidex-meta data list).")
     if record:
-        raise BidexError(f"{kind.name} does not play, so that there is nothing to record. Leave --record out.")
+        raise BidexError(f"{kind.name} does not play, so there is nothing to record. Leave --record out.")
     if launch().count > 1:
-        raise BidexError(f"{kind.name} learns in one process, here are {launch().count}. Start it without torchrun.")
+        raise BidexError(
+            f"{kind.name} learns in one process, but there are {launch().count}. Start it without torchrun."
+        )
     for dataset in datasets:
         _check_shown(dataset, source)
 
@@ -137,7 +139,7 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
     """Refuse demonstrations of other classes or bases, or with other goals; only metadata are read."""
     if names and Capability.IMITATES not in kind.make.capabilities:
         takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).make.capabilities)
-        raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
+        raise BidexError(f"{kind.name} does not imitate; --demonstrations goes with {takers}. Leave one of them out.")
     for dataset in open_datasets(names):
         classes = source.task_classes()
         for slot in dataset.metadata["tasks"]:
@@ -165,9 +167,9 @@ def _check_shown(dataset: Dataset, source: Worlds) -> None:
     if about.get("hides_goals", source.hides_goals) == source.hides_goals:
         return
     if about["hides_goals"]:
-        raise BidexError(f"{dataset.name} hides goals, {source.name} shows them. Record what shall be learned.")
+        raise BidexError(f"{dataset.name} hides goals, {source.name} shows them. Record a data set on {source.name}.")
     if about.get("points"):
-        raise BidexError(f"{dataset.name} has point clouds, where {source.name} hides goals. Record without --points.")
+        raise BidexError(f"{dataset.name} has point clouds, but {source.name} hides goals. Record without --points.")
 
 
 def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:

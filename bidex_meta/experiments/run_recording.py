@@ -22,9 +22,10 @@ def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollecto
     rows = spread_environments(world, config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
     needed = writer.estimated_bytes(config.record, *sizes, 20.0)
-    there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))  # of a resumed run
+    # Bytes that a resumed run has already stored.
+    there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))
     writer.check_room(folder, max(0, needed - there), f"{config.record:,} transitions")
-    # A checkpoint copies the running episodes; each process of this machine has its own.
+    # A checkpoint copies the running episodes, and each process of this machine has its own episodes.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
     say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")

@@ -40,7 +40,7 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
         raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
     if source.hides_goals and Capability.ADAPTS not in kind.make.capabilities:
         raise BidexError(
-            f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite, or take "
+            f"{kind.name}: its policy cannot infer the goals that {source.name} hides. Name an MT suite, or use "
             "--algo icl."
         )
     if SCRIPTS in config.teacher and (config.device != "cpu" or config.engine == "warp"):
@@ -80,7 +80,7 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     """Return the classes of ``source`` that a run's policy has learned, with equal observations and actions."""
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
-        raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
+        raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that does not adapt.")
     other = open_worlds(config.to_json())
     own = source.task_classes()
     theirs = other.task_classes()
@@ -129,7 +129,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
-    inner: Any = getattr(world, "unwrapped", world)  # without a recorder
+    inner: Any = getattr(world, "unwrapped", world)  # the world without its recorder
     privileged = inner if source.hides_goals else None
     if not scripted:
         return Teachers(world, tutors, privileged=privileged)

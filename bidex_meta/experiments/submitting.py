@@ -49,8 +49,8 @@ from bidex_meta.utils.validation import parse
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds, open_worlds
 
-_EPISODES = 1  # default number of each task
-_EPISODES_OF_TRIALS = 10  # default number of each task after each adaptation
+_EPISODES = 1  # default number of episodes of each task
+_EPISODES_OF_TRIALS = 10  # default number of episodes of each task after each adaptation
 _FACTS = ("suite", "track", "algorithm", "train_tasks", "steps")
 
 
@@ -111,7 +111,8 @@ def submit(
         for run in runs:
             if run.weights in entry.receipt.weights:
                 raise BidexError(
-                    f"{run.folder.path} stands in {known}: their weights are equal. Leave it out, or delete that entry."
+                    f"{run.folder.path} is already in {known}: their weights are equal. Leave it out, or delete that "
+                    "entry."
                 )
     track = _track_of(runs)
     if track is None:
@@ -134,14 +135,18 @@ def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
     if isinstance(entry, TransferEntry):
         raise BidexError(f"{path} is of a transfer. Name the run, and the folder of its transfer by --transfer.")
     if not isinstance(entry, Entry):
-        raise BidexError(f"{path} is of an agent that is no run: nobody can play it. Name an entry of runs.")
+        raise BidexError(
+            f"{path} belongs to an agent that is not a run, so it cannot be played again. Name an entry of runs."
+        )
     weights = entry.receipt.weights
     runs = read_runs(folders)
     found = [run.weights for run in runs]
     if sorted(found) != sorted(weights):
-        raise BidexError(f"{path} is of other runs: expected weights {', '.join(weights)}, got {', '.join(found)}.")
+        raise BidexError(
+            f"{path} belongs to other runs: expected weights {', '.join(weights)}, got {', '.join(found)}."
+        )
     runs.sort(key=lambda run: weights.index(run.weights))
-    track = _track_of(runs) or entry.track  # the run that it started from may not be here
+    track = _track_of(runs) or entry.track  # the run that it started from may be missing here
     content = _played(runs, track, entry.episodes, device)
     content |= {"name": entry.name, "tuning": asdict(entry.tuning)}
     again = sealed(content, Entry, str(path))
@@ -235,14 +240,16 @@ def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[Sub
             raise BidexError(f"{folder.path} trained on the task {config.task} alone. The leaderboard is of suites.")
         if shipped and config.suite.endswith(".toml"):
             raise BidexError(
-                f"{folder.path} trained on {portable(config.suite)}. The leaderboard is of shipped suites."
+                f"{folder.path} trained on {portable(config.suite)}. The leaderboard is for shipped suites."
             )
         if config.points:
             raise BidexError(f"{folder.path} saw clouds of points, which {config.suite} does not show. Leave it out.")
         if run_kind(config) != run_kind(configs[0]):
-            raise BidexError(f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it apart.")
+            raise BidexError(
+                f"{folder.path} differs from {folders[0].path} in more than its seed. Submit it separately."
+            )
     if len({config.seed for config in configs}) < len(configs):
-        raise BidexError("Two of the runs have one seed. Name each seed once.")
+        raise BidexError("Two of the runs have the same seed. Name one run for each seed.")
     worlds = open_worlds(configs[0].to_json())
     if Capability.ADAPTS in learner_class(configs[0].algo).capabilities:
         check_worlds(worlds, configs[0].algo)
@@ -320,7 +327,7 @@ def _adapted(
     run: SubmittedRun, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int
 ) -> _Played:
     """Play a meta-test."""
-    # An agent that adapts by its own episodes is judged in the environments in which it explores.
+    # An agent that adapts to its own episodes is evaluated in the environments in which it explored.
     rollouts = episodes if adaptation.is_per_environment else None
     options = Options(shots=SHOTS, tasks=TASKS, episodes=episodes, rollouts=rollouts, seed=seed)
     load = partial(policy_of, run.folder, run.state, worlds.device)
@@ -381,7 +388,7 @@ def commit_of(git: Json | None) -> str | None:
 def new_path(path: Path) -> Path:
     """Return the path of a new entry; raise BidexError if the file exists, or cannot be written."""
     if exists(path):
-        raise BidexError(f"There is {path} already. Give another --name, or delete it.")
+        raise BidexError(f"{path} exists already. Give another --name, or delete it.")
     check_writable(path)
     return path
 

@@ -24,7 +24,7 @@ from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
-_NOTHING = ("uniform", "zero", "held")  # policies that have learned nothing
+_NOTHING = ("uniform", "zero", "held")  # untrained policies
 
 
 def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:

@@ -27,7 +27,7 @@ _LISTS = ("dataset", "demonstrations", "teacher")
 _WHOLE = ("steps", "record")
 """Fields that may be written 2e7."""
 _MOST_RUNS = 10_000
-_IN_NAMES = r"\w.+ -"  # characters of a run folder's name, before blanks become hyphens
+_IN_NAMES = r"\w.+ -"  # characters of a run folder's name, before spaces become hyphens
 
 _Name = Annotated[str, Meta(pattern=rf"^[{_IN_NAMES}]{{1,60}}\Z")]
 _Texts = Annotated[tuple[Text, ...], Meta(min_length=1)]
@@ -120,7 +120,8 @@ class PlannedRun:
                 continue
             value = content[entry.name]
             is_given = value not in (entry.default, []) or entry.name in ("algo", "seed")
-            # A value that was given before may have been taken out since; only steps have no word for their default.
+            # The file may have set a value earlier and no longer set it, so defaults are passed too. Only steps have
+            # no flag for their default.
             if is_given or (may_change and "may_change" in entry.metadata and entry.name != "steps"):
                 words += words_of(entry.name, value)
         for name, value in flat(learner).items():
@@ -195,9 +196,11 @@ def _read(path: Path, root: Path) -> SweepPlan:
     runs: dict[str, PlannedRun] = {}
     for run in _runs(path, file, arms, folder):
         if run.name in runs:
-            raise BidexError(f"{path}: two runs are called {run.name}. Name arms apart, each seed and value once.")
+            raise BidexError(
+                f"{path}: two runs are called {run.name}. Give arms different names, and each seed and value once."
+            )
         if len(runs) == _MOST_RUNS:
-            raise BidexError(f"{path}: expected at most {_MOST_RUNS:,} runs, got more. Make several sweeps of it.")
+            raise BidexError(f"{path}: expected at most {_MOST_RUNS:,} runs, got more. Split it into several sweeps.")
         runs[run.name] = run
     return SweepPlan(folder, list(runs.values()), file.slurm, str(path))
 
@@ -205,7 +208,7 @@ def _read(path: Path, root: Path) -> SweepPlan:
 def _check_flags(path: Path, place: str, flags: JsonObject) -> None:
     for flag in flat(flags):
         if flag.replace("-", "_") in _OWN:
-            raise BidexError(f"{path}: {place}.{flag}: the file's other entries or the sweep decide that.")
+            raise BidexError(f"{path}: {place}.{flag}: other entries of the file or the sweep itself set this.")
 
 
 def _runs(path: Path, file: _File, arms: Sequence[_Arm], folder: Path) -> Iterator[PlannedRun]:

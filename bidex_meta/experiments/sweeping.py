@@ -32,7 +32,7 @@ from bidex_meta.utils.files import JsonObject, absolute, exists, is_file, read_t
 from bidex_meta.utils.validation import Few
 from bidex_meta.utils.waiting import note
 
-COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # a run's words are appended
+COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # the words of a run are appended
 _STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
 """Signal that makes a run save and end. A batch system may send it too; a second SIGTERM would kill the run."""
 
@@ -118,7 +118,7 @@ def states_of(plan: SweepPlan) -> list[State]:
 
     Raises BidexError for bad values, and if a run's folder has a run with another config.
     """
-    configs: dict[str, AnyConfig] = {}  # seeds share a config
+    configs: dict[str, AnyConfig] = {}  # runs that differ only in the seed share a config
     runs = []
     for run in plan.runs:
         kind = str(replace(run.given, seed=0, start_from=None))
@@ -144,10 +144,10 @@ def state_of(run: PlannedRun) -> State:
     last: JsonObject = {"step": 0}
     evaluated = False
     if exists(run.folder.config_path):
-        # The machine may have changed, so threads and device are ignored.
+        # Threads and device are ignored, because the machine may have changed.
         for name, there, here in run.folder.config().differences(run.config, ignored=("threads", "device")):
             raise BidexError(
-                f"{run.path} is a run of another config: {name} is {there} there, not {here}. Give the arm another "
+                f"{run.path} is a run with another config: its {name} is {there}, not {here}. Give the arm another "
                 "name, or move the folder away."
             )
         if is_file(run.folder.metrics_path):
@@ -204,7 +204,7 @@ class Job:
         If the run failed, BidexError is raised with the last line of the run's log.
         """
         run = self.run
-        while _locked(run) and not self.stopped:  # a process that a killed sweep has left still trains the run
+        while _locked(run) and not self.stopped:  # a process of a killed sweep may still train the run
             time.sleep(1.0)
         if state_of(run).state == "done":
             return True
@@ -254,15 +254,16 @@ class QueuedJob(Job):
             asked.append(number)
             self.stop()
 
-        requeueing = signal.Signals[f"SIG{os.environ.get('SUBMITIT_PREEMPT_SIGNAL', 'USR2')}"]  # read by submitit too
+        # Submitit reads this variable too.
+        requeueing = signal.Signals[f"SIG{os.environ.get('SUBMITIT_PREEMPT_SIGNAL', 'USR2')}"]
         numbers = {*BATCH_SIGNALS, signal.SIGTERM, requeueing}
         handlers = {number: signal.signal(number, remember) for number in numbers}
         try:
             done = super().__call__()
-            if not asked and self.process is not None:  # only the run received the signal, or received it before us
+            if not asked and self.process is not None:  # the signal reached only the run, or reached it first
                 asked.append(_signal_of(self.process.returncode) or 0)
             requeue = handlers[requeueing]
-            # SIGTERM does not request requeueing: the batch system sends it when somebody cancels the job.
+            # SIGTERM does not request requeueing, because the batch system sends it when somebody cancels the job.
             if not done and callable(requeue) and {*BATCH_SIGNALS, requeueing}.intersection(asked):
                 requeue(requeueing, None)
             return done
@@ -289,7 +290,7 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
     waiting = list(runs)
     failed = dict[Path | None, str]()
     free = list(cores)
-    note("")  # runs take hours; a line is printed at the start and end of each run
+    note("")  # runs take hours, so a line is printed at the start and at the end of each run
     own: dict[Future[bool], Job] = {}
     jobs: list[Job] = []
 
@@ -347,7 +348,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
         executor = submitit.AutoExecutor(folder=folder, cluster=where)
         executor.update_parameters(**{"timeout_min": 24 * 60, "cpus_per_task": 1, **parameters})
         for run in runs:
-            number = _beside(run, "job")  # local jobs need no number: the lock of the run's folder is enough
+            number = _beside(run, "job")  # local jobs need no number, because the lock of the run's folder is enough
             if where == "slurm" and is_file(number):
                 job = submitit.SlurmJob(folder=folder, job_id=read_text(number, "a job's number").strip())
                 if not job.done(force_check=True):
@@ -360,7 +361,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
             jobs[run.name] = executor.submit(QueuedJob(replace(run, path=run.path.resolve(), given=given), COMMAND))
             number.write_text(f"{jobs[run.name].job_id}\n")
     except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
-        raise BidexError(f"submitit: {one_line(error)[:300].rstrip('.')}. Mend [slurm], or --submit.") from None
+        raise BidexError(f"submitit: {one_line(error)[:300].rstrip('.')}. Fix [slurm], or --submit.") from None
     return jobs
 
 

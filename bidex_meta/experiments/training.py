@@ -35,7 +35,7 @@ from bidex_meta.worlds import Worlds, open_worlds
 
 _LOG = logging.getLogger("bidex_meta")
 
-Checkpoint = tuple[Json, int]  # state and environment steps
+Checkpoint = tuple[Json, int]  # a state and its environment steps
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def train(
     distributed.init_from_environment()
     folder = None
     try:
-        with contextlib.ExitStack() as held:  # the lock of the run's folder
+        with contextlib.ExitStack() as held:  # holds the lock of the run's folder
             old = together(lambda: None if resume is None else _opened(resume, run_dir))
             resolved = together(lambda: _checked(config, old))
             new = None if run_dir is None else Path(run_dir)
@@ -122,7 +122,7 @@ class _Run:
 
 def _opened(resume: RunFolder | str | Path, run_dir: object) -> RunFolder:
     if run_dir is not None:
-        raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
+        raise BidexError("--resume continues in the run's own folder. Leave --run-dir out, or start a new run there.")
     return RunFolder.open(resume.path if isinstance(resume, RunFolder) else resume)
 
 
@@ -148,7 +148,7 @@ def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: cont
             old.check_own()
             held.enter_context(old.locked())
         else:
-            # Of a name that no other run has, should one begin in this second too.
+            # The check uses a name that no other run has, even if another run begins in the same second.
             name = new_folder_name(config)
             check_new(new or name.with_name(f"{name.name}_0"))
         watching.check(config, worlds)
@@ -157,7 +157,7 @@ def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: cont
     if old is None and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         if start.checkpoints.newest_step() is None:
-            checkpoint(start)  # refuses it
+            checkpoint(start)  # raises BidexError if the run has no checkpoint
 
 
 def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
@@ -169,7 +169,7 @@ def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
         here = first.flat()
         for number, (other, other_step) in enumerate(everyone):
             there = other.flat()
-            # Machines may differ in cores; the run keeps the threads of process 0.
+            # Machines may differ in cores, so the run keeps the number of threads of process 0.
             for name in here.keys() - {"threads"}:
                 if here[name] != there.get(name):
                     raise BidexError(
@@ -224,7 +224,7 @@ def _begin(
 def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
     """Return the learner with data and teachers; a ``fresh`` one gets the policy of ``config.start_from``, if any."""
     sources = _sources(config, worlds, world)
-    # A learner from elsewhere that takes no sources need not have the argument.
+    # A learner of another package that takes no sources may lack this argument.
     if sources == NO_SOURCES:
         more = {}
     else:
@@ -276,7 +276,7 @@ def _train(
             together(lambda: runner.resume(learner, run.world, state))
         say(f"Continuing at {resume_step:,} steps.")
     elif run.is_resumed:
-        resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
+        resume_step = 0  # the run was killed before its first checkpoint; the same seed repeats the lost steps
         say("No checkpoint yet: starting from the beginning.")
     if config.minutes is None:
         seconds = math.inf
@@ -286,10 +286,11 @@ def _train(
         runner.train, learner, run.world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
     )
     if launch().rank > 0:
-        return iterate(record=None)  # process 0's clock decides
+        return iterate(record=None)  # the clock of process 0 decides for all
     folder.finish(resume_step)
     if run.is_resumed:
-        folder.change_config(config)  # more steps, say; not before it is known that the run goes on
+        # Changes such as more steps are written only when it is certain that the run continues.
+        folder.change_config(config)
     rows = mend(folder.metrics_path, resume_step or 0)
     if rows and rows[-1]["step"] == resume_step:
         last = rows[-1]

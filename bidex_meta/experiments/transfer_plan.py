@@ -31,9 +31,9 @@ from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 _NETWORK = ("architecture", "hidden", "activation", "normalise_observations", "point_widths")
 """Fields of a learner's config that a policy to start from must share."""
-_EVALUATIONS = 100  # evaluations of a run by reinforcement, evenly spaced
-_LONG = 10**9  # steps in which only the critic learns, so that a run by demonstrations keeps the cloned policy
-_PATIENCE = 3  # most rounds of a script
+_EVALUATIONS = 100  # evaluations of a reinforcement-learning run, evenly spaced
+_LONG = 10**9  # steps in which only the critic learns, so that a run on demonstrations keeps the cloned policy
+_PATIENCE = 3  # maximum number of rounds in which a script plays
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def arms_of(folders: Sequence[RunFolder]) -> list[Arm]:
     names = [arm.name for arm in arms]
     for name in names:
         if names.count(name) > 1:
-            raise BidexError(f"Two starts are called {name}. Name runs whose folders are called differently.")
+            raise BidexError(f"Two starts are called {name}. Name runs whose folders have different names.")
     return arms
 
 
@@ -152,8 +152,8 @@ def demonstrations_of(file: Path, name: str, given: Sequence[str], folder: Path,
             continue
         if dataset.metadata.get("rules", asdict(V1)) != asdict(task.rules):
             raise BidexError(
-                f"--data {dataset.name} has {name} by other rules than {file.stem}. Record it by the suite's version "
-                "(docs/versions.md)."
+                f"--data {dataset.name} has {name} with other rules than {file.stem}. Record it with the suite's "
+                "version (docs/versions.md)."
             )
         return dataset
     if not task.moving_base or task.name not in scripts_of(task.rules):
@@ -238,7 +238,7 @@ def cells_of(
         if count and dataset is not None:
             data = (str(absolute(some_of(dataset, name, count, config.seed, out / "data"))),)
         once = changed | {"critic_first": _LONG}
-        tracks.append((count, replace(base, steps=1, demonstrations=data, learner=once)))  # one iteration
+        tracks.append((count, replace(base, steps=1, demonstrations=data, learner=once)))  # one iteration is enough
     if steps:
         every = evaluate_every(steps, config)
         tracks.append((None, replace(base, steps=steps, evaluate_every=every, learner=changed)))

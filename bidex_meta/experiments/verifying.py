@@ -110,7 +110,7 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> Evaluated:
     path = named or run / "evaluation.json"
     again = f"bidex-meta evaluate {run} --json > {path}"
     if named is None and not exists(path):
-        raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
+        raise BidexError(f"{run} has no evaluation.json to verify. Let the run end, or write one: {again}")
     evaluation = read_evaluation(path, again)
     if evaluation.randomisation is not None:
         raise BidexError(f"{path}: expected an evaluation without --randomisation, got one with it. Name another.")
@@ -173,7 +173,7 @@ def _again(
             kind = "a meta-test"
         else:
             kind = "no meta-test"
-        raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
+        raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is evaluated.")
     if isinstance(recorded, PolicyEvaluation):
         world = worlds.world(recorded.split, num_envs)
         protocol = worlds.protocol(recorded.split, recorded.policy.episodes_per_task, seed)

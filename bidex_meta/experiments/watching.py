@@ -28,8 +28,10 @@ from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds, open_worlds
 
-TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
-_LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
+TASKS = 10  # tasks of each class in such an evaluation, the first of its pool, with one episode each
+# Minimum number of episodes over all classes: with fewer tasks each is played several times, so that one failure does
+# not decide.
+_LEAST = 10
 _FILM: Look = {"width": 240, "height": 180}
 _FILM_EVERY = 2
 _MOST_FILM_STEPS = 300

@@ -81,7 +81,7 @@ _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
     """Give geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER geoms keep their bits."""
     for geom in geoms:
-        if geom.contype:  # others are visual only
+        if geom.contype:  # geoms without a contype are only visual
             own = INNER if geom.contype == INNER else kind
             geom.contype = own
             geom.conaffinity = _COLLIDES[own]
@@ -109,7 +109,7 @@ def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: boo
 
 def _add_touch(part: mujoco.MjSpec) -> None:
     for body in TOUCHED:
-        # Only contacts of the sensor's own body within its site count, and this site encloses each of the bodies.
+        # A touch sensor reads only contacts of its own body within its site, so the site encloses the whole body.
         site = part.body(body).add_site(name=f"{body}_touch", size=[_TOUCH_RADIUS] * 3, group=4)
         part.add_sensor(
             name=site.name, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name

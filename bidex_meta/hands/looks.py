@@ -121,7 +121,7 @@ class _Tailor:
         self._side = side
 
     def _add(self, body: str, material: str, **shape: object) -> None:
-        # Skins have no mass and no contacts, because bodies state their inertia.
+        # Skins add no mass and no contacts, because bodies define their own inertia.
         self._scene.body(f"{self._side}/{body}").add_geom(
             material=f"{self._side}/{material}", contype=0, conaffinity=0, mass=0, group=0, **shape
         )

@@ -117,7 +117,7 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
         return (towards @ points.transpose(1, 2) + radii).amax(dim=2).reshape(length.shape)
 
     reach = (points[..., 1] + radii).amax(dim=1)
-    # A thumb that lies flat stands out above the palm; an object that would touch it starts above it.
+    # A thumb that lies flat rises above the palm, so an object that would touch it starts higher.
     lowest = _SLACK - _PALM_HALF_THICKNESS - reach
     rest = torch.stack((centre[:, 0], centre[:, 1].minimum(lowest), centre[:, 2]), dim=1)
     low, high = (constant(end, rest).expand_as(rest) for end in _THUMB)

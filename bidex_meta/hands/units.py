@@ -60,7 +60,7 @@ def units_by_agent(line: str) -> dict[str, list[str]]:
                 why = repr(line)
             raise BidexError(
                 f"agents: expected {', '.join(NAMED)}, the path of a TOML file, or name=unit+unit;name=unit with each "
-                f"agent once, got {why}. Mend it as docs/learners/multiagent.md shows."
+                f"agent once, got {why}. Fix it as docs/learners/multiagent.md shows."
             )
         found[name] = [unit.strip() for unit in units.split("+")]
     return found

@@ -67,7 +67,7 @@ class ForMetaWorld:
     def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, Info]:
         """Return exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
         obs = self._tensor(observations)
-        if self._begins:  # Meta-World resets the environments here without calling reset
+        if self._begins:  # Meta-World resets the environments here without calling reset of the agent
             self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
             self._begins = False
         action, outputs = checked_outputs(self._agent, self._agent.adapt_action(obs))
@@ -93,7 +93,7 @@ class ForMetaWorld:
         tensor = dense(value, self._device)
         if tensor is None:
             raise BidexError(f"ForMetaWorld: expected an array of numbers, got {shortened(value)}.")
-        # A copy, because an environment may write into its array again.
+        # The observation is copied, because an environment may write into its array again.
         return tensor.to(torch.float32 if tensor.is_floating_point() else tensor.dtype, copy=True)
 
 
@@ -134,7 +134,7 @@ class FromMetaWorld:
 
     def step(self, timestep: Timestep) -> None:
         """Pass one transition of every environment to the agent."""
-        assert self._over is not None  # reset comes first
+        assert self._over is not None  # reset is called first
         running = ~self._over
         ended = (timestep.terminated | timestep.truncated) & running
         reward = torch.where(running, timestep.reward, torch.zeros_like(timestep.reward))

@@ -58,7 +58,8 @@ class MetaWorldWorld(ForeignWorld):
         self._task_seed = seed
         self._tasks = make_tasks(suite, seed)
         self._singles = [Single(self.task_names[i]) for i in self.task_id.tolist()]
-        self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)  # of the running episodes, for checkpoints
+        # Actions of the running episodes, for checkpoints.
+        self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)
         self._pools: dict[str, list[int]] = {}
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
@@ -70,7 +71,8 @@ class MetaWorldWorld(ForeignWorld):
                 raise unknown_name(f"class of {self.suite}", name, self.task_names)
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
-            if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
+            # The comparison is false for NaN.
+            if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):
                 fault = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
                 raise BidexError(f"{fault}, got {numbers.tolist()}.")
             chosen[name] = [int(number) for number in numbers.flatten()]
@@ -101,7 +103,7 @@ class MetaWorldWorld(ForeignWorld):
         for row in (active & ~broken).nonzero().squeeze(1).tolist():
             new, gained, reached, fell = self._singles[row].step(numbers[row])
             if fell:
-                unstable[row] = True  # its last finite observation stays
+                unstable[row] = True  # the row keeps its last finite observation
                 continue
             obs[row, :OBSERVATION_SIZE] = torch.from_numpy(new)
             reward[row] = gained

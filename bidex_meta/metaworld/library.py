@@ -42,8 +42,8 @@ def _library() -> ModuleType:
         library = mended()
     except ModuleNotFoundError as error:
         fault = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
-        raise BidexError(f"{fault}. Mend: pip install metaworld==3.0.0") from None
-    # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
+        raise BidexError(f"{fault}. Fix it: pip install metaworld==3.0.0") from None
+    # MuJoCo would print each broken environment to stderr and to a log file. Single.step reports it.
     mujoco.set_mju_user_warning(lambda message: None)
     return library
 
@@ -78,7 +78,7 @@ class Single:
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """Advance 1/80 s by an action (4,); returns observation (39,), reward in [0, 10], success, broken physics."""
         obs, reward, _, _, info = self._env.step(action)
-        # After a bad number MuJoCo continues from its default state; only its counters show it.
+        # After an invalid number MuJoCo continues from its default state, and only its counters show this.
         broken = bool(np.any(self._env.data.warning.number[_BROKEN]))
         broken = broken or not (np.isfinite(obs).all() and np.isfinite(reward))
         return obs, float(reward), bool(info["success"]), broken

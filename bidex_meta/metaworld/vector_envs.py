@@ -24,7 +24,7 @@ from bidex_meta.utils.validation import Count, Few, true_or_false
 from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import AnyTask, EnvRecipe
 
-Option = Any  # a keyword of Meta-World's functions; ``make_env`` and ``SuiteEnv`` have their types
+Option = Any  # a keyword argument of Meta-World's functions; ``make_env`` and ``SuiteEnv`` define the types
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 
@@ -141,7 +141,7 @@ def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = 
     if benchmark.suite.kind != "multi-task":
         raise BidexError(f"{benchmark.name} hides its goals: make_ml_envs({benchmark.name!r}) makes its environments.")
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
-        raise BidexError(f"meta_batch_size and total_tasks_per_cls are of meta suites; {benchmark.name} is none.")
+        raise BidexError(f"meta_batch_size and total_tasks_per_cls are for meta suites; {benchmark.name} is not one.")
     classes = benchmark.train_classes
     envs = [(env_class.recipe, benchmark.tasks_of(name)) for name, env_class in classes.items()]
     return _make_vector(envs, seed, num_tasks=num_tasks or len(envs), **options)
@@ -202,7 +202,7 @@ def make_env(
     whether the episode ended. With `task_select`, `"random"` draws a task at each reset, and `"pseudorandom"` takes the
     tasks in turn when `sample_tasks()` is called. Other options are those of `SuiteEnv`.
     """
-    wrappers = mended().wrappers  # not needed by the package's other names
+    wrappers = mended().wrappers  # the package's other names do not need these wrappers
     single = recipe.make_class()(**options)
     if seed is not None:
         single.seed(seed)

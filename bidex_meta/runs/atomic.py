@@ -14,8 +14,8 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.utils.files import exists
 
 TEMPORARY_SUFFIX = ".tmp"
-_CHUNK = 2**20  # bytes
-Json = dict[str, Any]  # an object of JSON
+_CHUNK = 2**20  # bytes per write
+Json = dict[str, Any]  # a JSON object
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
@@ -29,7 +29,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         os.replace(temporary, path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # torch.save reports errors of the system, such as a full disk, as its own kind of error.
+        # torch.save reports system errors, such as a full disk, as errors of its own class.
         if isinstance(error, RuntimeError) and isinstance(why := error.__context__, OSError):
             raise OSError(why.errno, why.strerror, str(path)) from None
         raise
@@ -107,7 +107,7 @@ def check_writable(path: Path) -> None:
         for folder in reversed([folder for folder in path.parents if not exists(folder)]):
             folder.mkdir()
             created.append(folder)
-        # The temporary name is as long as the one that the file will have while it is written.
+        # The temporary name is as long as the one under which the file will be written, so too long a name fails now.
         temporary = temporary_name(path)
         try:
             with temporary.open("xb") as file:

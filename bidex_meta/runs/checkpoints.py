@@ -21,9 +21,9 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import exists, is_file, open_regular
 from bidex_meta.utils.validation import Whole
 
-State = Json  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
+State = Json  # nested dicts and lists of tensors, numbers and strings, which can be read without running code
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
-FORMAT = 2  # goes up when older code could not read a checkpoint
+FORMAT = 2  # raised when older code can no longer read a checkpoint
 _DEEPEST = 100
 
 
@@ -115,7 +115,7 @@ class Checkpoints:
         try:
             content = _opened(path)
         except Exception as error:
-            raise BidexError(f"{path} is no checkpoint that can be read ({_reason(error)}). Name another.") from None
+            raise BidexError(f"{path} is not a readable checkpoint ({_reason(error)}). Name another.") from None
         return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
@@ -131,7 +131,8 @@ class Checkpoints:
         A damaged file is skipped with a line on stderr that names the file used instead. Raises BidexError if no
         checkpoint can be read.
         """
-        # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
+        # last.pt is renamed last: if the process dies between the two renames, last.pt is older than the newest
+        # step_<N>.pt.
         candidates = [path for path in [*self._step_files(), self.last] if exists(path)]
         for path in candidates:
             loaded = _read(path)
@@ -156,7 +157,7 @@ class Checkpoints:
 
 
 def _torch():
-    import torch  # not at the top: `bidex-meta list` starts without it
+    import torch  # imported here, so that `bidex-meta list` starts without torch
 
     return torch
 
@@ -164,7 +165,8 @@ def _torch():
 def _read(path: Path, then: str = "trying an older one") -> State | None:
     try:
         return _opened(path)
-    except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
+    # Torch raises a dozen kinds of errors for a damaged file; each means "try the one before".
+    except Exception as error:
         print(f"Checkpoint {path} cannot be read ({_reason(error)}); {then}.", file=sys.stderr)
         return None
 
@@ -181,7 +183,7 @@ def _opened(path: Path) -> State:
     """Return a file's content, at least ``step`` and ``state``; torch raises many kinds of errors if it is damaged."""
     with open_regular(path, "a checkpoint") as file:
         _check_archive(file)
-        # weights_only: a checkpoint from somebody else must not be able to run code.
+        # With weights_only, another person's checkpoint cannot run code.
         content = _torch().load(file, map_location="cpu", weights_only=True)
     if not isinstance(content, dict) or not isinstance(content.get("state"), dict):
         raise ValueError("it holds no training's state")
@@ -239,7 +241,7 @@ def _feed(value: object, digest: "hashlib.blake2b", depth: int) -> None:
     if isinstance(value, torch.Tensor):
         digest.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
         flat = value.detach().cpu().contiguous()
-        # A single number can have any stride, but a view of bytes requires 1.
+        # A single number can have any stride, but a view as bytes requires stride 1.
         flat = flat.as_strided((flat.numel(),), (1,))
         digest.update(flat.view(torch.uint8).numpy().data)
     elif isinstance(value, dict):
@@ -252,7 +254,7 @@ def _feed(value: object, digest: "hashlib.blake2b", depth: int) -> None:
         for entry in value:
             _feed(entry, digest, depth + 1)
     else:
-        # repr gives every bit of a float, except for NaN.
+        # repr writes every bit of a float, except for NaN.
         if isinstance(value, bytes):
             content = value
         else:

@@ -79,7 +79,7 @@ class Summary:
 
     episodes_per_task: Few | None = None
     classes: Classes
-    aggregate: dict[str, Aggregate | None] | None = None  # by measure: ``success`` and ``score``
+    aggregate: dict[str, Aggregate | None] | None = None  # aggregates by measure: ``success`` and ``score``
 
 
 @dataclass(frozen=True)

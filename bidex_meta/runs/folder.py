@@ -42,7 +42,7 @@ AnyConfig = RunConfig[Any]  # A run's config, with its learner's settings in any
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
 """Entries of a run folder before the end of its first iteration, apart from TensorBoard's file."""
 _EVENTS = "events.out.tfevents."
-_MOST_LOOKED_AT = 2000  # entries that are searched for runs below a folder that is no run
+_MOST_LOOKED_AT = 2000  # maximum number of entries that are searched for runs below a folder that is not a run
 
 
 class _Part:
@@ -80,7 +80,7 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         folder = cls(path)
         for part in (folder.checkpoints_path, folder.videos_path):
-            part.mkdir(exist_ok=True)  # exists if a start was killed before its config was written
+            part.mkdir(exist_ok=True)  # the folder exists if an earlier start was killed before its config was written
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
         write_json(folder.config_path, config.to_json())  # last, because a folder with a config.json counts as complete
@@ -106,7 +106,7 @@ class RunFolder:
     metrics_path = _Part("metrics.jsonl")
     checkpoints_path = _Part("checkpoints")
     videos_path = _Part("videos")
-    evaluation_path = _Part("evaluation.json")  # exists after the run has ended and was evaluated
+    evaluation_path = _Part("evaluation.json")  # the file exists once the run has ended and was evaluated
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -211,7 +211,7 @@ def _torn_start(path: Path) -> bool:
         entries = list(path.iterdir())
         whole = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
         if not whole:
-            # A single temporary file belongs to the config: the check that the config can be written was killed.
+            # A single temporary file belongs to the config: the check whether the config can be written was killed.
             checked = [entry for entry in entries if entry.name.startswith(".config.json.")]
             return bool(entries) and checked == entries and not any(entry.is_symlink() for entry in entries)
         return all(_is_of_a_start(entry) for entry in whole)
@@ -223,7 +223,7 @@ def _is_of_a_start(entry: Path) -> bool:
     """Return whether an entry of a run folder can be there before the end of the first iteration."""
     if entry.is_symlink():
         return False
-    if entry.name in ("checkpoints", "videos"):  # a checkpoint's room is reserved by temporary files
+    if entry.name in ("checkpoints", "videos"):  # temporary files reserve space for a checkpoint
         return all(inner.name.endswith(TEMPORARY_SUFFIX) for inner in entry.iterdir())
     if entry.name == "metrics.jsonl":
         return entry.stat().st_size == 0

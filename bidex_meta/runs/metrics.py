@@ -16,7 +16,7 @@ from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
 from bidex_meta.utils.validation import Whole
 
-_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; one iteration writes a line of a few kilobytes
+_MOST_BYTES = 4_000_000_000  # maximum size of a ``metrics.jsonl``; one iteration writes a line of a few kilobytes
 _TAIL = 65_536
 
 
@@ -41,7 +41,7 @@ class MetricsWriter:
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
-        self._file.flush()  # to the operating system, so that a killed process loses no line
+        self._file.flush()  # hands the line to the operating system, so that a killed process loses no line
         self.writer.scalars(values, step)
 
     def flush(self) -> None:
@@ -104,7 +104,7 @@ def mend(path: Path, step: Whole) -> list[Json]:
         return []
     bad = sum(row is None for _, row in lines[:-1])
     if bad:
-        # A copy, because the file itself keeps the good lines.
+        # The rows are copied, because the file itself keeps the good lines.
         write_atomic(path.with_name(f"{path.name}.damaged"), lambda file: file.write(path.read_bytes()))
         print(f"{path}: {bad} lines cannot be read; all are kept in {path.name}.damaged.", file=sys.stderr)
         _keep(path, [line for line, row in lines if row is not None])
@@ -130,7 +130,7 @@ def _row(line: bytes) -> Json | None:
     """Return a line's numbers by name; None if the line holds anything else."""
     try:
         row = bounded(json.loads(line, parse_constant=lambda _: None))
-    except (ValueError, RecursionError):  # ValueError: also bytes that are no text
+    except (ValueError, RecursionError):  # ValueError: also bytes that are not text
         return None
     if not isinstance(row, dict) or type(row.get("step")) is not int or row["step"] < 0:
         return None

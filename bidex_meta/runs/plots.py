@@ -31,16 +31,16 @@ class Curve:
     high: np.ndarray | None  # upper end
 
 
-Group = tuple[str, Mapping[str, Curve]]  # runs drawn in one colour: a label, and curves by tag
+Group = tuple[str, Mapping[str, Curve]]  # runs drawn in one colour: their label, and their curves by tag
 Bar = tuple[str, float, Interval | None]  # a label, a value, and its interval if known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
-_STYLES = {"Train": "-", "Eval": "--"}  # of lines, by family of tags
-_FEW = 60  # most evaluations drawn as dots; more dots would hide the dashes
+_STYLES = {"Train": "-", "Eval": "--"}  # line styles by family of tags
+_FEW = 60  # maximum number of evaluations drawn as dots; more dots would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
-_MILLIONS = (1e6, _STEPS)  # of an axis: the size of one unit and its name
+_MILLIONS = (1e6, _STEPS)  # size of one unit of an axis, and the unit's name
 
 
 def draw_learning(groups: Sequence[Group]) -> "Figure":
@@ -53,7 +53,7 @@ def draw_learning(groups: Sequence[Group]) -> "Figure":
     tags = [tag for tag in chain.from_iterable(curves for _, curves in groups) if tag.startswith(starts)]
     names = list(dict.fromkeys(tag.split("/", 2)[2] for tag in tags))
     if not names:
-        raise BidexError("There is no finished episode yet: nothing to plot.")
+        raise BidexError("There is nothing to plot yet, because no episode has ended.")
     figure, axes = _task_panels([names])
     for name, panels in zip(names, axes[0], strict=True):
         for axis, measure in zip(panels, _MEASURES, strict=True):
@@ -114,6 +114,26 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> "Figure":
         axis.set_ylim(len(bars) - 0.5, -0.5)
         axis.set_title(title)
         axis.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def draw_bars(groups: Mapping[str, Sequence[Bar]], title: str) -> "Figure":
+    """Draw horizontal bars, a colour for each group; bars with equal labels share a row, and lines mark intervals."""
+    names = list(dict.fromkeys(label for label, _, _ in chain.from_iterable(groups.values())))
+    height = 0.8 / len(groups)
+    figure = _figure(6.4, 1.0 + 0.32 * len(names))
+    axis = figure.subplots()
+    for number, bars in enumerate(groups.values()):
+        rows = [names.index(label) - 0.4 + (number + 0.5) * height for label, _, _ in bars]
+        axis.barh(rows, [value for _, value, _ in bars], height, color=_colour(number))
+        for row, (_, _, interval) in zip(rows, bars, strict=True):
+            if interval:
+                axis.plot(interval, (row, row), color="black", linewidth=1.0)
+    axis.set_yticks(range(len(names)), [_plain(name) for name in names])
+    axis.set_ylim(len(names) - 0.5, -0.5)
+    axis.set_xlabel(title)
+    axis.grid(alpha=0.3, axis="x")
+    _add_legend(figure, list(groups))
     return figure
 
 

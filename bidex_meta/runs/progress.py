@@ -31,7 +31,7 @@ class PlainConsole(Console):
 
     @override
     def on_broken_pipe(self) -> None:
-        raise  # the error that is being handled
+        raise  # raises the error that is being handled
 
 
 class Progress:
@@ -78,7 +78,7 @@ class Progress:
             elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
                 self._last_line = time.monotonic()
                 self._print([*self._overall(step), *self._of_tasks()])
-        except OSError as error:  # of a terminal that is gone: EIO
+        except OSError as error:  # a terminal that is gone gives EIO
             silence(self._console.file)
             raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
 

@@ -29,7 +29,7 @@ from bidex_meta.runs.versions import parse_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
-FORMAT = 1  # of a run in these files; increased if an older reader would misread it
+FORMAT = 1  # format of a run in these files; raised if an older reader would misread it
 
 
 class _Content(TypedDict):

@@ -25,7 +25,7 @@ def check_suffix(path: Path) -> str:
     """Return the suffix of ``path`` in lower case; raises BidexError unless it is one of ``SUFFIXES``."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise BidexError(f"A picture ends in .png, a film in .mp4 or .webp, but {path.name!r} in none of them.")
+        raise BidexError(f"A picture ends in .png, a film in .mp4 or .webp, but {path.name!r} does not.")
     return suffix
 
 
@@ -119,7 +119,8 @@ def _whole(path: Path) -> bool:
             file.seek(offset)
             size = int.from_bytes(file.read(4))
             kind = file.read(4)
-            size = int.from_bytes(file.read(8)) if size == 1 else size  # 1: a length of eight bytes follows
+            # A size of 1 means that a length of eight bytes follows.
+            size = int.from_bytes(file.read(8)) if size == 1 else size
             if size < 8:
                 return False
             offset += size

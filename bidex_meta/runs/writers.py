@@ -73,7 +73,7 @@ class TensorBoardWriter(Writer):
 
     @override
     def film(self, tag: str, path: Path, frames: Sequence[np.ndarray], fps: float, step: int) -> None:
-        # TensorBoard shows films as animated GIFs under its tab Images.
+        # TensorBoard shows films as animated GIFs in its tab Images.
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
 
         height, width, _ = frames[0].shape

@@ -136,7 +136,7 @@ def _missing(state: TaskState) -> Tensor:
 
 _PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
 _OPEN = 0.3
-_GAP = 0.0125  # version 2's tolerance, metres; with 2.5 cm one witness settled in 12 % of its tasks
+_GAP = 0.0125  # tolerance of version 2 in metres; with 2.5 cm one witness solved 12 % of the tasks
 _BODY_POINT = 0.07
 """Position of the body point on the pen's axis, metres; the cap's point lies towards the other end."""
 

@@ -19,7 +19,7 @@ class CatchUnderarm(EggTask):
     name = "CatchUnderarm"
     summary = "Throw an egg underarm from the right hand to the left one"
     episode_steps = 75
-    wide_steps = 225  # hands move at 17 cm/s at most, and an egg must be held at its goal: 75 steps are too few
+    wide_steps = 225  # hands move at 17 cm/s at most and an egg must be held at its goal, so 75 steps are too few
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
     transition_scale = 0.05

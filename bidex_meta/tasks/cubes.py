@@ -313,11 +313,11 @@ class ReOrientation(TaskClass):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], 0.2, qpos)
-        radius = 0.0434  # half the space diagonal of a cube
+        radius = 0.0434  # half the space diagonal of a cube, in metres
         for i, side, pose in ((1, "left", self.left), (2, "right", self.right)):
             cube = qpos[f"object{i}"]
             eggs.start_egg(cube, draws[:, eggs.JOINT_DRAWS :], 0.01)
-            if not self.rules.wide:  # there a start would tell something about the hidden goal
+            if not self.rules.wide:  # in version 2, the start would reveal something about the hidden goal
                 _turn_away(cube, frozen[f"goal{i}_inverse"])
             eggs.lay_egg_on_hand(cube, qpos[f"{side}/joints"], pose, radius, radius)
 

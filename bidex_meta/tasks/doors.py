@@ -77,7 +77,7 @@ class _Door(ReachTask):
 
     def __init__(self, moving_base: bool | None = None) -> None:
         super().__init__(moving_base)
-        # Upright, or upside down about y.
+        # The door stands upright, or is turned upside down about y.
         self.objects = (SceneObject("object", "door", _BASE, (0.0, math.pi if self.inward else 0.0, 0.0)),)
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:

@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import true_or_false
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
-# Modules by name, imported at first use: listing names must not import torch and mujoco.
+# Modules are imported at first use, because listing names must not import torch and mujoco.
 _MODULES = {
     "HandOver": "catches", "CatchUnderarm": "catches", "CatchOver2Underarm": "catches",
     "TwoCatchUnderarm": "catches", "CatchAbreast": "catches", "LiftUnderarm": "vessels",

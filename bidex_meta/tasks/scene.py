@@ -186,8 +186,8 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base, task.touch)
     task.add_objects(spec)
-    # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
-    # million times as large on a few objects, costs nothing.
+    # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Instead, gravity is a millionth, and a few
+    # objects have a compensation that is a million times as large; this costs nothing.
     for body in spec.bodies:
         if body.name != "world" and not body.name.startswith(("right/", "left/")):
             body.gravcomp = _FALL
@@ -200,7 +200,7 @@ def compile_scene(task: "TaskClass") -> Scene:
     """Compile the scene of a task class."""
     model = build_spec(task).compile()
     damp_bases(model)
-    # The assets have the stiffest contacts and limits that 1/240 s allows; a longer step only allows softer ones.
+    # The assets have the stiffest contacts and limits that are stable at 1/240 s. A longer step needs softer ones.
     factor = model.opt.timestep / _STATED_TIME_STEP
     for solref in (model.geom_solref, model.pair_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
         solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor

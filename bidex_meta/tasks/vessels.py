@@ -76,7 +76,7 @@ class LiftUnderarm(OwnObjectClass):
         """Return ``object``: shift, turn (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
         if self.rules.wide:
-            placement = torch.zeros_like(placement)  # episodes draw it, so a goal may not depend on it
+            placement = torch.zeros_like(placement)  # episodes draw the placement, so a goal must not depend on it
         start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + constant(_START, placement)
         goal = torch.cat((start + variation[:, 3:], yaw_quaternion(placement[:, 2])), dim=1)
         return {"object": variation[:, :3], **frozen_goal(goal)}
@@ -154,7 +154,7 @@ class BottleCap(OwnObjectClass):
     constant = 0.2
     camera_target = (0.0, -0.62, 0.52)
     variation_space = VariationSpace(("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -0.01, -TURN), (SHIFT, 0.0, TURN))
-    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # the hand has no room for more
+    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # the hand has no room for a longer slide
     wide_solved = "cap within 5 mm of where it shall stand out"
     wide_blocks = goal_blocks("goal")
     jittered_hands = ("left",)
@@ -259,7 +259,7 @@ class SwingCup(OwnObjectClass):
     camera_target = (0.08, 0.0, 0.68)
     camera_angle = (20.0, -42.0)
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
-    wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # a small table
+    wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # the table is small
     wide_solved = "cup within 8 degrees of its goal and within 20 cm of its nominal start"
     blocks = (
         *object_blocks("cup"),

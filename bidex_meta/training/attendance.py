@@ -14,10 +14,10 @@ from bidex_meta.training.launch import notices
 
 _BEAT_SECONDS = 0.5
 _LISTEN_SECONDS = 3.0
-# torchrun kills 30 s after it asked.
+# torchrun kills a process 30 s after it asked it to stop.
 _STOP_SECONDS = 12.0
 _END_SECONDS = 10.0
-# A beat and a look at the others take three; more only where the store no longer answers.
+# A heartbeat and a check of the others take three seconds; more only if the store no longer answers.
 _JOIN_SECONDS = 10.0
 
 
@@ -31,7 +31,7 @@ class Attendance(threading.Thread):
 
     def __init__(self, store: Any, rank: int, count: int):
         super().__init__(name="attendance", daemon=True)
-        # A connection of its own: operations of one wait for each other.
+        # The thread has its own connection, because operations on one connection wait for each other.
         self._store = store.clone()
         self._rank = rank
         self._count = count
@@ -41,7 +41,7 @@ class Attendance(threading.Thread):
         for end in (self._signals, sent):
             os.set_blocking(end, False)
         if threading.current_thread() is threading.main_thread():
-            # A handler written in Python would wait for the operation to return; this byte does not.
+            # A signal handler in Python would wait for the running operation to return; writing this byte does not.
             signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
         self.start()
 
@@ -74,7 +74,7 @@ class Attendance(threading.Thread):
                 self._store.add(f"beats {self._rank}", 1)
                 if asked_at is None and self._was_asked_to_end():
                     asked_at = time.monotonic()
-                # With all others alive the iteration just takes long.
+                # If all other processes are alive, the iteration only takes long.
                 late = asked_at is not None and time.monotonic() - asked_at > _STOP_SECONDS
                 lost = late and self._missing()
             except RuntimeError:

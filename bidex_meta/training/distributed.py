@@ -22,8 +22,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.training.attendance import Attendance, end_patiently
 from bidex_meta.training.learner import State
 
-# A dead process closes its sockets and is noticed at once; this is for a machine that no longer answers, and must be
-# longer than process 0 takes to write a checkpoint.
+# A dead process closes its sockets, which is noticed at once. This limit is for a machine that no longer answers. It
+# must be longer than process 0 takes to write a checkpoint.
 TIMEOUT = timedelta(minutes=5)
 
 Value = TypeVar("Value")
@@ -53,7 +53,8 @@ def own_seed(seed: int) -> int:
     """Return a seed for this process only (starts, sampled actions); in process 0 it is ``seed`` itself."""
     if is_main():
         return seed
-    # 32 bits: torch's CPU generator reads no more, so that seed + (rank << 32) would be the same in all processes.
+    # The seed has 32 bits, because torch's CPU generator reads no more: seed + (rank << 32) would be equal in all
+    # processes.
     return int.from_bytes(hashlib.sha256(f"{seed}/{rank()}".encode()).digest()[:4], "little")
 
 
@@ -101,7 +102,7 @@ def _leave() -> None:
     through C++ code that must not throw, and the process dies with "terminate called without an active exception".
     """
     _end_threads()
-    # With NCCL this might wait for a process that is lost.
+    # With NCCL this call could wait for a lost process.
     if _joined() and not torch.cuda.is_available():
         dist.destroy_process_group()
 
@@ -235,6 +236,6 @@ def _collective() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        # gloo says "[its/own/file.cc:1] Connection closed by peer [address]. What may be the cause. ..."
+        # gloo reports "[its/own/file.cc:1] Connection closed by peer [address]. What may be the cause. ..."
         reason = re.sub(r"^\[[^]]*\] ", "", (str(error).splitlines() or [""])[0])
         raise LostProcess(reason.split(". ")[0]) from error

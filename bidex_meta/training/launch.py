@@ -36,7 +36,7 @@ class Launch:
 
 def launch() -> Launch:
     """Return this process's rank and the number of processes, read from the environment variables on every call."""
-    # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
+    # A batch system may set WORLD_SIZE for other reasons. torchrun also sets the address at which processes meet.
     if "MASTER_ADDR" not in os.environ:
         return Launch()
     defaults = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}

@@ -55,7 +55,7 @@ class Sources:
         """Raise BidexError if there is a source that is not among ``taken``, or if the ``needed`` source is missing."""
         for name, value in vars(self).items():
             if value is not None and name not in taken:
-                raise BidexError(f"{learner}: learns from no {name}. Leave them out of its sources.")
+                raise BidexError(f"{learner}: does not learn from {name}. Leave them out of its sources.")
         if needed is not None and getattr(self, needed) is None:
             raise BidexError(f"{learner}: has no {needed} to learn from. Pass sources=Sources({needed}=...).")
 
@@ -156,4 +156,4 @@ class Learner(ABC):
 
     def start_from(self, policy: State) -> None:
         """Start from the policy of another run's checkpoint instead of fresh weights."""
-        raise BidexError(f"{self.name}: cannot start from another run's policy.")
+        raise BidexError(f"{self.name}: cannot start from another run's policy. Leave --start-from out.")

@@ -23,7 +23,7 @@ from bidex_meta.training.learner import Learner, State
 from bidex_meta.utils.waiting import note
 from bidex_meta.world.contract import VectorWorld
 
-# The most of a run's time that may go into checkpoints.
+# This is the maximum share of a run's time that checkpoints may take.
 _SAVING_SHARE = 0.02
 _WITH_MOMENTS = 3
 _OF_AN_ENTRY = 1024  # bytes of an archive's entry: name, place and alignment
@@ -72,8 +72,9 @@ def train(
     is gone; existing checkpoints are kept.
     """
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
-        return 0  # it was stopped between its last iteration and the end of its evaluation
-    # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
+        return 0  # the run was stopped between its last iteration and the end of its evaluation
+    # With several processes, one may be lost at any time, after which nothing can be saved. So the first iteration is
+    # saved.
     if world_size() == 1:
         saved_at = time.monotonic()
     else:
@@ -86,7 +87,7 @@ def train(
     def over() -> bool:
         if learner.env_steps == 0 or total_seconds == math.inf:
             return learner.env_steps >= total_steps
-        # Clocks differ: process 0's decides.
+        # Clocks differ, so the clock of process 0 decides.
         late = any_process(is_main() and time.monotonic() - began_at >= total_seconds)
         return late or learner.env_steps >= total_steps
 
@@ -178,7 +179,10 @@ def resume(learner: Learner, world: VectorWorld, state: State) -> None:
     """
     parts = [state, *state.get("others", [])]
     if len(parts) != world_size():
-        raise BidexError(f"The checkpoint is of {len(parts)} processes, but here are {world_size()}. Start as many.")
+        raise BidexError(
+            f"The checkpoint has {len(parts)} processes, but this run has {world_size()}. Start the same "
+            "number of processes."
+        )
     mine = parts[rank()]
     world.load_state_dict(mine["env"])
     learner.load_state_dict({**state["learner"], **mine["learner"]})
@@ -208,7 +212,7 @@ def _stop_requests() -> Iterator["_Stop"]:
         return
     asking = (signal.SIGINT, signal.SIGTERM)
     numbers = (*asking, *notices())
-    # None stands for a handler that was not set from Python and cannot be put back.
+    # None stands for a handler that was not set from Python and cannot be restored.
     old = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
 
     def restore(numbers: Iterable[signal.Signals]) -> None:

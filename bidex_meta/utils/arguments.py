@@ -64,13 +64,14 @@ def checked_arguments(target: Target) -> Target:
 
     @functools.cache
     def hints() -> dict[str, object]:
-        return get_type_hints(target, include_extras=True)  # not at import: names may be defined further down
+        # Not at import time, because names may be defined further down.
+        return get_type_hints(target, include_extras=True)
 
     @functools.wraps(target)
     def checked(*arguments: object, **keywords: object) -> object:
         try:
             given = signature.bind(*arguments, **keywords).arguments
-        except TypeError:  # Python's own words for missing and unknown arguments
+        except TypeError:  # Python raises it for missing and unknown arguments
             return target(*arguments, **keywords)
         for argument, value in given.items():
             hint = hints().get(argument, object)
@@ -141,7 +142,7 @@ def _fits_generic(value: object, origin: type, parts: tuple[object, ...]) -> boo
     if not isinstance(value, origin):
         return False
     if isinstance(value, str | bytes):
-        return False  # a text is a sequence of texts, which nobody means
+        return False  # a string is a sequence of strings, which nobody means
     if isinstance(value, Mapping):
         pairs = list(islice(value.items(), _MOST_ELEMENTS))
         return len(parts) < 2 or all(_fits(key, parts[0]) and _fits(each, parts[1]) for key, each in pairs)

@@ -40,7 +40,7 @@ def absolute(path: str | Path) -> Path:
     try:
         return expanded(path).resolve()
     except (RuntimeError, OSError) as error:
-        raise BidexError(f"{shortened(str(path))}: {one_line(error)}. Mend the link, or name another path.") from None
+        raise BidexError(f"{shortened(str(path))}: {one_line(error)}. Fix the link, or name another path.") from None
 
 
 def portable(content: Json) -> Json:
@@ -81,11 +81,11 @@ def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
     Raises BidexError if the file is missing, unreadable or too large, or is no regular file.
     """
     try:
-        # Opening a pipe would wait for somebody to write into it.
+        # Opening a pipe would wait until somebody writes to it.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise BidexError(f"Expected {what} at {path}, but {reason}. Mend the path or the file.") from None
+        raise BidexError(f"Expected {what} at {path}, but {reason}. Fix the path or the file.") from None
     try:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode):
@@ -139,7 +139,7 @@ def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Json]) 
         return bounded(parse(text))
     except RecursionError:
         raise BidexError(f"{path}: expected {what}, but it is nested more than {_DEEPEST} deep.") from None
-    except ValueError as error:  # both parsers' errors are; so is Python's refusal of numbers with too many digits
+    except ValueError as error:  # both parsers raise ValueError, and so does Python for numbers with too many digits
         raise BidexError(f"{path}: expected {what} in {language}, but {one_line(error)[:200].rstrip('.')}.") from None
 
 

@@ -21,7 +21,7 @@ _VARIABLE = "MUJOCO_GL"
 _LIBRARIES = {"egl": ("EGL", "GL"), "osmesa": ("OSMesa",)}
 _OTHERS = {"enable", "enabled", "on", "true", "1", "glfw", "glx", "disable", "disabled", "off", "false", "0"}
 _INSTALL = "(Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6)"
-_impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine does not have
+_impossible: str | None = None  # the value of ``MUJOCO_GL``, if this machine does not support it
 
 
 def set_aside_what_is_missing() -> None:
@@ -45,7 +45,7 @@ def prepare() -> None:
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
-            f"Unset it to take what there is, or install it {_INSTALL}."
+            f"Unset it to use an available one, or install it {_INSTALL}."
         )
     from mujoco.rendering.classic import gl_context
 
@@ -53,7 +53,9 @@ def prepare() -> None:
     if asked or not sys.platform.startswith("linux"):
         reason = _reason(lambda: _try(gl_context.GLContext))
         if reason is not None:
-            raise BidexError(f"Drawing by {_VARIABLE}={asked or 'default'} failed ({reason}). Unset it, or mend that.")
+            raise BidexError(
+                f"Drawing by {_VARIABLE}={asked or 'default'} failed ({reason}). Unset it, or fix the cause."
+            )
         return
     reasons = []
     with_screen = ["glfw"] if has_screen() else []
@@ -75,7 +77,7 @@ def _reason(attempt: Callable[[], None]) -> str | None:
     """Return why an attempt failed, on one line, or None if it succeeded."""
     try:
         attempt()
-    except Exception as error:  # drawing libraries raise errors of many kinds
+    except Exception as error:  # drawing libraries raise many kinds of errors
         return (str(error).splitlines() or [type(error).__name__])[0][:120].rstrip(".")
     return None
 
@@ -112,7 +114,7 @@ def _try(context: Any) -> None:
 
     MuJoCo must not get a context that fails, because MuJoCo would then not draw with the next one either.
     """
-    with warnings.catch_warnings():  # GLFW's are what the caller is told
+    with warnings.catch_warnings():  # the message to the caller contains GLFW's warnings
         warnings.simplefilter("ignore")
         made = context(16, 16)
         made.make_current()

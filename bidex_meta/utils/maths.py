@@ -110,7 +110,8 @@ def uprightness(q: Tensor) -> Tensor:
     return 1.0 - 2.0 * (x * x + y * y)
 
 
-# Half of what the three angles need, as sums of two products: wx + yz, xx + yy, wy - zx, wz + xy, yy + zz.
+# These are halves of the terms of the three angles, as sums of two products: wx + yz, xx + yy, wy - zx, wz + xy, yy +
+# zz.
 _ANGLES = ((3, 1, 0, 1, 3, 2, 3, 0, 1, 2), (0, 2, 0, 1, 1, 0, 2, 1, 1, 2))
 _ANGLE_SIGNS = (1, 1, 1, 1, 1, -1, 1, 1, 1, 1)
 

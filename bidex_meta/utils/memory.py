@@ -49,7 +49,9 @@ def check_memory(needed: float, what: str, mend: str) -> None:
     """
     there = available()
     if needed > there:
-        raise BidexError(f"{what} would take about {needed / 1e9:,.1f} GB, and {there / 1e9:,.1f} are free. {mend}")
+        raise BidexError(
+            f"{what} would take about {needed / 1e9:,.1f} GB, but only {there / 1e9:,.1f} are free. {mend}"
+        )
 
 
 def _free_of_groups() -> Iterator[int]:
@@ -73,7 +75,7 @@ def _cpu_quotas() -> Iterator[float]:
     for group in _groups("cpu"):
         version_1 = _numbers(group / "cpu.cfs_quota_us") + _numbers(group / "cpu.cfs_period_us")
         for quota in (_numbers(group / "cpu.max"), version_1):
-            if len(quota) == 2 and min(quota) > 0:  # version 1 has a quota of -1 for none
+            if len(quota) == 2 and min(quota) > 0:  # version 1 writes -1 for no quota
                 yield quota[0] / quota[1]
 
 
@@ -90,7 +92,7 @@ def _groups(controller: str) -> Iterator[Path]:
         if controllers and controller not in controllers.split(","):
             continue
         place = Path(path.lstrip("/"))
-        # Version 2 has one tree, which lies in a folder "unified" where the machine has version 1 too.
+        # Version 2 has one tree. If the machine also has version 1, the tree is in a folder "unified".
         trees = (controller, controllers) if controllers else (".", "unified")
         for tree in trees:
             yield from (root / tree / group for group in (place, *place.parents))

@@ -23,4 +23,4 @@ def _room(name: str) -> Path:
     for folder in (packed, beside):
         if folder.is_dir():
             return folder
-    raise BidexError(f"Expected the folder {name}/ at {packed} or {beside}, found neither. Install bidex-meta again.")
+    raise BidexError(f"Expected the folder {name}/ at {packed} or {beside}, found neither. Reinstall bidex-meta.")

@@ -44,7 +44,7 @@ def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not look there by itself
+        sys.path.append(os.getcwd())  # a console script does not search the current folder by default
     try:
         spec = importlib.util.find_spec(module_name)
         if spec is not None and spec.origin is not None:
@@ -52,7 +52,7 @@ def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
         message = own_fault(error)
-        # ValueError and TypeError: an empty or a relative name.
+        # Python raises ValueError and TypeError for an empty or a relative name.
         absent = isinstance(error, ModuleNotFoundError)
         if absent or (message is None and isinstance(error, ValueError | TypeError)):
             missing = (error.name if absent else None) or module_name
@@ -75,7 +75,7 @@ def own_fault(error: BaseException) -> str | None:
     for file, line in reversed(at):
         if file in _files:
             return f"{_files[file]}: {_said(error)} ({file}, line {line})."
-    # Wrong arguments are refused by Python before the function has a line of its own.
+    # Python refuses wrong arguments before the first line of the function runs.
     asked = [(short_name(name), file, name) for file, name in _files.items()]
     found = [(file, name) for each, file, name in asked if isinstance(error, TypeError) and f"{each}." in str(error)]
     if found:

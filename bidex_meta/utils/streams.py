@@ -8,7 +8,7 @@ import shutil
 import sys
 from typing import IO
 
-_WIDTHS = (40, 1000)  # columns that tables and help texts can be laid out in
+_WIDTHS = (40, 1000)  # range of columns in which tables and help texts can be laid out
 
 
 def open_missing() -> None:
@@ -56,7 +56,7 @@ def output_width(unknown: int) -> int:
 
 def silence(stream: IO[str]) -> None:
     """Send later output, and output that could not be written before, to the null device."""
-    with contextlib.suppress(OSError, ValueError):  # a stream within Python has no number
+    with contextlib.suppress(OSError, ValueError):  # a stream within Python has no file number
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)

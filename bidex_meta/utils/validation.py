@@ -22,15 +22,15 @@ from bidex_meta.errors import BidexError, nearest, shortened
 
 Kind = TypeVar("Kind")
 
-MOST = 10**12  # no count of anything is larger
+MOST = 10**12  # no count is larger than this
 _LARGE = 1e300
 
 Whole = Annotated[int, Meta(ge=0, le=MOST)]
 Count = Annotated[int, Meta(ge=1, le=MOST)]
 Few = Annotated[int, Meta(ge=1, le=1_000_000)]  # repetitions: episodes, tasks, trials, images
-Shots = Annotated[int, Meta(ge=0, le=1000)]  # adaptations one after the other
+Shots = Annotated[int, Meta(ge=0, le=1000)]  # adaptation rounds, one after the other
 Environments = Annotated[int, Meta(ge=1, le=10_000_000)]
-Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more than there are cores
+Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more threads than the machine has cores
 Pixels = Annotated[int, Meta(ge=1, le=16_384)]
 Port = Annotated[int, Meta(ge=1, le=65_535)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -132,7 +132,7 @@ def real_numbers(name: str, value: object, dimensions: int) -> np.ndarray:
     """
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors of an accelerator
+    except (TypeError, ValueError, RuntimeError):  # lists of unequal lengths, or tensors of an accelerator
         array = np.array(None)
     if array.dtype.kind not in "fiu" or array.ndim != dimensions:
         if array.dtype.kind in "fiu":
@@ -200,7 +200,7 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
         path = ""
     path = path.rstrip("`")
     place = (field + path).removeprefix(".")
-    if isinstance(error.__cause__, BidexError):  # of a dataclass that checks more than its annotations
+    if isinstance(error.__cause__, BidexError):  # a dataclass raised it in a check beyond its annotations
         return str(error.__cause__)
     missing = re.fullmatch(r"Object missing required field `(.*)`", complaint)
     if missing:
@@ -222,7 +222,7 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
     return f"{place or 'content'}: {expected}{got}."
 
 
-# Our words for msgspec's.
+# These are our words for msgspec's terms.
 _WORDS = {"a table": "object", "a list": "array", "a whole number": "int", "a number": "float", "a text": "str"}
 _WORDS |= {"true or false": "bool"}
 
@@ -235,7 +235,7 @@ def _choices(hint: object) -> list[object]:
     return list(itertools.chain.from_iterable(map(_choices, parts)))
 
 
-# A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.
+# This matches a part of msgspec's path, such as ``.runs[0].name``; ``[...]`` stands for an unknown index.
 _STEP = re.compile(r"\.([^.\[]+)|\[([^\]]*)\]")
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 
 _LOOK_SECONDS = 1.0
-# With the time between two looks no more than 5 and 15 seconds.
+# The time between two checks adds to these limits, so notices come after at most 5 and 15 seconds.
 _FIRST_SECONDS = 4.0
 _SECONDS = 14.0
 
@@ -82,6 +82,6 @@ def watched(what: str) -> Iterator[None]:
 
 
 def _look(watch: _Watch, ended: threading.Event) -> None:
-    with contextlib.suppress(OSError, ValueError):  # nobody reads stderr any more: the command finds out by itself
+    with contextlib.suppress(OSError, ValueError):  # nobody reads stderr any more; the command notices this itself
         while not ended.wait(_LOOK_SECONDS):
             watch.look()

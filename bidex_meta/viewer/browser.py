@@ -11,8 +11,8 @@ from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import GHOST_ALPHA
 
 _TYPE = mujoco.mjtGeom
-_Handle = Any  # viser's, which is not imported before something is shown
-_SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
+_Handle = Any  # an object of viser, which is imported only when something is shown
+_SHOWN_GROUPS = 3  # geom groups from this number on are hidden, as in MuJoCo's own viewer
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
@@ -37,7 +37,7 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises BidexError for kinds that the browser cannot show, e.g. height fields.
     """
-    make = import_module("trimesh.creation")  # of viser's packages
+    make = import_module("trimesh.creation")  # trimesh is a dependency of viser
     kind = model.geom_type[geom]
     size = model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:
@@ -55,7 +55,8 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
         mesh.apply_scale(size)
     elif kind == _TYPE.mjGEOM_CAPSULE:
         mesh = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
-        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))  # from one end on in some versions
+        # In some versions the mesh begins at one end instead of the centre.
+        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))
     elif kind == _TYPE.mjGEOM_CYLINDER:
         mesh = make.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
     elif kind == _TYPE.mjGEOM_BOX:
@@ -63,7 +64,7 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     else:
         raise BidexError(
             f"Expected geoms that the browser can show (primitives, meshes), got {model.geom(geom).name!r} of type "
-            f"{_TYPE(int(kind)).name}. Make a film of it: bidex-meta render."
+            f"{_TYPE(int(kind)).name}. Make a film instead: bidex-meta render."
         )
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
@@ -82,7 +83,7 @@ class Browser:
         self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
         self._server.scene.set_up_direction("+z")
-        self._server.scene.configure_environment_map(environment_intensity=0.3)  # at 1 colours are all but white
+        self._server.scene.configure_environment_map(environment_intensity=0.3)  # at 1, colours are almost white
         self._shapes: dict[int, _Handle] = {}
         self._ghosts: list[_Handle] = []
         self._add_controls(stage)
@@ -96,7 +97,7 @@ class Browser:
         self._pause = gui.add_checkbox("Pause", False)
         self._pace = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=min(2.0, max(0.1, self.speed)))
         for label in ("Another episode", "Next task"):
-            # Called in the server's thread; the stage runs in another one.
+            # The server's thread calls this function; the stage runs in another thread.
             gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))
 
     def is_open(self) -> bool:
@@ -110,7 +111,7 @@ class Browser:
         stage.tour = bool(self._tour.value)
         if self._class.value != self._chosen:
             stage.row = stage.names.index(self._class.value)
-            stage.tour = False  # the chosen class stays
+            stage.tour = False  # the chosen class stays in view
             self._tour.value = False
             self.show(stage)
         while self._asked:
@@ -138,7 +139,8 @@ class Browser:
         azimuth, elevation = np.radians(angle)
         away = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
         camera = self._server.initial_camera
-        position = np.array(target) - 1.35 * distance * away  # farther than in pictures: the controls hide a part
+        # Farther away than in pictures, because the controls hide a part of the view.
+        position = np.array(target) - 1.35 * distance * away
         camera.position = position
         camera.look_at = np.array(target)
         camera.fov = 0.7

@@ -38,7 +38,7 @@ class Desktop:
             self._viewer = launch_passive(
                 self._model, self._data, key_callback=self._asked.append, show_left_ui=False, show_right_ui=False
             )
-        except Exception as error:  # the window library raises errors of many kinds
+        except Exception as error:  # the window library raises many kinds of errors
             if sys.platform == "darwin":
                 hint = " On macOS start it by mjpython -m bidex_meta.cli play."
             else:
@@ -98,6 +98,6 @@ def _check_windows() -> None:
         return
     import glfw
 
-    with warnings.catch_warnings(action="ignore"):  # GLFW warns about what is raised here
+    with warnings.catch_warnings(action="ignore"):  # GLFW warns about the error that is raised here
         if not glfw.init():
             raise OSError("GLFW finds no screen")

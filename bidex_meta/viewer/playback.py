@@ -106,7 +106,7 @@ class Stage:
             "class": self.names[row],
             "step": f"{self._steps[row]} of {most}",
             "return": f"{self._returns[row]:.3g}",
-            # Where success counts at the end it is "yes" while the goal is held, and may be lost again.
+            # If success counts at the end, the label is "yes" while the goal is held, and success may be lost again.
             "success": "yes" if self._success[row] else "not yet",
             "episodes": f"{self._solved[row]} of {self._episodes[row]} solved",
         }
@@ -145,10 +145,10 @@ def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
             if not screen.paused:
                 stage.step()
             now = time.monotonic()
-            if now - shown >= 0.9 / _PICTURES:  # a step that comes a little early counts
+            if now - shown >= 0.9 / _PICTURES:  # a step that is slightly early is shown too
                 shown = now
                 screen.show(stage)
-            # Delays are not caught up with: the view would race after each pause.
+            # Delays are not caught up with, because the view would race after each pause.
             due = max(due + 1.0 / (CONTROL_RATE * screen.speed), now)
             time.sleep(due - now)
     finally:

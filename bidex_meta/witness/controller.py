@@ -152,7 +152,7 @@ class HandActions:
         """
         now = xyzw(now / now.norm(dim=-1, keepdim=True))
         error = multiply(held, conjugate(now))
-        way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rad, for small angles
+        way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rotation vector, rad; valid for small angles
         torque = rotate(now, rotate(conjugate(now), way) * constant(ANGULAR_DAMPING, now))
         return GAIN * torque / self._full_torque
 

@@ -33,7 +33,7 @@ class OpenLoopReplay:
         for slot, name in enumerate(task_names):
             if name in witnesses:
                 recorded = torch.from_numpy(witnesses[name].actions)
-                steps = torch.arange(longest).clamp_max(len(recorded) - 1)  # repeats the last action
+                steps = torch.arange(longest).clamp_max(len(recorded) - 1)  # the last action is repeated
                 self._sequences[slot, :, : recorded.shape[1]] = recorded[steps]
         self._task_id = task_id
         self._step = torch.zeros_like(task_id)
@@ -162,13 +162,13 @@ class ShiftedStarts(PooledWorldWrapper):
         starts = engine.placement()[0].expand(rows, -1).clone()
         generator = torch.Generator().manual_seed(SEED if seed is None else seed)
         for name, where in part.group.members[0].scene.qpos.items():
-            if "/" in name:  # a joint, or a hand
+            if "/" in name:  # such a name is a joint or a hand
                 continue
             angle, size = torch.rand(2, rows, generator=generator, dtype=starts.dtype)
             way = torch.stack([(2.0 * torch.pi * angle).cos(), (2.0 * torch.pi * angle).sin()], 1)
             starts[:, where.start : where.start + 2] += self._shift * size.sqrt()[:, None] * way
         engine.reset(torch.ones(rows, dtype=torch.bool), starts)
-        # Loading a state makes the world return observations of these starts.
+        # Loading a state makes the world return the observations of these starts.
         action = torch.zeros(self.world.action_space.shape)
         obs = part.observe(list(part.states(self.world.task_index)), action, *base_rotations([part]))
         self.world.load_state_dict(self.world.state_dict() | {"observation": obs})

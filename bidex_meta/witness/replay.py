@@ -15,7 +15,7 @@ from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World, WorldConfig
 from bidex_meta.world.part import judge
 
-# witnesses are about task 0 of each class of this suite and seed
+# Witnesses solve task 0 of each class of this suite and seed.
 SUITE = "MT20"
 SEED = 0
 SHIFT = 1e-4  # how far the objects' start is shifted to see whether a witness succeeds by more than luck, metres

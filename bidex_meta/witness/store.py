@@ -56,7 +56,7 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
             raise BidexError(f"{name} has no witness. `bidex-meta witness --all` shows which classes have one.")
         return _read(path)
     if not path.is_file():
-        raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
+        raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is not a file.")
     witness = _read(path)
     size = registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
@@ -77,14 +77,14 @@ def _read(path: Path) -> Witness:
     content = io.BytesIO(read_bytes(path, "a witness", _MOST_BYTES))
     try:
         with zipfile.ZipFile(content) as archive:
-            # A small archive may unpack to anything.
+            # A small archive may unpack to any size.
             if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
                 raise ValueError("it unpacks to too much")
         content.seek(0)
         with np.load(content, allow_pickle=False) as stored:
             levels = stored["actions"]
             made = bounded(json.loads(str(stored["made"])))
-    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds of errors for a damaged file
         reason = one_line(error)[:150].rstrip(".")
         raise BidexError(f"Expected a witness at {path}, but {reason}. Copy the file again.") from None
     if levels.dtype != np.int8 or levels.ndim != 2 or not 1 <= len(levels) <= _MOST_STEPS:

@@ -113,10 +113,12 @@ def _units_of_agents(units: dict[str, list[int]], line: str) -> dict[str, list[s
                 raise unknown_name(f"unit of agent {name}", unit, units)
             if unit in owners:
                 raise BidexError(
-                    f"agents: expected each unit once, but {unit} is of {owners[unit]} and of {name}. Take one out."
+                    f"agents: expected each unit once, but {unit} belongs to {owners[unit]} and to {name}. Remove one."
                 )
             owners[unit] = name
     missing = [unit for unit in units if unit not in owners]
     if missing:
-        raise BidexError(f"agents: expected each unit of the world, but {', '.join(missing)} is of no agent. Add it.")
+        raise BidexError(
+            f"agents: expected each unit of the world, but {', '.join(missing)} belongs to no agent. Add it."
+        )
     return found

@@ -242,7 +242,7 @@ class BatchedWorld(VectorEnv, ABC):
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
-        if self._masked or not valid.all():  # on the CPU the question costs less than a pass over all observations
+        if self._masked or not valid.all():  # on the CPU this check costs less than a pass over all observations
             obs = torch.where(valid[:, None], obs, self._obs)
         info: Info = {
             "success": episodes.solved_at_end if self.success_at_end else solved,
@@ -290,7 +290,7 @@ class BatchedWorld(VectorEnv, ABC):
         self._set_seed(int(state["seed"]))
         self._renew_draws()
         self.episodes.load_state_dict(state["episodes"])
-        # Checkpoints are loaded to the CPU, wherever the world lives.
+        # Checkpoints are loaded to the CPU, whatever the device of the world.
         self.task_index = state["task_index"].to(self.device, copy=True)
         self._obs = state["observation"].to(self.device, copy=True)
         self._ready = True

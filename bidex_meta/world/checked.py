@@ -100,7 +100,7 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
 
     Non-finite numbers become 0.
     """
-    # Zero times a number is zero unless the number is infinite or NaN.
+    # Zero times a number is zero, unless the number is infinite or NaN.
     broken = (0.0 * action).sum(dim=1) != 0.0
     return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
 
@@ -165,12 +165,13 @@ def _check_made(given: object, own: Mapping[str, str]) -> None:
         if isinstance(value, str) and value == own.get(name, "none"):
             continue
         count += 1
-        kind = name.partition(" of ")[0]  # one slot is an example of all
+        kind = name.partition(" of ")[0]  # one slot stands for all
         told.setdefault(kind, one_line(f"{name} {value}, here {own.get(name, 'none')}")[:_LONGEST])
     if count:
         differences = "; ".join(list(told.values())[:_TOLD])
         raise BidexError(
-            f"Expected the state of a world that was made alike, got {count} differences: {differences}; {_AGAIN}"
+            f"Expected the state of a world that was made with the same arguments, got {count} differences: "
+            f"{differences}; {_AGAIN}"
         )
 
 

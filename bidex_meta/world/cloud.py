@@ -132,7 +132,7 @@ class Cloud:
         cloud = chosen @ self._axes + self._eye
         if self._kinds is not None:
             cloud = torch.cat((cloud, self._kinds[index][..., None]), dim=2)
-        # where, not a product: where physics broke, candidates are NaN.
+        # torch.where is used instead of a product, because candidates are NaN if physics broke.
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -144,7 +144,7 @@ class Cloud:
         turn = rotation.index_select(1, self._bodies).float()
         offset = position.index_select(1, self._bodies).float() - self._eye
         poses = torch.cat((self._axes @ turn, (offset @ self._axes.T)[..., None]), dim=3)
-        # The eye in the body's frame; n . (eye - p) is positive where a surface faces it.
+        # The eye is in the body's frame; n . (eye - p) is positive if a surface faces the eye.
         eye = torch.cat((-(offset[:, :, None] @ turn)[:, :, 0], torch.ones_like(offset[..., :1])), dim=2)
         n = len(offset)
         places = offset.new_empty(n, 3, self._size)
@@ -160,12 +160,13 @@ class Cloud:
         scale = focal / depth
         column = x * scale + 0.5 * _PIXELS
         row = y * scale + 0.5 * _PIXELS
-        # False for NaN, where physics broke.
+        # The comparison is false for NaN, which broken physics gives.
         inside = (column >= 0) & (column < _PIXELS) & (row >= 0) & (row < _PIXELS)
         candidate = inside & (depth > camera.near) & (depth < camera.far) & (facing > 0)
         pixel = torch.where(candidate, row.floor() * _PIXELS + column.floor(), 0.0).long()
-        # A neighbour on the same slanted surface must hide nothing: each draws what its surface reaches a pixel further
-        # away. Depth changes by tan(angle) / focal of itself from pixel to pixel; cos(angle) = facing / distance.
+        # A neighbour on the same slanted surface must not hide a point. So each point draws the depth that its surface
+        # has one pixel further away. From pixel to pixel, the depth changes by tan(angle) / focal times its value, with
+        # cos(angle) = facing / distance.
         cosine = (facing / torch.sqrt(x * x + y * y + depth * depth)).clamp_min(1e-3)
         slant = torch.sqrt((1.0 - cosine * cosine).clamp_min(0.0)) / cosine
         reach = (_SLOPE * slant * depth / focal).clamp_max(_MOST_SLOPE)

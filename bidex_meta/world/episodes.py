@@ -175,7 +175,7 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
         raise BidexError(f"Expected reset options as a dict, got {shortened(options)}. Leave options out.")
     if unknown := sorted(map(str, (options or {}).keys() - {"reset_mask"})):
         raise BidexError(
-            f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start some environments alone give "
+            f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start only some environments, give "
             f"a bool mask of all: reset(options={{'reset_mask': mask}}), shape ({num_envs},)."
         )
     given = (options or {}).get("reset_mask")
@@ -187,7 +187,9 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
             got = shortened(given)
         else:
             got = f"{mask.dtype} {tuple(mask.shape)}"
-        raise BidexError(f"Expected a bool reset_mask of shape ({num_envs},), got {got}. Without it all start.")
+        raise BidexError(
+            f"Expected a bool reset_mask of shape ({num_envs},), got {got}. Without the mask, all environments start."
+        )
     if not ready and not mask.all():
         raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")
     return mask

@@ -60,7 +60,7 @@ class ForeignWorld(BatchedWorld):
         self._set_spaces(Box(low, high, dtype=np.float32), sizes.action)
         if self.num_id_columns:
             self._obs[:, sizes.state :] = torch.eye(count)[self.task_id]
-        # Success of the last transition, which a frozen environment keeps.
+        # A frozen environment keeps the success of its last transition.
         self._success = torch.zeros(self.num_envs, dtype=torch.bool)
 
     def _draws(self, num: int) -> Tensor:

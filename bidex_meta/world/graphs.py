@@ -100,7 +100,7 @@ def fresh(result: Result) -> Result:
     """Copy a nest of tensors into new memory; a tensor that occurs twice is copied once."""
     tensors = {id(value): value for value in tree_leaves(result) if isinstance(value, Tensor)}
     copies = {key: torch.empty_like(value) for key, value in tensors.items()}
-    for kind in {value.dtype for value in tensors.values()}:  # one call per dtype launches few kernels
+    for kind in {value.dtype for value in tensors.values()}:  # one call per dtype needs few kernels
         keys = [key for key, value in tensors.items() if value.dtype == kind]
         torch._foreach_copy_([copies[k] for k in keys], [tensors[k] for k in keys])  # pyright: ignore
     return tree_map_only(Tensor, lambda value: copies[id(value)], result)
@@ -188,7 +188,7 @@ class SideBySide:
                 job()
             return
         caller = torch.cuda.current_stream()
-        # One event before all jobs: of a later one, in the legacy stream, jobs under way might have to be waited for.
+        # One event is recorded before all jobs. A later event in the legacy stream might have to wait for running jobs.
         before = caller.record_event()
         for stream, job in zip(self._streams, jobs, strict=True):
             stream.wait_event(before)

@@ -97,10 +97,10 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
         given = np.array(None)
     if given.dtype.kind not in "fiub":
         raise BidexError(f"{wanted}, got {type(tasks).__name__} that is no array of real numbers.")
-    tasks = given.astype(np.float64)  # a copy
+    tasks = given.astype(np.float64)  # makes a copy
     if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != space.size:
         raise BidexError(f"{wanted}, got {tasks.shape}.")
-    good = np.abs(tasks) <= _LARGEST  # false for NaN
+    good = np.abs(tasks) <= _LARGEST  # the comparison is false for NaN
     if not good.all():
         row, column = (int(i) for i in np.argwhere(~good)[0])
         raise BidexError(

@@ -38,7 +38,7 @@ class HiddenParts:
         values = torch.empty(world.num_envs, world.observation_size, device=world.device)
         for part in world.parts:
             values[part.group.env_ids] = part.goals(part.group.take(world.task_index), world.observation_size)
-        # Added, because an entry of the goal in one class may belong to an object in another.
+        # The parts are added, because an entry of the goal in one class may belong to an object in another class.
         return obs.index_add(1, self._goal_entries, values[:, self._goal_entries])
 
     def values(self, world: PartedWorld) -> Tensor:

@@ -88,7 +88,7 @@ def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
     for name in ("body_mass", "body_inertia", "body_subtreemass"):
         yield "object_mass", name, (1.0 * objects)[:, None]
     yield "object_mass", "body_invweight0", (-1.0 * objects)[:, None]
-    for name in ("dof_armature", "dof_M0"):  # where C MuJoCo has the inertia of bodies whose frames are simple
+    for name in ("dof_armature", "dof_M0"):  # C MuJoCo stores the inertia of bodies with simple frames here
         yield "object_mass", name, (1.0 * of_object)[:, None]
     yield "object_mass", "dof_invweight0", (-1.0 * of_object)[:, None]
     for name in ("geom_size", "geom_pos", "geom_rbound", "geom_aabb"):

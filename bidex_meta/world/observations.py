@@ -40,7 +40,7 @@ class Observer:
             turns = 3 * len(SIDES)
         else:
             turns = 0
-        # Columns: sensors, actions, rotations. Fresh memory for every step would cost more than what is written to it.
+        # These hold sensors, actions and rotations. Allocating them in every step would cost more than filling them.
         self._values = torch.empty(len(start_mounts), actions + turns, device=device)
         self._columns = slice(0, sensors), slice(sensors, actions), slice(actions, actions + turns)
         self._source = torch.zeros(width, dtype=torch.int64, device=device)

@@ -97,7 +97,7 @@ class Part:
             checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         if sights is not None:
-            self._engine.body_poses()  # from now on the engine gives them
+            self._engine.body_poses()  # from this call on, the engine computes the poses
         self.set_pools(slots)
 
     def _start_mounts(self) -> Tensor:
@@ -116,7 +116,7 @@ class Part:
             tasks = torch.tensor(slots[member.slot].tasks, device=self._engine.device)
             frozen = member.scene.task.frozen(tasks.to(self._engine.sensordata))
             self.tasks.append(tasks)
-            # Copies, because some values are views of others, and ``renew`` writes into them.
+            # The values are copied, because some are views of others and ``renew`` writes into them.
             pool = {}
             for name, value in frozen.items():
                 pool[name] = value.clone(memory_format=torch.contiguous_format)

@@ -42,7 +42,7 @@ def env_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
 
 def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
     """Return keys (n, 2) of a stream of numbers within an episode (n,), from the keys (n, 2) of its environment."""
-    beyond = torch.full_like(episode, _MASK - stream)  # no pair of an episode's own draws is counted so far
+    beyond = torch.full_like(episode, _MASK - stream)  # the episode's own draws never count up to this number
     return torch.stack(threefry((keys[:, 0], keys[:, 1]), (episode, beyond)), dim=1)
 
 

@@ -85,7 +85,7 @@ class _Remade(type):
 def _reduced(made: _Remade) -> str | tuple[Callable[..., _Remade], tuple[EnvRecipe]]:
     recipe = vars(made).get("recipe")
     if recipe is None:
-        return made.__qualname__  # one of a module's own
+        return made.__qualname__  # the class is one of the module's own
     return _make_class, (recipe,)
 
 
@@ -152,7 +152,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self.goal_space = Box(np.array(space.low), np.array(space.high), dtype=np.float64)
         self.terminate_on_success = False
         self._task: AnyTask | None = None
-        self._given: AnyTask | None = None  # waits for the next reset
+        self._given: AnyTask | None = None  # the task waits for the next reset
         self._over = True
 
     @property

@@ -15,7 +15,7 @@ from bidex_meta.world.graphs import Stepper, Together
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import uniform
 
-# Draws of an episode that are the world's own: the task, and the elapsed time of a training world's first episode.
+# The world makes these draws of an episode: the task, and the elapsed time of a training world's first episode.
 _TASK_DRAW = 0
 _ELAPSED_DRAW = 1
 _OWN_DRAWS = 2
@@ -72,7 +72,8 @@ class Starts:
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
         """Draw ahead if the next ``take`` needs new draws; ``take`` must get the same mask, number and task_index."""
         if self._masked:
-            # An environment begins at most one episode per take, so counting them replaces a look at any number.
+            # An environment begins at most one episode per take, so counting takes replaces reading any number from the
+            # device.
             if self._takes % _AHEAD == 0:
                 stepper.run(self._draw_all, number, task_index)
             self._takes += 1

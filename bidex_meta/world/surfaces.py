@@ -95,8 +95,8 @@ def _sphere(u: np.ndarray) -> np.ndarray:
 
 
 def _ellipsoid(size: np.ndarray, count: int, offset: np.ndarray) -> Surface:
-    # The sphere's points stretched are too dense at the ends; each stays with a chance in proportion to how much its
-    # place was stretched.
+    # Stretching a sphere's points makes them too dense at the ends. Each point is kept with a probability in proportion
+    # to the local stretch.
     tries = 4 * count + 64
     unit = _sphere(even_numbers(tries, offset))
     stretch = np.linalg.norm(unit / size, axis=1)
@@ -108,7 +108,8 @@ def _ellipsoid(size: np.ndarray, count: int, offset: np.ndarray) -> Surface:
 
 
 def _capsule(size: np.ndarray, u: np.ndarray) -> Surface:
-    # Archimedes: the caps' area is that of the cylinder around them, so height is uniform over the whole length.
+    # By Archimedes' theorem, the caps' area equals that of the enclosing cylinder, so the height is uniform over the
+    # whole length.
     radius = size[0]
     half = size[1]
     height = (2.0 * u[:, 0] - 1.0) * (half + radius)
@@ -128,7 +129,7 @@ def _cylinder(size: np.ndarray, u: np.ndarray) -> Surface:
     turn = 2.0 * np.pi * u[:, 1]
     circle = np.stack((np.cos(turn), np.sin(turn)), axis=1)
     on_side = u[:, 0] < side
-    rest = (u[:, 0] - side) / (1.0 - side)  # in [0, 1): both discs, one after the other
+    rest = (u[:, 0] - side) / (1.0 - side)  # in [0, 1): the two discs, one after the other
     end = np.where(rest < 0.5, -1.0, 1.0)
     share = 2.0 * rest % 1.0
     points = np.empty((len(u), 3))
@@ -250,7 +251,8 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
     of_body = body_kinds(model)
     seen = {geom: _in_body(model, geom, _PROBES, offsets[geom], geoms) for geom in geoms}
     open_area = np.array([area(model, g) * len(seen[g][0]) / _PROBES for g in geoms])
-    # Only geoms of the world itself have the fixtures' share: a door's frame has its points from the objects'.
+    # Only geoms that belong to the world itself use the fixtures' share. A door's frame takes its points from the
+    # objects' share.
     owners = model.geom_bodyid[geoms]
     kinds = np.full(len(owners), OBJECT)
     kinds[np.array(of_body)[owners] == HAND] = HAND

@@ -31,7 +31,7 @@ def set_up_torch(threads: int, deterministic: bool = False) -> None:
     if deterministic:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a GPU is first used
         torch.use_deterministic_algorithms(True)
-        # To fill new memory only serves to find faults, and takes time.
+        # Filling new memory only serves to find bugs, and takes time.
         setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010  # the stubs lack it
     keep_freed_memory()
 

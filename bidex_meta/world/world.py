@@ -142,7 +142,7 @@ class World(BatchedWorld):
         self.endless = config.task_sampling == "fresh"
         self._renews_tasks = self.endless and self.autoreset_mode != AutoresetMode.DISABLED
         if self._renews_tasks:
-            # Entry j of a pool is of environment j; the start of each episode replaces it.
+            # Entry j of a pool belongs to environment j, and each episode start replaces it.
             self.slots = [_with_entries(*each) for each in zip(self.slots, self.slot_env_ids, strict=True)]
             self._set_pool_sizes([len(slot.tasks) for slot in self.slots])
         self.metadata |= {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}
@@ -306,7 +306,7 @@ class World(BatchedWorld):
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
         self._starts.prepare(self._stepper, mask, self.episodes.number + 1, self.task_index)
-        # Only first resets are staggered, too few for a recording.
+        # Only first resets are staggered, and a recording would not pay off for them.
         if stagger:
             starts = self._take_starts(mask, stagger=True)
         else:
@@ -316,7 +316,7 @@ class World(BatchedWorld):
 
     def _take_starts(self, mask: Tensor, stagger: bool = False) -> list[Tensor]:
         """Count new episodes in the environments of a mask and return their starts, part by part."""
-        # The number counts for all: starts of other environments may be drawn in the same go.
+        # The number counts for all environments, because starts of others may be drawn in the same call.
         task_index, share, starts = self._starts.take(mask, self.episodes.number + 1, self.task_index)
         self._count_episodes(mask, task_index, share, stagger)
         self._action = torch.where(mask[:, None], 0.0, self._action)
@@ -335,7 +335,7 @@ class World(BatchedWorld):
 
     def _refresh(self, mask: Tensor) -> None:
         """Write the first observations of the episodes in the environments of a mask."""
-        # Masked engines observe all environments: shapes must not depend on the mask.
+        # Masked engines observe all environments, because shapes must not depend on the mask.
         if self._masked:
             obs = torch.empty_like(self._obs)
         else:
@@ -421,7 +421,7 @@ class World(BatchedWorld):
     def load_state_dict(self, state: State) -> None:
         """Restore a ``state_dict``; raises BidexError for the state of a world that was made differently."""
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
-        # A world that evaluates may finish the episodes of one that trains.
+        # An evaluation world may continue the episodes of a training world.
         self._renews_tasks = state.get("renews_tasks", False) and self.autoreset_mode != AutoresetMode.DISABLED
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)

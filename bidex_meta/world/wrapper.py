@@ -42,7 +42,7 @@ class WorldWrapper(VectorWorld):
         self.world = world
 
     def __getattr__(self, name: str) -> Any:
-        if name == "world":  # not made yet, as in copies
+        if name == "world":  # the world is not set yet, as in copies
             raise AttributeError(name)
         return getattr(self.world, name)
 
@@ -137,7 +137,7 @@ class NumpyWorld(VectorEnv):
         info: Info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}
         ended = _array(step_info["_final_obs"])
         if ended.any():
-            step_info = ended_info(step_info) | step_info  # a world's own has the time on the clock
+            step_info = ended_info(step_info) | step_info  # the info of a world contains the elapsed time
             info |= {"final_obs": np.full(self.num_envs, None, dtype=object), "_final_obs": ended}
             for env_id, obs in zip(np.flatnonzero(ended), _array(step_info["final_obs"])[ended], strict=True):
                 info["final_obs"][env_id] = obs

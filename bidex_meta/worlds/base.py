@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
-# Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
+# A meta-batch consists of whole episodes of all environments, so fewer environments give more meta-batches.
 _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 
@@ -62,9 +62,9 @@ class Worlds(ABC):
 
     hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
-    class_name: str | None = None  # the class, if there is a single one
+    class_name: str | None = None  # name of the class, if the worlds have a single class
     object: str | None = None
-    moving_base: bool | None = None  # whether a single class has moving bases; None: the class's own bases
+    moving_base: bool | None = None  # True if a single class has moving bases; None: as the class defines it
     on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
     """Name of the preset that ``auto`` prefers for these worlds, if the learner has it, and the reason in words."""

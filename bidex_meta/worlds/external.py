@@ -13,7 +13,7 @@ from bidex_meta.worlds.base import Identity, Worlds, WorldsConfig
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import Agent, PooledWorld, TaskClass
 
-HUMANOID = "gymnasium/Humanoid-v5"  # how a run names it (``--task``)
+HUMANOID = "gymnasium/Humanoid-v5"  # name of the class in ``--task``
 
 # Environments and steps per class of Meta-World; 2 M steps are the budget of published results.
 _TRAINING_SIZE = 4
@@ -33,16 +33,16 @@ class Foreign(Worlds):
     def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         if self.randomisation is not None:
-            raise BidexError(f"Worlds of our own are randomised, got {name}. Leave --randomisation out.")
+            raise BidexError(f"Only bidex-meta's own worlds can be randomised, got {name}. Leave --randomisation out.")
         if config.touch:
-            raise BidexError(f"Touch sensors are of our hands, got {name}. Leave --touch out.")
+            raise BidexError(f"Only bidex-meta's hands have touch sensors, got {name}. Leave --touch out.")
         if config.tasks_per_class is not None:
-            raise BidexError(f"Suites of our own draw their tasks, got {name}. Leave --tasks-per-class out.")
+            raise BidexError(f"Only bidex-meta's own suites draw their tasks, got {name}. Leave --tasks-per-class out.")
 
     def _check(self, split: str, rows: int) -> None:
         """Refuse any split but train, any engine but C MuJoCo on the CPU, and worlds that do not fit into memory."""
         if split != "train":
-            raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
+            raise BidexError(f"{self.name} has only the split train, got {split!r}. Leave --split out.")
         if not self.device.startswith("cpu") or self.engine == "warp":
             if self.engine == "warp":
                 wrong = "--engine warp"
@@ -53,7 +53,7 @@ class Foreign(Worlds):
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """Raise BidexError: the classes belong to another library."""
-        raise BidexError(f"Pictures and references are made of classes of our own, got {self.name}. Name another.")
+        raise BidexError(f"Pictures and references need bidex-meta's own classes, got {self.name}. Name another.")
 
     def identity(self) -> Identity:
         """Return an identity without entries: the version of the library's package identifies the physics."""
@@ -68,14 +68,16 @@ class MetaWorldSuite(Foreign):
     """The worlds of one of Meta-World's suites."""
 
     preset = ("metaworld", "the suite is Meta-World's")
-    default_episodes = 1  # its tasks fix their start, so that a policy would only repeat itself
+    default_episodes = 1  # tasks fix their start, so that further episodes would only repeat the first
     bytes_per_environment = 10_000_000
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
         super().__init__(name, config)
         self.class_names = metaworld_classes(name)
         if self.points:
-            raise BidexError(f"Point clouds are made of scenes of our own, got the suite {name}. Leave --points out.")
+            raise BidexError(
+                f"Only bidex-meta's own scenes have point clouds, got the suite {name}. Leave --points out."
+            )
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """See ``Worlds``."""
@@ -117,7 +119,7 @@ class HumanoidTask(Foreign):
         given = {"points": config.points or None, "object": config.object, "base": config.base.replace("own", "")}
         for flag, value in given.items():
             if value:
-                raise BidexError(f"--{flag} is of the classes with hands, got {value} with {HUMANOID}. Leave it out.")
+                raise BidexError(f"--{flag} is for classes with hands, got {value} with {HUMANOID}. Leave it out.")
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """See ``Worlds``."""

@@ -79,7 +79,7 @@ class HumanoidWorld(ForeignWorld):
                 raise unknown_name("class", name, [NAME])
             shape = np.shape(pool)
             if len(shape) != 2 or shape[0] == 0 or shape[1] != 0:
-                raise BidexError(f"Expected tasks of {NAME} as (n, 0), for they are all alike, got {shape}.")
+                raise BidexError(f"Expected tasks of {NAME} as (n, 0), because all tasks are equal, got {shape}.")
             self._set_pool_sizes([shape[0]])
 
     @property
@@ -111,7 +111,7 @@ class HumanoidWorld(ForeignWorld):
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
         engine = self._engine
         moved = active & ~broken
-        # In single precision, as Gymnasium's actions are.
+        # Actions are in single precision, as in Gymnasium.
         engine.ctrl[:] = self._action * self._largest.float()
         engine.step(_SUBSTEPS, moved)
         self._feel(moved)

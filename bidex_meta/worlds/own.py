@@ -44,7 +44,7 @@ class OwnSuite(Worlds):
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """See ``Worlds``."""
         if rows is None:
-            # They are split evenly over slots, so that all need as many as the slot with the most tasks.
+            # Environments are split evenly over slots, so all slots need as many as the slot with the most tasks.
             pools = self.tasks(split).values()
             rows = max(map(len, pools), default=1) * max(len(pools), 1)
         given = split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine
@@ -85,14 +85,14 @@ class SingleClass(Worlds):
             self.preset = V2_PRESET
         self.name = name_with_object(name, self.object)
         if self.object is not None:
-            self.task_classes()  # refuses an unknown one now
+            self.task_classes()  # raises BidexError now for an unknown class
 
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """See ``Worlds``."""
         from bidex_meta.benchmark import make_task_world
 
         if split != "train":
-            raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
+            raise BidexError(f"A run on the single task {self.name} has no {split} split. Leave --split out.")
         named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
         named |= {"randomisation": self.randomisation, "touch": self.touch, "deterministic": self.deterministic}
         given = self.class_name, rows or _TASKS_ALONE, self.device, self.seed, mode or "DISABLED", self.threads

@@ -13,6 +13,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 STAGE = ROOT / "build" / "site-pages"
 LINK = re.compile(r"(\]\()(?!https?://|mailto:|#)([^)#\s]+)(#[^)\s]*)?\)")
+WITHIN_VALUES = re.compile(r"(?<=\d) (?=%|[→×]|to [-\d])|(?<=\d to) (?=[-\d])|(?<=[→×]) (?=[-\d])|(?<=,) (?=[^],\s]+])")
+"""Spaces within a value of a table, as in ``89.5 % (88.7 to 90.6)``, where a narrow cell must not break the line."""
 
 
 def stage() -> list[Path]:
@@ -39,7 +41,9 @@ def stage() -> list[Path]:
         text = source.read_text(encoding="utf-8")
         linked = [(source.parent / found[2]).resolve() for found in LINK.finditer(text)]
         waiting += [_page_of(path) for path in linked if _page_of(path).is_file()]
-        target.write_text(LINK.sub(partial(_for_the_site, source), text), encoding="utf-8")
+        text = LINK.sub(partial(_for_the_site, source), text)
+        text = re.sub(r"^\|.*$", _with_whole_values, text, flags=re.MULTILINE)
+        target.write_text(text, encoding="utf-8")
     return [page for page in seen if page.suffix == ".md"]
 
 
@@ -53,6 +57,11 @@ def _for_the_site(source: Path, found: re.Match[str]) -> str:
     if not path.is_dir():
         return found[0]
     return f"{found[1]}{found[2].rstrip('/')}/README.md{found[3] or ''})"
+
+
+def _with_whole_values(row: re.Match[str]) -> str:
+    """Return the row of a table whose values do not break between number and unit."""
+    return WITHIN_VALUES.sub("\N{NO-BREAK SPACE}", row[0])
 
 
 if __name__ == "__main__":

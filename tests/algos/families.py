@@ -24,9 +24,9 @@ class PointClass:
     """A task class of :class:`PointGoals`."""
 
     name: str = "PointGoals"
-    steps: int = 20  # time limit
-    scale: float = 1.0  # of the reward
-    count: int = 8  # goals in the pool, :func:`circle` of them
+    steps: int = 20  # time limit in steps
+    scale: float = 1.0  # scale of the reward
+    count: int = 8  # number of goals in the pool, on a :func:`circle`
 
 
 class PointGoals(FakePools):

@@ -72,7 +72,7 @@ class LQR(_TimedWorld):
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b, q, r = (torch.from_numpy(m).float() for m in (self.a, self.b, self.q, self.r))
         cost = ((self.state @ q) * self.state).sum(1) + ((action @ r) * action).sum(1)
-        # A policy that blows the state up shall be bad, not infinite.
+        # A policy that lets the state diverge must be rated as bad, not as infinite.
         state = (self.state @ a.T + action @ b.T).clamp(-5.0, 5.0)
         self.state = torch.where(active[:, None], state, self.state)
         return -cost, self.state.abs().amax(1) < 0.1, self.never

@@ -14,7 +14,7 @@ import torch
 
 from bidex_meta.training import distributed
 
-# A deadlock shall fail, not last; a busy machine shall do neither.
+# A deadlock must fail and not last, but a busy machine must not fail.
 _DEADLOCK_SECONDS = 500
 
 
@@ -27,7 +27,7 @@ def exit_codes(function: Callable[[int], Any], folder: Path) -> list[int | None]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # Spawned, since a forked process would inherit torch's threads in an undefined state.
+    # Processes are spawned, because a forked process would inherit torch's threads in an undefined state.
     context = multiprocessing.get_context("spawn")
     processes = [context.Process(target=_one, args=(function, rank, port, folder)) for rank in range(2)]
     for process in processes:
@@ -77,6 +77,6 @@ def resumed(make: Callable[[int], Any], iterations: int = 3) -> tuple[Any, Any]:
         assert a == b
     ends = [each.state_dict() for each in (unbroken, again)]
     for end in ends:
-        end["policy"].pop("seed", None)  # of the learner's making, which the test lets differ
+        end["policy"].pop("seed", None)  # the learner sets it, and the test lets it differ
     assert same(*ends)
     return unbroken, again

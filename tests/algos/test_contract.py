@@ -123,10 +123,10 @@ def each(cases: dict[str, Case]) -> Callable[..., Any]:
 
 @each(CASES | SHARING)
 def test_save_load_resume_is_bit_equal(case: Case) -> None:
-    # Networks of SHARING differ, and the state beside them does not: one iteration shows what they save.
+    # Networks in SHARING differ, but the state beside them does not, so one iteration shows what they save.
     unbroken, again = resumed(case.make, iterations=2 if case in CASES.values() else 1)
     policy = type(again).load_policy(again.policy_state_dict())
-    obs = torch.randn(5, again.shape.observations)  # of another number of environments
+    obs = torch.randn(5, again.shape.observations)  # another number of environments
     if again.shape.num_id_columns:
         obs[:, -2:] = torch.eye(2)[[0, 1, 1, 0, 1]]
     for each in (policy, unbroken):
@@ -150,7 +150,7 @@ def test_a_transition_that_broke_physics_teaches_nothing(case: Case) -> None:
 @each({name: case for name, case in PLAYING.items() if "slices" not in name and "policy_heads" not in case.options})
 def test_training_counts_success_by_the_worlds_rule(case: Case) -> None:
     """A quarter of the episodes hold the goal at the end; the others had held it long enough, and lost it."""
-    if case.algo == "dagger":  # whose figures leave out what teachers play
+    if case.algo == "dagger":  # the figures of DAgger leave out episodes that teachers play
         case = Case(case.algo, case.options | {"teacher_steps": 0})
     learner = case.make(world=Passing(16, learner_kind(case.algo).make.autoreset_mode(case.config)))
     found: dict[str, float] = {}

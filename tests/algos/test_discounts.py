@@ -86,10 +86,10 @@ def test_bootstraps_and_returns_of_a_replay_are_those_by_hand(kind: str):
     world = paying(horizon=50)
     learner = make(world, replace(config, per_task_rewards=False, steps_per_iteration=2), seed=0)
     learner.iterate()
-    # Nothing has ended: the sum of what was paid, discounted by each row's own.
+    # No episode has ended, so the statistics hold the sum of rewards, discounted by each row's own factor.
     paid = learner.replay._steps["rewards"][:2]
     by_row = OF_TASKS[world.task_id]
-    ended = learner.returns.discounted == 0.0  # of episodes that began late
+    ended = learner.returns.discounted == 0.0  # these episodes began late
     assert ended.sum() <= 2
     assert_close(learner.returns.discounted[~ended], (by_row * paid[0] + paid[1])[~ended])
     places = learner.replay.draw(1, learner.batch_per_task, learner.generator)
@@ -102,7 +102,7 @@ def test_bootstraps_and_returns_of_a_replay_are_those_by_hand(kind: str):
 def test_a_learner_with_one_discount_for_all_refuses_such_a_world():
     world = PointGoals(24, classes=(PointClass(), PointClass("Far")))
     world.gammas = (0.9, None)
-    with pytest.raises(BidexError, match=r"promp: has one discount .* gives PointGoals one of its own"):
+    with pytest.raises(BidexError, match=r"promp: uses one discount .* gives PointGoals one of its own"):
         ProMP(world, replace(PROMP["laptop"], hidden=(8,)), seed=0)
 
 

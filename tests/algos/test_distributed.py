@@ -56,7 +56,7 @@ REPLAYED: dict[str, Any] = {
 }  # fmt: skip
 SAC, ATOMS = MTSACConfig(**REPLAYED), BRCConfig(**REPLAYED, critic_hidden=(16, 16), atoms=51)
 FLASH = FlashSACConfig(**REPLAYED, critic_hidden=(16, 16), atoms=51)
-# Steps in proportion to the gradient: Adam as such would not see a sum in the place of a mean.
+# Steps are in proportion to the gradient, because Adam would not reveal a sum instead of a mean.
 PLAIN_SAC = replace(
     SAC, adam_eps=10.0, max_grad_norm=1e9, learning_rate=0.5, critic_learning_rate=0.5, alpha_learning_rate=0.5
 )
@@ -257,7 +257,7 @@ def everything(rank: int) -> dict[str, Any]:
     alone = {name: moves() for name, moves in TWINS.items()}
     distributed.init_from_environment()
     found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
-    # Twins: the same draws and noise in both. Sums over both must then be the means that one finds.
+    # Both processes have the same draws and noise, so sums over both must be the means that one process finds.
     original, base.own_seed = base.own_seed, lambda seed: seed
     found["twins"] = {name: (moves(), alone[name]) for name, moves in TWINS.items()}
     base.own_seed = original
@@ -324,7 +324,7 @@ def test_networks_and_metrics_are_those_of_all_noise_differs_and_a_run_is_resume
     a, b = (here[name]["whole"]["learner"] for here in found)
     own = make.per_process
     assert same({k: v for k, v in a.items() if k not in own}, {k: v for k, v in b.items() if k not in own})
-    # Episodes of the toy are of one length: their discounts are alike.
+    # All episodes of the toy have one length, so their discounts are equal.
     assert all(not same(a[part], b[part]) for part in own if part != "discounted_ones")
     assert a["env_steps"] == STEPS[name]
     told = [[{k: v for k, v in m.items() if "Perf" not in k} for m in here[name]["metrics"]] for here in found]
@@ -388,5 +388,5 @@ def test_a_checkpoint_of_more_processes_is_refused():
     learner.iterate()
     state = checkpoint(learner, world)
     assert state is not None
-    with pytest.raises(BidexError, match="of 2 processes, but here are 1"):
+    with pytest.raises(BidexError, match="has 2 processes, but this run has 1"):
         resume(learner, world, {**state, "others": [state]})

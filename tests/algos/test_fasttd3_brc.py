@@ -128,7 +128,7 @@ def test_the_bound_is_the_largest_discounted_sum_of_each_task() -> None:
 def test_a_time_limit_counts_as_if_the_episode_went_on() -> None:
     never, last = [False, False], [True, False]
     bound = bound_after(0.8, [[1.0, 1.0]] * 3, truncated=[never, never, last], terminated=[never, never, never])
-    # One reward after the other without end is worth 1 / (1 - 0.8); three of them 1 + 0.8 + 0.64.
+    # An endless series of rewards of 1 is worth 1 / (1 - 0.8); three of them are worth 1 + 0.8 + 0.64.
     assert_close(bound.bound, torch.tensor([5.0, 2.44]))
     both = bound_after(0.8, [[1.0, 1.0]], truncated=[[True, True]], terminated=[[True, False]])
     assert_close(both.bound, torch.tensor([1.0, 5.0]))
@@ -225,7 +225,8 @@ def test_brcs_target_is_that_of_the_definition() -> None:
     target = learner._target(draw, draw.next_obs)
     actions, log_prob = learner.policy.sample(draw.next_obs, again)
     following = distributions(learner, draw.next_obs, actions.detach()).mean(0)
-    # An entropy of 2 actions times 2 at each step to come; of the second task more than half of the range.
+    # Two actions have an entropy of 2 each in every future step; for the second task this is more than half of the
+    # range.
     rooms = [10.0 - 0.1 * 4.0 / 0.3, 5.0]
     rewards = draw.rewards / torch.tensor([4.0 / rooms[0]] * 3 + [50.0 / rooms[1]] * 3)
     bonus = -torch.tensor([0.1] * 3 + [0.9] * 3) * log_prob.detach()
@@ -260,7 +261,7 @@ def test_weights_decay_but_no_temperature(kind: Any, config: Any) -> None:
 @both
 def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
     wide = replace(config, critic_hidden=(4096, 4096, 4096))
-    # Two critics of two more matrices of 4096 by 4096 each, with gradient and two moments, in float32.
+    # These are two critics with two more matrices of 4096 by 4096 each, with gradient and two moments, in float32.
     assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
 
 

@@ -66,7 +66,7 @@ def test_running_statistics_are_those_of_the_formula_and_hold_outside_of_trainin
     assert_close(norm.running_mean, mean)
     assert_close(norm.running_var, var)
     assert_close(norm(x), (x - mean) / (var + 1e-5).sqrt())
-    # A row by itself gives what it gives among others.
+    # A single row gives the same result as in a batch.
     assert_close(net(x)[:1], net(x[:1]))
 
 
@@ -139,7 +139,7 @@ def test_noise_stays_as_long_as_drawn_and_then_is_new() -> None:
         learner._explore(obs)
         noise.append(learner.noise[:, 0])
     stays = (torch.stack(noise[1:]) == torch.stack(noise[:-1])).double()
-    # Lengths 1 to 4 in proportion to 1, 1/4, 1/9, 1/16: of all steps so many continue the one before.
+    # Lengths 1 to 4 have probabilities in proportion to 1, 1/4, 1/9, 1/16, which gives this share of continuing steps.
     shares = torch.arange(1.0, 5.0) ** -2
     mean = float((shares / shares.sum() * torch.arange(1.0, 5.0)).sum())
     assert float(stays.mean()) == pytest.approx(1.0 - 1.0 / mean, abs=0.01)
@@ -155,7 +155,7 @@ def test_without_repeats_noise_is_new_at_every_step() -> None:
 
 
 def test_a_point_is_brought_to_its_goal() -> None:
-    # In the LQR the largest return is that of the worst states: all others share an atom.
+    # In the LQR the worst states have the largest absolute return, so all other states share an atom.
     learner = trained(FlashSAC, PointMass(), FLASH, 14)
     best = discounted_return(PointMass(rows=256), learner.world.best, 0.8, 40)
     assert discounted_return(PointMass(rows=256), lambda obs: torch.zeros(len(obs), 2), 0.8, 40) < 2.5 * best

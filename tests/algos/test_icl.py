@@ -65,7 +65,7 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal() -> No
     assert metrics[-1]["Train/return_last_episode"] > metrics[-1]["Train/return_first_episode"] + 1.5
     assert metrics[-1]["Loss/goal"] < 0.15  # at the end of a trial; 1/3 is no better than a guess
 
-    # Goals between those of the training.
+    # These goals lie between the goals of the training.
     test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = ICL.load_policy(learner.policy_state_dict())
@@ -82,7 +82,7 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     reported = learner.iterate()
     assert "Loss/imitation/Long" in reported and "Loss/imitation/Short" not in reported
     assert reported["Policy/teacher_share"] == pytest.approx(0.5) and learner.env_steps == 2 * 4 * (3 + 7)
-    # Labels and goals are those of the recorded states.
+    # Labels and goals belong to the recorded states.
     data = learner.data
     assert data is not None
     t, filled = data.trials, data.trials.filled()

@@ -72,7 +72,7 @@ def test_first_order_leaves_the_second_derivatives_out(kind: Any, config: Any):
         parameters = list(learner.policy.actor.parameters())
         gradients.append(flatten(torch.autograd.grad(learner._objective(batches)[0], parameters)))
     assert (gradients[0] - gradients[1]).norm() > 1e-3 * gradients[0].norm()
-    # The first-order gradient is that at the adapted parameters, as if they were given.
+    # The first-order gradient is the gradient at the adapted parameters, as if these were constants.
     adapter = learner.policy.adapter
     adapted = {n: p.detach().requires_grad_() for n, p in adapter.adapt(adapter.meta(3), batches[0]).items()}
     ratio, _ = adapter.ratio_and_kl(adapted, batches[1])

@@ -25,7 +25,8 @@ SMALL = MTPPOConfig(
 
 @pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])
 def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(terminal: bool, value: float):
-    # Reward 1 at each step and gamma 0.8: worth 1 / (1 - 0.8) = 5 where only the clock stops an episode of one step.
+    # A reward of 1 per step with gamma 0.8 is worth 1 / (1 - 0.8) = 5 if only a time limit ends the episodes of one
+    # step.
     world = ToyWorld([lambda action: torch.ones(len(action))], horizon=1, terminal=terminal)
     learner = MTPPO(world, replace(SMALL, gamma=0.8, critic_learning_rate=3e-3), seed=0)
     for _ in range(60):

@@ -176,7 +176,7 @@ def test_popart_keeps_values_when_statistics_change(kind: str) -> None:
 
 
 def test_bad_configs_are_one_line() -> None:
-    with pytest.raises(BidexError, match="is of no agent"):
+    with pytest.raises(BidexError, match="belongs to no agent"):
         MAPPO(LQR(), MAPPOConfig(agents="a=action/0", **SMALL), seed=0)
     with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
         HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)

@@ -23,7 +23,7 @@ from tests.algos.problems import opposite_bandits
 
 TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore, "transformer": Transformer}
 TRUNKS |= {"towers": partial(Towers, shared=1), "separate": partial(Towers, shared=0)}
-# The task id stands in the middle: nothing may assume that it is last.
+# The task id is in the middle, because no code may assume that it is last.
 GROUPS = (ObservationGroup("state", (slice(0, 3), slice(6, 9))), ObservationGroup("task_id", (slice(3, 6),)))
 TASKS = torch.arange(8) % 3
 
@@ -90,7 +90,7 @@ def test_soft_routes_sum_to_one_and_follow_the_paper(hidden: tuple[int, ...]):
     assert [tuple(r.shape) for r in routes] == [(8, 3, 3)] * (len(hidden) - 2) + [(8, 1, 3)]
     for shares in routes:
         assert_close(shares.sum(-1), torch.ones(shares.shape[:2]))
-    # One row by hand, module by module.
+    # One row is computed by hand, module by module.
     row, both = 4, state[4] * network.task(torch.eye(3)[TASKS[4]])
     logits, given = network.down[0](both.relu()), [state[row]] * 3
     for number, layer in enumerate(network.layers):
@@ -172,14 +172,14 @@ def draw(seed: int, tasks: int, entries: int = 5) -> torch.Tensor:
 def test_no_direction_serves_the_worst_served_task_better_than_cagrads(
     seed: int, tasks: int, entries: int, rank: int, apart: float, c: float
 ):
-    # Of low rank, or nearly parallel; sizes differ tenfold.
+    # The matrices have low rank or are nearly parallel, and sizes differ tenfold.
     gradients = draw(seed, 1, entries) * (apart < -2) + 10**apart * draw(seed, tasks, rank) @ draw(seed, rank, entries)
     gradients *= torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
     gram, even = gradients @ gradients.T, torch.full((tasks,), 1 / tasks, dtype=torch.float64)
     length = gradients.mean(0).norm()
     direction = conflict_averse(gradients, c)[0] / tasks
     assert (direction - gradients.mean(0)).norm() <= (c + 1e-6) * length
-    # Whatever the weights, their dual value is no less than what any direction gives.
+    # For any weights, the dual value is at least the value of every direction.
     weights = worst_served(gram, even, c * length)
     assert weights.min() >= 0 and weights.sum() == pytest.approx(1, abs=1e-5)
     weights /= weights.sum()
@@ -197,7 +197,7 @@ def test_cagrad_without_a_radius_or_a_conflict_is_the_sum():
 
 
 def test_famo_of_two_losses_is_the_closed_form():
-    # l_i = a_i x_i^2 about the least 0, each with a coordinate of its own.
+    # The losses are l_i = a_i x_i^2 above the minimum 0, each with its own coordinate.
     famo, a, x = Famo(2, rate=0.1, decay=0.0, device=torch.device("cpu")), torch.tensor([1.0, 8.0]), torch.ones(2)
     with torch.no_grad():
         famo.logits.copy_(torch.tensor([0.3, -0.2]))
@@ -206,16 +206,16 @@ def test_famo_of_two_losses_is_the_closed_form():
     weights = famo.weights(losses)
     total = z[0] / 1.0 + z[1] / 8.0
     assert weights.tolist() == pytest.approx([2 * z[0] / 1.0 / total, 2 * z[1] / 8.0 / total])
-    # The direction is the gradient of the mean of log l_i, weighted by z, but for its length.
+    # Apart from its length, the direction is the gradient of the mean of log l_i, weighted by z.
     slope = weights * 2 * a * x
     assert float(slope[0] / slope[1]) == pytest.approx(z[0] / z[1])
-    # The first loss falls to a quarter, the second stays: the second shall weigh more, by J' (log 4, 0).
+    # The first loss falls to a quarter and the second stays, so the second must gain weight, by J' (log 4, 0).
     famo.learn(lambda: losses * torch.tensor([0.25, 1.0]))
     fallen = math.log(4.0)
     expected = [z[0] * (1 - z[0]) * fallen, -z[1] * z[0] * fallen]
     gradient = famo.logits.grad
     assert gradient is not None and gradient.tolist() == pytest.approx(expected)
-    # Adam's first step is its rate long, against the gradient.
+    # Adam's first step is as long as its rate, against the gradient.
     assert famo.logits.tolist() == pytest.approx([0.3 - 0.1, -0.2 + 0.1], abs=1e-5)
 
 

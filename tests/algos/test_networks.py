@@ -166,7 +166,7 @@ def test_value_and_gradient_stay_finite_where_tanh_rounds_to_one():
     log_std = torch.zeros(1, 3, requires_grad=True)
     action, log_prob = sample_squashed(mean, log_std, torch.ones(1, 3))
     assert action[0, 0] == 1.0
-    # Far out the slope of tanh is 4 exp(-2|u|).
+    # For large u, the slope of tanh is 4 exp(-2|u|).
     expected = -1.5 - 1.5 * math.log(2 * math.pi) + (2 * 51 - math.log(4)) + (2 * 49 - math.log(4)) + 0.8675617
     assert_close(log_prob, torch.tensor([expected]), rtol=1e-5, atol=1e-4)
     (log_prob + action.sum()).sum().backward()

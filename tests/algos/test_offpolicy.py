@@ -224,7 +224,7 @@ def test_the_replay_is_cut_to_its_memory_and_says_so(capsys: pytest.CaptureFixtu
     assert line.count("\n") == 1
     for part in ("1,000 vector steps (32,000 transitions)", "0.0001 GB", f"keeps {steps:,} ({steps * 32:,} tr"):
         assert part in line
-    with pytest.raises(BidexError, match="replay_memory 1e-06 GB holds not one step of 32 environments"):
+    with pytest.raises(BidexError, match="replay_memory 1e-06 GB is too little for one step of 32 environments"):
         MTSAC(one_step_bandit(), replace(SAC, replay_memory=1e-6), seed=0)
 
 

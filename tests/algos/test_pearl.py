@@ -32,12 +32,12 @@ def test_one_episode_tells_what_is_paid() -> None:
     learner = PEARL(Slopes(mode="SAME_STEP", steps=10), SMALL, seed=0)
     for _ in range(10):
         learner.iterate()
-    # Slopes between those of the training too.
+    # The slopes include some between those of the training.
     test, agent = Slopes(33, tasks=33, steps=10), PEARL.load_policy(learner.policy_state_dict())
     assert abs(share(agent, test)) < 0.2
     shot(agent, test)  # type: ignore[arg-type]
     assert share(agent, test) > 0.8
-    # It is the task's own data that does it: those of the opposite task mislead.
+    # The task's own data help, because data of the opposite task mislead.
     agent.init()
     test.goal = -test.goal
     shot(agent, test)  # type: ignore[arg-type]
@@ -64,11 +64,12 @@ def test_the_posterior_is_made_of_the_episodes_of_a_trial() -> None:
     sums = learner._shown
     learner._shown = lambda rows, *given: shown.append((rows, *given)) or torch.zeros(len(rows), 4)  # type: ignore[func-returns-value, method-assign]
     learner.iterate()
-    # Rows 0 to 3 have ended six episodes of three steps after 20, rows 4 to 6 two of seven.
+    # After 20 steps, rows 0 to 3 have ended six episodes of three steps, and rows 4 to 6 two of seven steps.
     of_short, of_long = ([episodes[rows == row].item() for rows, _, episodes in shown if row in rows] for row in (0, 4))
     assert of_short == [1, 2, 0, 1, 2, 0] and of_long == [1, 2]
     assert learner.bounds[:, 0, 0].tolist() == [9, 18]
-    # The first two episodes of the last trial but one: steps 9 to 14 of those rows, by 64 of them with repetition.
+    # The batch takes the first two episodes of the last trial but one: steps 9 to 14 of those rows, 64 draws with
+    # repetition.
     rewards = learner.replay._steps["rewards"][9:15, :4]
     rows = torch.arange(4)
     found = sums(rows, torch.zeros_like(rows), torch.full_like(rows, 2))
@@ -84,11 +85,11 @@ def test_the_agent_adds_up_what_an_update_estimates() -> None:
     shot(agent, world)
     mean, std = policy.posterior(agent._sums)
     assert (std < 1.0).all() and mean.any()
-    # Waiting environments add nothing: of three and of seven steps.
+    # Waiting environments add nothing after three and after seven steps.
     precise = policy.evidence(torch.zeros(1, 4), torch.zeros(1, 2), torch.zeros(1), torch.zeros(1, 4))[0, :2]
     count = agent._sums[:, :2] / precise
     assert count[:3].max() < count[3:].min()
-    # Evaluation teaches nothing; the next shot goes on; at the start the posterior is the prior.
+    # Evaluation teaches nothing, the next shot continues, and at the start the posterior equals the prior.
     left = agent._sums.clone()
     agent.reset(everyone(world))
     played(agent.eval_action, world)
@@ -118,7 +119,7 @@ def test_an_update_learns_from_all_environments_of_the_chosen_tasks() -> None:
     draws: list[Any] = []
     learner._infer = lambda rows, draw, *_: draws.append((rows, draw)) or {"Loss/critic": torch.zeros(())}  # type: ignore[func-returns-value, method-assign]
     learner.iterate()
-    # Of two classes two tasks each; distances to their goals tell them apart.
+    # Two classes have two tasks each; distances to their goals tell the tasks apart.
     for rows, draw in draws:
         assert world.task_id[rows].tolist() == [0, 0, 1, 1]
         goals = world.goal[rows][learner.which]

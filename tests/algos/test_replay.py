@@ -79,7 +79,7 @@ def test_a_last_observation_that_is_no_longer_kept_costs_the_weight_and_no_more(
     assert replay.cuts_kept == ROWS
     for t in range(8):
         add(replay, truncated=[0, 1] if t % 2 == 0 else [])
-    # Eight ends, room for five: the first three are gone.
+    # There are eight ends and room for five, so the first three are gone.
     places = everything(replay)
     weights = replay.weights(places).view(8, ROWS)
     lost = [(t, row) for t in range(8) for row in range(ROWS) if weights[t, row] == 0]

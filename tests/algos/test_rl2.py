@@ -38,7 +38,7 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
     metrics = [learner.iterate() for _ in range(50)][-1]
     assert metrics["Train/return_last_episode"] > metrics["Train/return_first_episode"] + 1.5
 
-    # Goals between those of the training.
+    # These goals lie between the goals of the training.
     test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = RL2.load_policy(learner.policy_state_dict())
@@ -77,7 +77,7 @@ def test_rows_of_different_length_are_recorded_without_gaps():
     batch, _ = learner._prepare()
     assert batch.weights.sum(0).tolist() == t.lengths.tolist()
     assert not batch.advantages[9:, :3].any()
-    # Positions move by at most 0.2 within an episode, and begin anew near the origin.
+    # Positions move by at most 0.2 within an episode, and the next episode begins near the origin.
     jumps = (t.obs[1:15, 3, :2] - t.obs[:14, 3, :2]).abs().amax(1)
     assert (jumps[[0, 1, 2, 3, 5, 6]] <= 0.2001).all() and (t.obs[[0, 5, 10], 3, :2].abs() <= 0.1).all()
 
@@ -103,7 +103,7 @@ def test_advantages_are_those_of_the_definition(end_at_goal: bool):
         true_end = t.terminated[:n, row]
         expected, running = torch.zeros(n), 0.0
         for k in range(n - 1, -1, -1):
-            # An episode that ended truly stands still, unrewarded, until its time limit.
+            # After a true end, the environment stands still without reward until the time limit.
             discount = g ** (1 + int(t.left[k, row])) if true_end[k] else g
             follows = 0.0 if k == n - 1 and true_end[k] else value[k + 1]
             delta = t.rewards[k, row] + discount * follows - value[k]
@@ -181,7 +181,7 @@ def test_evaluation_episodes_start_from_what_adaptation_left():
         assert not torch.equal(agent.eval_action(obs), first[-1])  # the memory goes on within the episode
     assert torch.equal(first[0], first[1]) and torch.equal(first[0], first[2])
     assert torch.equal(state_of(agent), left)
-    # A second shot goes on from the first, not from an evaluation.
+    # A second shot continues from the first shot, not from an evaluation.
     shot(agent, world)
     assert not torch.equal(state_of(agent), left)
     agent.init()
@@ -233,7 +233,7 @@ def test_the_agent_plays_the_trial_that_the_training_played():
     learner._update = lambda batch: {}  # type: ignore[method-assign]
     learner.iterate()
     t, agent = learner.trials, MemoryAgent(learner.policy)
-    # Statistics have moved since: what the memory would be by the present ones.
+    # The statistics have changed, so we compute the memory with the current ones.
     previous = t.previous(len(t.obs) - 1)
     for row in (0, 5):
         agent.init()

@@ -84,7 +84,7 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
             clock[0] += 4.0
 
     run(Slow(), 70, checkpoint_seconds=60.0)
-    # The first after 60 s, the next 200 s after its end, and so on; the last at the end.
+    # The first checkpoint comes after 60 s, the next one 200 s after its end, and so on; the last one comes at the end.
     assert saved == [60.0, 264.0, 468.0, 672.0, 716.0]
 
 

@@ -41,7 +41,7 @@ def test_one_shot_closes_half_of_the_gap_to_a_policy_that_knows_the_goal() -> No
     metrics = [learner.iterate() for _ in range(40)]
     assert metrics[-1]["Train/return_last_episode"] > metrics[-1]["Train/return_first_episode"] + 1.0
 
-    # Goals between those of the training.
+    # These goals lie between the goals of the training.
     test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = VariBAD.load_policy(learner.policy_state_dict())
@@ -63,7 +63,7 @@ def test_beliefs_learn_to_tell_goals_apart_from_rewards_alone() -> None:
         ends = mean[-1].view(16, 2, -1)  # goals alternate
         apart, spread = (ends[:, 0] - ends[:, 1]).mean(0).norm(), ends.std(0).norm(dim=1).mean()
         assert apart > 2.0 * spread and log_std[-1].mean() < log_std[0].mean() - 0.3
-        # Beliefs of other trials: those of the same goal predict the rewards, those of the other do not.
+        # Beliefs of other trials with the same goal predict the rewards; beliefs of trials with the other goal do not.
         off = [
             learner.net.pays(x, mean[-1:].roll(by, 1))[0] - learner.policy.earned(batch.previous[1]) for by in (2, 1)
         ]
@@ -106,5 +106,5 @@ def test_what_is_decoded_is_seen_and_each_belief_is_compared_to_the_last(
         monkeypatch.setattr(learner.policy, "earned", lambda reward, marked=marked: marked.float())
         error, divergence = learner._bound(batch, rows)
         assert float(error) == pytest.approx(expected)
-    # Of unit Gaussians at 1, the first is compared to one at 0.
+    # The first of these unit Gaussians at 1 is compared with one at 0.
     assert float(divergence) == pytest.approx(3 * 0.5 * 6 / float(batch.weights.sum()))

@@ -69,7 +69,7 @@ def test_a_resumed_run_is_that_of_an_unbroken_one(toy_worlds: None, tmp_path: Pa
     assert plot([half, whole.path], tmp_path / "curves.png").stat().st_size > 1000
     with pytest.raises(BidexError, match=r"--seed is 0 in .*half, not 1: a resumed run keeps its config"):
         train(replace(half.config(), seed=1), resume=str(half.path))
-    with pytest.raises(BidexError, match="goes on in the run's own folder"):
+    with pytest.raises(BidexError, match="continues in the run's own folder"):
         train(CONFIG, run_dir=tmp_path / "other", resume=half)
     with pytest.raises(BidexError, match="Expected a config or a run to resume"):
         train()
@@ -133,7 +133,7 @@ def test_a_sweep_of_configs_is_trained_once_and_resumed(toy_worlds: None, tmp_pa
     assert RunFolder.open(tmp_path / "gammas" / "g0.95").config().learner_values["gamma"] == 0.95
     monkeypatch.setattr(sweeping, "work", lambda runs, cores: pytest.fail("trained twice") if runs else 0)
     assert sweep(plan).states == result.states
-    with pytest.raises(BidexError, match=r"g0\.9 is a run of another config: learner\.gamma is 0\.9 there"):
+    with pytest.raises(BidexError, match=r"g0\.9 is a run with another config: its learner\.gamma is 0\.9, not"):
         sweep(SweepPlan.of(tmp_path / "gammas", {"g0.9": gamma_config(0.8)}))
     with pytest.raises(BidexError, match="Expected the name of a folder"):
         SweepPlan.of(tmp_path, {"../up": CONFIG})

@@ -71,7 +71,7 @@ def test_an_upload_holds_the_run_and_its_card(shown, refused, monkeypatch) -> No
     assert words == ("me/hand-over",) and made == {"repo_type": "model", "private": True, "exist_ok": True}
     paths = [each.path for each in commit["operations"]]
     assert {"config.json", "README.md"} < {*paths} and sum(path.endswith(".pt") for path in paths) == 1
-    assert "for a data set alone" in refused("push", HAND_OVER, "datasets/me/hand-over")
+    assert "only for a data set" in refused("push", HAND_OVER, "datasets/me/hand-over")
 
 
 def test_a_data_set_goes_through_a_folder_and_minari_makes_its_environment(shown, tmp_path: Path, monkeypatch) -> None:
@@ -203,7 +203,7 @@ def test_a_pull_that_finds_no_room_or_is_killed_leaves_nothing_in_the_way(refuse
     hub = Path(shutil.copytree(HAND_OVER, tmp_path / "hub"))
     (checkpoint,) = (hub / "checkpoints").iterdir()
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    assert "damaged, and was not kept" in refused("pull", f"folder:{hub}", "--out", tmp_path / "other")
+    assert "damaged and was deleted" in refused("pull", f"folder:{hub}", "--out", tmp_path / "other")
     assert not (tmp_path / "other").exists() and not list(tmp_path.glob(".*"))
 
 

@@ -40,7 +40,7 @@ def test_flags_say_what_the_meta_test_of_a_run_plays(tmp_path, refused):
     splits = json.loads((path / "evaluation.json").read_text())["splits"]
     assert list(splits) == ["test"] and [splits["test"][name] for name in ("shots", "rollouts", "trials")] == [2, 7, 5]
     assert len(splits["test"]["hidden_by_shot"]) == 3
-    # A resumed run may differ.
+    # A resumed run may have another value.
     assert (
         not {"split", "shots", "rollouts", "tasks", "hidden_rewards"} & RunFolder.open(path).config().to_json().keys()
     )

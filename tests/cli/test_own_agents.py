@@ -135,8 +135,8 @@ def test_the_file_is_read_again_and_is_no_run_s(tmp_path: Path, adapted: Path, r
         (Constant(), "ML4", {"save": True}, r"call result\.save\(path\)"),
         (Wide(), "ML4", {}, "Expected actions of shape"),
         (Locked(), "ML4", {}, "copy.deepcopy can copy, got a Locked: .*lock"),
-        ("runs/r", "ML4", {}, "suite: a run brings its own, got ML4. Leave suite out"),
-        ("runs/r", None, {"task_seed": 1}, "task_seed: a run brings its own"),
+        ("runs/r", "ML4", {}, "suite: a run has its own, got ML4. Leave suite out"),
+        ("runs/r", None, {"task_seed": 1}, "task_seed: a run has its own"),
     ],
 )
 def test_refusals_are_one_line(agent, suite, options, expected) -> None:

@@ -117,5 +117,5 @@ def test_large_films_are_named_alone(runs, monkeypatch, report):
 def test_nothing_to_show_is_one_line(runs, refused, monkeypatch):
     assert "Name the run folders" in refused("report")
     log(runs[0])
-    assert "holds nothing yet" in refused("report", runs[0])
+    assert "has no metrics to draw yet" in refused("report", runs[0])
     log(runs[0], *ROWS)

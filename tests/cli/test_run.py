@@ -119,8 +119,8 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("render --task gymnasium/Humanoid-v5 --tiled --out a.png", "got gymnasium/Humanoid-v5. Name another."),
         ("render --suite metaworld/MT10 --out a.png", "got metaworld/MT10. Name another."),
         ("render --suite metaworld/MT10 --tiled --out a.png", "got metaworld/MT10. Name another."),
-        ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "classes of our own"),
-        ("baseline random --suite metaworld/MT3", "classes of our own"),
+        ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "bidex-meta's own classes"),
+        ("baseline random --suite metaworld/MT3", "bidex-meta's own classes"),
         ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
         ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
         ("bench world --steps 0", "--steps of 1 or more"),
@@ -162,13 +162,16 @@ HUMANOID = "run --task gymnasium/Humanoid-v5 --num-envs 4 --device cpu --algo pp
     [
         ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
         ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
-        ("run --suite metaworld/MT10 --points 16", "scenes of our own"),
-        ("run --suite metaworld/MT10 --touch", "Touch sensors are of our hands, got metaworld/MT10. Leave --touch"),
+        ("run --suite metaworld/MT10 --points 16", "own scenes have point clouds"),
+        (
+            "run --suite metaworld/MT10 --touch",
+            "Only bidex-meta's hands have touch sensors, got metaworld/MT10. Leave --touch",
+        ),
         ("run --suite ML1 --algo maml --points 16 --threads 1", "does not read point clouds"),
         *(
             (
                 f"{HUMANOID} {flag} {value}",
-                f"{flag} is of the classes with hands, got {value} with gymnasium/Humanoid-v5",
+                f"{flag} is for classes with hands, got {value} with gymnasium/Humanoid-v5",
             )
             for flag, value in (("--points", 8), ("--object", "mug"), ("--base", "moving"))
         ),

@@ -323,7 +323,7 @@ def test_the_table_is_by_track_and_suite_and_claims_only_what_is_separated(tmp_p
     place_of(board, "reward-only", made("reward-only", first=6))
     place_of(board, "transfer", made("transfer", first=8))
     scout = place_of(board, "agent", made("agent", "scout"))
-    with pytest.raises(BidexError, match="nobody can play it"):
+    with pytest.raises(BidexError, match="cannot be played again"):
         submitting.check(scout, [], "cpu")
     lines = list(leaderboard_table("", tmp_path / "data"))
     heads = [line for line in lines if line.startswith("**")]
@@ -383,10 +383,12 @@ def test_a_submission_is_played_by_the_seed_of_its_weights_and_ranked(
     lines = list(leaderboard_table("MT4", tmp_path / "data"))
     assert lines[0] == "**MT4, multi-task**" and lines[4].startswith("| 1 | mtppo | ")
     assert "There is" in refused("submit", *runs, "--out", out, *TUNED)
-    assert "Two of the runs have one seed" in refused("submit", runs[0], runs[0], "--name", "x", "--out", out, *TUNED)
+    assert "Two of the runs have the same seed" in refused(
+        "submit", runs[0], runs[0], "--name", "x", "--out", out, *TUNED
+    )
     for words in ({"seed": 2}, {"seed": 2, "suite": "MT4-v2"}):
         told = refused("submit", copied(runs[0], **words), "--name", "x", "--out", out, *TUNED)
-        assert f"stands in {out / 'MT4-mtppo.json'}" in told
+        assert f"is already in {out / 'MT4-mtppo.json'}" in told
 
 
 def test_check_repeats_an_entry_and_finds_a_forgery(runs, tmp_path: Path, shown, refused, capsys) -> None:
@@ -396,7 +398,7 @@ def test_check_repeats_an_entry_and_finds_a_forgery(runs, tmp_path: Path, shown,
     before = path.read_bytes()
     again = ["submit", "--check", path, *runs[::-1], "--device", "cpu"]
     assert shown(*again).splitlines()[-1] == f"{path}: equal" and path.read_bytes() == before
-    assert "is of other runs" in refused(*again[:3], runs[0])
+    assert "belongs to other runs" in refused(*again[:3], runs[0])
     assert "--check takes" in refused(*again, *TUNED)
     forge(path, 1)
     assert shown(*again).splitlines()[-1] == f"{path}: within the interval"
@@ -455,7 +457,7 @@ def test_runs_that_adapt_play_trials_of_three_episodes_on_both_splits(
     assert {*task_seeds} == {("train", 0), ("train", 1), ("test", entry.seed)}
     copy = copied(folders[0], seed=2)
     assert "they are one run" in refused("submit", *folders, copy, "--name", "x", "--out", out, *TUNED)
-    assert "stands in" in refused("submit", copy, "--name", "x", "--out", out, *TUNED)
+    assert "is already in" in refused("submit", copy, "--name", "x", "--out", out, *TUNED)
     last = shown("submit", "--check", out / "ML4-finder.json", *folders, "--device", "cpu").splitlines()[-1]
     assert last.endswith(": equal")
 
@@ -485,7 +487,7 @@ def test_runs_that_nobody_else_could_play_are_refused(toy_suite, tmp_path: Path,
     run = tmp_path / "r"
     shown("run", *SMALL[2:], "--suite", suite, "--steps", "24", "--run-dir", run, "--no-evaluate")
     told = refused("submit", run, "--out", tmp_path, *TUNED)
-    assert "trained on mine.toml. The leaderboard is of shipped suites" in told
+    assert "trained on mine.toml. The leaderboard is for shipped suites" in told
     change(run, suite="MT4", points=16)
     assert "saw clouds of points" in refused("submit", run, "--out", tmp_path, *TUNED)
 

@@ -34,7 +34,7 @@ CONFIG = run_config(task="HandOver", algo="ppo", steps=6)
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(queue, "COMMAND", FAKE)
-    # Configs are `bidex-meta run`'s matter; the stand-in has but a few entries.
+    # `bidex-meta run` tests configs; this stand-in has only a few entries.
     monkeypatch.setattr(queue, "_resolved", lambda run: CONFIG)
     path = tmp_path / "sweep.toml"
     path.write_text(FILE)

@@ -136,7 +136,7 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
 def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, shown) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "results").symlink_to(ROOT / "results")  # teachers
-    # Data sets are recorded before; which, the files say.
+    # Data sets must be recorded before the sweep; its file lists them.
     monkeypatch.setattr("bidex_meta.experiments.run_data.open_datasets", lambda names: [])
     monkeypatch.setattr("bidex_meta.experiments.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):

@@ -185,7 +185,7 @@ def test_scripts_demonstrate_where_no_data_are_given(pair: Path, tmp_path: Path)
     given = demonstrations(tmp_path / "mine-v0")
     own = demonstrations_of(file, "DoorCloseOutward", [str(given)], tmp_path, 1)
     assert own and own.folder == given / "data"
-    with pytest.raises(BidexError, match="has DoorCloseOutward by other rules than pair-DoorCloseOutward"):
+    with pytest.raises(BidexError, match="has DoorCloseOutward with other rules than pair-DoorCloseOutward"):
         demonstrations_of(file, "DoorCloseOutward", [str(demonstrations(tmp_path / "v1-v0", rules=None))], tmp_path, 1)
     pair.write_text(SUITE.replace("DoorCloseOutward", "CatchAbreast"))
     file = suite_file(opened(pair), "CatchAbreast", tmp_path)

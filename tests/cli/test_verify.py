@@ -107,7 +107,7 @@ def test_what_cannot_be_compared_is_one_line(run, capsys, change, told):
 def test_no_evaluation_and_another_file(run, capsys, tmp_path):
     (run / "evaluation.json").rename(tmp_path / "kept.json")
     code, shown = verify(capsys, run)
-    assert code == 2 and "has no evaluation.json to be verified" in shown.err and "evaluate" in shown.err
+    assert code == 2 and "has no evaluation.json to verify" in shown.err and "evaluate" in shown.err
     assert verify(capsys, run, "--evaluation", tmp_path / "kept.json")[0] == 0
     capsys.readouterr()
     assert main(["evaluate", str(run), "--json", "--num-envs", "12", "--seed", "5", "--episodes", "3"]) == 0

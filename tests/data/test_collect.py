@@ -193,7 +193,7 @@ def test_minari_opens_and_samples_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(theirs.sample_episodes(4)) == 4 and "ndarray" in repr(theirs[0])
     assert theirs.spec.action_space.shape == (2,)
     assert list(minari.list_local_datasets()) == ["Points/test-v0"]
-    # The other way round: what Minari wrote itself.
+    # The other direction: we read what Minari wrote.
     spaces = {name: getattr(theirs.spec, name) for name in ("observation_space", "action_space")}
     buffer: Any = import_module("minari.data_collector.episode_buffer").EpisodeBuffer
     columns = [{name: getattr(e, own) for name, own in part_files.ARRAYS.items()} for e in ours.episodes()]

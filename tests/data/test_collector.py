@@ -163,7 +163,7 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
         second.load_state_dict(rough().state_dict())
     other = RunCollector(rough(), [0, 1])
     other.open(tmp_path / "other")
-    with pytest.raises(BidexError, match="of other rows"):
+    with pytest.raises(BidexError, match="other environments"):
         other.load_state_dict(state)
 
 

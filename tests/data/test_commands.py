@@ -64,7 +64,7 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert "rewards computed again" in printed(capsys, "data", "check", real.name)
     most = real.num_episodes // 2 + 1  # every second one, not all
     assert verify(real, most).episodes == math.ceil(real.num_episodes / 2) <= most
-    # Observations shifted by a step, a reward of another task, a torn end: each is seen.
+    # Each fault is found: observations shifted by a step, a reward of another task, a torn end.
     path = part_files.parts_of(real.folder)[0]
     with changed(path) as file:
         shifted = file["episode_0"]["observations"]
@@ -111,7 +111,7 @@ def test_rewards_of_a_suite_with_bases_alone_are_computed_again(tmp_path: Path) 
     (tmp_path / "own.toml").unlink()
     found = verify(dataset)
     assert (dataset.action_size, found.count, found.recomputed) == (40, 0, {"HandOver": found.steps})
-    # A class that has no such number of actions.
+    # This class has another number of actions.
     dataset.metadata["base"] = "moving"
     found = verify(dataset)
     assert (found.count, found.skipped) == (0, {"HandOver": "HandOver has 52 actions here, the data 40"})
@@ -132,7 +132,7 @@ def test_the_four_kinds_of_a_suite(toy: None, folder: Path, capsys: pytest.Captu
     assert (acted["run"], acted["actions"], acted["steps"], acted["algo"]) == ("a", "sampled", 240, "mtppo")
     mixed = sets["medium-expert"].table
     assert abs(mixed["steps"][mixed["policy"] == 0].sum() - mixed["steps"].sum() / 2) < 20
-    # Of a third of the rows: a third of 240 steps, less the episodes that had not ended.
+    # A third of the rows is recorded: a third of 240 steps, less the episodes that had not ended.
     assert 60 < sets["replay"].num_steps <= 80 and set(sets["replay"].table["row"]) == {0, 3}
     assert sets["replay"].num_steps == open_dataset(folder / "a" / "replay").num_steps
     assert "holds a complete data set" in printed(capsys, "record", "replay", runs[0], code=2)
@@ -169,7 +169,7 @@ def test_of_two_recorders_at_once_one_is_refused(toy: None, folder: Path) -> Non
 def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path) -> None:
     flags = [*SMALL, "--record", "200"]
     assert main(["run", *flags, "--steps", "240", "--run-dir", str(folder / "whole")]) == 0
-    # The rows follow from the steps that were first asked for.
+    # The rows follow from the number of steps that was first requested.
     assert main(["run", *flags, "--steps", "240", "--run-dir", str(folder / "torn"), "--stop-at-return", "-1e9"]) == 0
     assert open_dataset(folder / "torn" / "replay").num_steps < 60
     torn = ["--resume", str(folder / "torn"), "--no-evaluate", "--stop-at-return", "1e9"]
@@ -207,11 +207,11 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
     steps = [json.loads(line)["step"] for line in (folder / "r" / "metrics.jsonl").read_text().splitlines()]
     assert 24 <= steps[-1] < 100
     assert RunFolder.open(folder / "r").goal == steps[-1]
-    # Killed before its evaluation was written, it is evaluated and not trained further.
+    # A run that was killed before its evaluation was written is evaluated and not trained further.
     said = printed(capsys, "run", "--resume", folder / "r", "--episodes", "1")
     assert "Enough: Train/mean_return is" in said and RunFolder.open(folder / "r").evaluation().steps == steps[-1]
     assert [row["step"] for row in RunFolder.open(folder / "r").metrics()] == steps
-    assert "Add --evaluate-every" in printed(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
+    assert "Add for example --evaluate-every" in printed(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
     assert "--stop-at-success" in printed(capsys, "run", *SMALL, "--stop-at-success", "80", code=2)
 
 

@@ -49,7 +49,7 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
     assert verify(open_dataset(folder)).unsealed == []
     for path in sorted(folder.iterdir()):
         data = path.read_bytes()
-        # All of the first bytes, which hold the digest and HDF5's own head, and some of the others.
+        # These are all of the first bytes, which hold the digest and HDF5's own header, and some of the others.
         places = [*range(0, 80, 5), 300, 511, 512, len(data) - 1, *(draw.randrange(len(data)) for _ in range(40))]
         for place in (*places, *range(len(data) - 40, len(data), 3)):
             path.write_bytes(data[:place] + bytes([data[place] ^ (1 << draw.randrange(8))]) + data[place + 1 :])

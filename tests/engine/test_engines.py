@@ -25,7 +25,7 @@ SUBSTEPS, ROWS = 2, 4
 ROOM = Capacity(contacts=112, convex=30, rows=208)
 NAMES = ("CatchAbreast", "CatchUnderarm", "CatchOver2Underarm", "CatchUnderarm")
 VIEWS = ("qpos", "qvel", "ctrl", "xfrc_applied", "sensordata")
-# A cold cache compiles for a minute and more, and one test process shall do it, not all (--dist loadgroup).
+# A cold cache compiles for more than a minute, so only one test process should do it (--dist loadgroup).
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 Either = CpuEngine | WarpEngine
 
@@ -123,7 +123,7 @@ def test_a_broken_row_is_reported_and_its_neighbours_do_not_change_by_a_bit(
     assert same(run(engine, 2, seed=1), run(other, 2, seed=1), rest)
     assert engine.unstable().tolist() == [False, True, False, False], "until the reset"
     assert not other.unstable().any()
-    # After a reset the row is as good as new.
+    # After a reset, the row behaves like a new one.
     reset(engine, some(1), starts(scenes))
     reset(other, everyone(), starts(scenes))
     assert not engine.unstable().any()
@@ -290,7 +290,7 @@ def test_a_row_without_memory_for_its_contacts_is_unstable() -> None:
     engine = CpuEngine([cramped.model], [0] * 3, 1)
     qpos = torch.from_numpy(cramped.start_qpos).repeat(3, 1)
     qpos[:, cramped.qpos["object"].start] += 0.001 * torch.arange(3)
-    # The second row's hands stand in each other and in the floor: more contacts than it has memory for.
+    # The hands of the second row penetrate each other and the floor, which gives more contacts than its memory holds.
     for side in ("right", "left"):
         place = cramped.qpos[f"{side}/base"].start
         qpos[1, place : place + 3] = torch.tensor([0.0, -0.3, 0.0], dtype=torch.float64)

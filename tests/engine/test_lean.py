@@ -46,7 +46,7 @@ def test_steps_are_those_of_mujoco_warp_bit_for_bit(name: str) -> None:
     assert not engines[0].unstable().any() and engines[0].qvel.abs().max() > 0.1
 
 
-# What a model has, and what is left out, of tendons, friction, sites and actuators.
+# These are the tendons, friction, sites and actuators of a model, and the parts that are left out.
 FEATURES = {
     "": "friction sites",
     "<default><joint frictionloss='.1'/></default>": "sites",

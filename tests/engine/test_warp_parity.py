@@ -178,13 +178,13 @@ FREE = {"position": 1e-3, "quaternion": 1e-3, "velocity": 1e-2, "reward": 1e-2, 
 """95th percentiles of a free rollout: m and rad; one; 0.2 m/s and rad/s; relative above 1; after one step, relative
 above 1 N or N m."""
 WIDER = {
-    # Two eggs roll on fingers from the start; an egg's contact normals differ by 1e-4 to 1e-3 rad in single precision.
+    # Two eggs roll on fingers from the start. Contact normals of an egg differ by 1e-4 to 1e-3 rad in single precision.
     "TwoCatchUnderarm": {"position": 4e-3, "quaternion": 2e-2, "velocity": 6e-2},
-    # Falling cubes meet fingers; the reward is steep where an angle is small (C rounded to single precision: 7e-3).
+    # Falling cubes meet fingers. The reward is steep near small angles (C rounded to single precision: 7e-3).
     "ReOrientation": {"quaternion": 4e-3, "reward": 6e-2},
-    # A bottle in a hand that grips at random (C rounded to single precision: 3.5e-2).
+    # A bottle is in a hand that grips at random (C rounded to single precision: 3.5e-2).
     "BottleCap": {"quaternion": 2.5e-3},
-    # Two blocks dropped on a table; the reward is steep near the target.
+    # Two blocks drop onto a table. The reward is steep near the target.
     "StackBlock": {"reward": 0.15},
 }
 """Bars that chaos breaks, at twice what was measured."""

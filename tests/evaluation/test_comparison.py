@@ -114,7 +114,7 @@ def test_the_table_shows_each_class_under_its_own_name(tmp_path: Path, capsys: p
 def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path):
     path = evaluated_at(evaluated_run(tmp_path, 0, {"A": 0.5}), 1016)
     assert groups(path)[0].steps == 1000
-    with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
+    with pytest.raises(BidexError, match="is of 500 steps, but the run continues to 1,000"):
         groups(evaluated_at(path, 500))
     (path / "evaluation.json").write_text("")
     with pytest.raises(BidexError, match="expected an evaluation in JSON"):
@@ -154,7 +154,7 @@ def test_a_run_that_time_or_a_mark_ended_is_of_the_steps_it_made(tmp_path: Path,
     if over:
         assert groups(path)[0].steps == 1000
     else:
-        with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
+        with pytest.raises(BidexError, match="is of 1,000 steps, but the run continues to 1,000,000,000"):
             groups(path)
 
 
@@ -209,7 +209,7 @@ def test_runs_are_grouped_whether_evaluated_or_not(tmp_path: Path):
     assert (first.label, second.label) == ("mtppo, gamma 0.9", "mtppo, gamma 0.8")
     assert [len(each.runs) for each in (first, second)] == [2, 1]
     assert list(first.curves) == ["Train/success/A"]
-    with pytest.raises(BidexError, match="holds nothing yet"):
+    with pytest.raises(BidexError, match="has no metrics to draw yet"):
         read_histories([log(paths[0])])
 
 
@@ -226,5 +226,5 @@ def test_plot_takes_several_runs_and_compare_draws(tmp_path: Path, capsys, monke
     assert main(["compare", *names, "--out", str(tmp_path / "c.svg")]) == 0
     assert "success, IQM" in (tmp_path / "c.svg").read_text()
     assert main(["plot", *names, "--adaptation"]) == 2
-    assert "draws one run, got 2" in capsys.readouterr().err
+    assert "draws a single run, got 2" in capsys.readouterr().err
     assert main(["plot"]) == 2

@@ -80,7 +80,7 @@ def test_the_order_of_calls():
 def test_rows_of_a_task_share_it_and_its_rollouts_are_split_over_them():
     agent = Still()
     found = meta_evaluate(agent, world(14), 1, rollouts=3, episodes_per_task=2)
-    # Seven rows a class: two tasks at a time of Near, one of Far.
+    # Each class has seven rows: Near plays two tasks at a time, Far one.
     assert agent.of_row.tolist() == [0, 1, 0, 1, 0, 1, 0] + [2] * 7
     valid = torch.stack([told.valid for told in agent.steps if told.valid is not None]).sum(0)
     portions = 2
@@ -93,7 +93,7 @@ def test_more_rollouts_than_rows_take_several_rounds():
     agent = Still()
     found = meta_evaluate(agent, world(6, 3, 3), 1, rollouts=5, episodes_per_task=1)
     assert found.rollouts == 5
-    # One task at a time, three rows each. A round of three and one of two between one evaluation and the next.
+    # One task is played at a time, in three rows each: a round of three and a round of two between two evaluations.
     assert found.adapt_steps == [3 * 5 * (8 + 12)]
     assert [int(mask.sum()) for mask in agent.masks[:4]] == [2, 6, 4, 2]
 
@@ -122,7 +122,7 @@ def test_frozen_cut_and_broken_rows_are_not_valid():
         assert not (told.terminated & told.truncated).any()
         assert torch.equal(told.aux_policy_outputs["double"], 2 * told.action)
     assert agent.steps[8].truncated[5:7].all() and agent.steps[7].truncated[0] and not agent.steps[7].truncated[5]
-    # The next observation is of the same episode, its last one too.
+    # The next observation belongs to the same episode; for the last step it is the final one.
     for told, after in zip(agent.steps, agent.steps[1:], strict=False):
         assert told.next_observation is not None and torch.equal(told.next_observation, after.observation)
 

@@ -40,7 +40,7 @@ def test_return_is_the_sum_of_unscaled_rewards_until_the_episode_ends():
     obs, _ = ToyWorld(6, "DISABLED").reset(seed=5)
     distance = (obs[:, 0] - obs[:, 1]).abs()
     expected = world.max_episode_steps * (1 - distance)
-    # Rows 0-2 are Near's three tasks; rows 3 and 4 Far's two, row 5 repeats its first and is left out.
+    # Rows 0-2 play Near's three tasks and rows 3 and 4 Far's two; row 5 repeats Far's first task and is left out.
     assert np.allclose(found.classes["Near"].returns, expected[:3].numpy())
     assert np.allclose(found.classes["Far"].returns, expected[3:5].numpy())
 
@@ -56,7 +56,7 @@ def test_success_counts_any_step_and_is_kept_by_name():
 def test_agent_is_told_which_rows_begin():
     seeker = Seeker()
     evaluate(seeker, ToyWorld(8, "DISABLED"), episodes_per_task=3)
-    # Near: 4 rows on 3 tasks, of which tasks 1 and 2 have one row each: three rounds.
+    # Near has 4 rows for 3 tasks, of which tasks 1 and 2 have one row each, so it needs three rounds.
     assert len(seeker.masks) == 3
     assert seeker.masks[0].all()
     assert seeker.masks[2].tolist() == [False, True, True, False, False, False, False, False]

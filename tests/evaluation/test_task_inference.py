@@ -24,7 +24,7 @@ def test_blind_policies_cannot_do_much_in_version_2() -> None:
     classes = benchmark.task_classes("train") | benchmark.task_classes("test")
     found = {name: blind_ceiling(task, 2000) for name, task in classes.items()}
     assert len(found) == 20 and max(found.values()) <= 0.25 and np.mean(list(found.values())) <= 0.15, found
-    # Tolerance over range.
+    # The expected value is the tolerance divided by the range.
     assert (found["BottleCap"], found["SwingCup"]) == pytest.approx((0.2, 16 / 135), abs=0.03)
     known = {"CatchUnderarm": 0.52, "StackBlock": 0.79, "DoorOpenOutward": 1.0}
     version_1 = {name: blind_ceiling(registry.get(name, True)) for name in known}
@@ -98,7 +98,7 @@ def result(returns: list[float], successes: list[float]) -> ClassResult:
 
 def test_alignment_counts_pairs_of_successful_and_other_episodes() -> None:
     found = alignment({"a": result([5.0, 2.0, 1.0], [1.0, 1.0, 0.0]), "b": result([2.0, 4.0], [0.0, 0.0])})
-    # 5 is above 1, 2, 4; 2 is above 1, ties with 2, is below 4.
+    # 5 is above 1, 2 and 4; 2 is above 1, ties with 2 and is below 4.
     assert found == Alignment(rank=pytest.approx((3 + 1 - 1) / 6), solved=3.5, unsolved=3.0)
     assert alignment({"a": result([1.0, 2.0], [1.0, 0.0])}) is None, "no policy always fails"
     assert alignment({"b": result([1.0, 2.0], [0.0, 0.0])}) is None, "nobody succeeds"

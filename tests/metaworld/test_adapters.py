@@ -106,7 +106,7 @@ def test_our_agent_hears_the_order_of_calls_it_knows():
         keywords: dict[str, Any] = {"num_evals": 1, "adaptation_episodes": 2, "evaluation_episodes": 1}
         theirs.metalearning_evaluation(ForMetaWorld(agent), envs, **keywords)  # type: ignore[arg-type]
     episode = ["reset", *["adapt_action", "step"] * 3]
-    # The last reset of a shot is of the episode that Meta-World begins and does not play.
+    # The last reset of a shot belongs to the episode that Meta-World begins and does not play.
     assert agent.calls == ["assign", "init", *episode, *episode, "reset", "adapt", "reset", "eval_action", "reset"]
     told = agent.steps[0]
     assert isinstance(told.observation, torch.Tensor) and told.observation.dtype == torch.float32
@@ -122,7 +122,7 @@ def test_their_agent_in_our_evaluation():
     played = ["reset", "eval_action"]
     shot = [*["adapt_action", "step"] * 10, "adapt", *played]
     assert native.calls == ["init", *played * 2, *[*shot, *played] * 4]
-    # Each row's episode ends once; then it goes on without reward and without an end.
+    # Each row's episode ends once; after that the row continues without reward and without an end.
     rewards, ends = (np.stack([told[i] for told in native.told[:10]]) for i in (0, 1))
     assert (ends.sum(0) == 1).all()
     after = np.cumsum(ends, 0) - ends > 0

@@ -187,7 +187,7 @@ def test_a_run_trains_evaluates_and_resumes(short, few, tmp_path, capsys):
     assert main(["evaluate", part, "--json", "--device", "cpu"]) == 0
     assert json.loads(capsys.readouterr().out)["policy"] == report["policy"]
     assert main(["evaluate", part, "--split", "test"]) == 2
-    assert "split train alone" in capsys.readouterr().err
+    assert "only the split train" in capsys.readouterr().err
 
 
 def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:

@@ -436,7 +436,7 @@ def test_constructors_take_what_meta_worlds_take() -> None:
         (lambda: ours.make_ml_envs("ML4", meta_batch_size=12), "total_tasks_per_cls=48"),
         (lambda: ours.make_ml_envs("MT4"), "make_mt_envs('MT4')"),
         (lambda: ours.make_mt_envs("ML4"), "make_ml_envs('ML4')"),
-        (lambda: ours.make_mt_envs("MT4", meta_batch_size=4), "of meta suites"),
+        (lambda: ours.make_mt_envs("MT4", meta_batch_size=4), "for meta suites"),
         (lambda: ours.make_mt_envs("MT5"), "Did you mean 'MT5-v2'?"),
         (lambda: ours.make_mt_envs("MT4", vector_strategy="threads"), "Known: async, sync"),
         (lambda: ours.make_mt_envs("HandOver", reward_function_version="v1"), "the suite's reward"),

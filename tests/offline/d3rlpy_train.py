@@ -15,7 +15,7 @@ import numpy as np
 def main(path: str, algo: str, updates: int, seed: int, out: str) -> None:
     d3rlpy.seed(seed)
     stored = np.load(path)
-    # Told, not left to be guessed: actions at their bounds look like whole numbers.
+    # The action space is given, because actions at their bounds look like whole numbers.
     kind = d3rlpy.ActionSpace.CONTINUOUS
     data = d3rlpy.dataset.MDPDataset(**{name: stored[name] for name in stored.files}, action_space=kind)
     shared = {"batch_size": 256, "gamma": 0.99, "tau": 0.005, "actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4}

@@ -77,7 +77,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     again = open_dataset("torn-v0").transitions()
     assert all(np.array_equal(a, again[name]) for name, a in whole.transitions().items())
     assert "rewards computed again" in printed(capsys, "data", "check", whole.name)
-    # A witness that is shaken hard succeeds no more.
+    # With this much noise the witness fails.
     told_of = printed(capsys, *RECORD, "--noise", "3", "--out", sets / "sets" / "wild-v0", code=2)
     assert "None of 9 replays of HandOver's witness succeeds" in told_of
 
@@ -133,7 +133,7 @@ def test_a_run_imitates_several_sets_and_is_resumed(
     for name in ("whole", "torn"):
         assert list(RunFolder.open(sets / name).config().demonstrations) == names
 
-    # Nothing is built for what cannot be imitated.
+    # No world is built for learners that cannot imitate.
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a world was made")
 
@@ -142,7 +142,7 @@ def test_a_run_imitates_several_sets_and_is_resumed(
         (["--demonstrations", "HandOver/demo-v0"], "Unknown data set 'HandOver/demo-v0'"),
         ([*shown, "--base", "own"], "Add --base moving"),
         ([*shown, "--task", "Switch"], "HandOver"),
-        ([*shown, "--algo", "td3"], "td3 imitates nothing; --demonstrations goes with mtppo, ppo"),
+        ([*shown, "--algo", "td3"], "td3 does not imitate; --demonstrations goes with mtppo, ppo"),
     ]
     for flags, text in wrong:
         assert text in printed(capsys, *RUN, *flags, "--run-dir", sets / "bad", code=2)

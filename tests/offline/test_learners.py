@@ -175,7 +175,7 @@ def test_a_checkpoint_of_other_data_is_refused() -> None:
         other.load_state_dict(learner.state_dict())
     with pytest.raises(BidexError, match="bc: has no data to learn from"):
         BC(world, SMALL["bc"][1], seed=0)
-    with pytest.raises(BidexError, match="bc: learns from no demonstrations"):
+    with pytest.raises(BidexError, match="bc: does not learn from demonstrations"):
         BC(world, SMALL["bc"][1], 0, Sources(data, demonstrations=data))
 
 

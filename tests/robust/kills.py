@@ -117,7 +117,7 @@ class Victim:
         for phase in PHASES[1:]:
             if not counts[phase]:
                 continue
-            # Before the last of them the run shall not be over: none goes further than an eighth of it.
+            # The run must not end before the last kill, so each step goes at most an eighth further.
             most = counts[phase] if phase == PHASES[-1] else max(1, counts[phase] // 8)
             answer = self.go_on(aim=(phase, draw.randint(1, most)))
             assert answer["code"] == KILLED, (phase, self.log.read_text())

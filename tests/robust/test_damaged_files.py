@@ -180,7 +180,7 @@ def test_witnesses(tmp_path: Path) -> None:
     def check(drawn: Any) -> None:
         put(path, drawn, whole)
         found = one_line_or(lambda: load_witness("HandOver", path))
-        # The archive's checksums hold what is inside.
+        # The archive's checksums protect its content.
         assert found is None or (found.made == good.made and np.array_equal(found.actions, good.actions))
 
     draws(150, of_files(), check)

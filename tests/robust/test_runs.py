@@ -195,7 +195,7 @@ def test_the_room_that_is_held_takes_the_first_checkpoint(algo: str, toy: None, 
 def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     save = Recorder.save
     monkeypatch.setattr(Recorder, "save", lambda *a: (shutil.rmtree(run), save(*a)))
-    # TensorBoard's thread would open its file anew while the folder is emptied.
+    # TensorBoard's thread would open its file again while the folder is emptied.
     told = refused(capsys, "run", "--resume", run, "--steps", "96", "--logger", "none").splitlines()[-1]
     assert told.startswith("bidex-meta: ") and "No such file" in told
 

@@ -152,7 +152,7 @@ def curve(*values, spread=None):
 
 
 def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
-    with pytest.raises(BidexError, match="no finished episode"):
+    with pytest.raises(BidexError, match="no episode has ended"):
         draw_learning([("mtppo", {"Loss/value": curve(1.0)})])
     tags = {f"Train/{kind}/T{i}": curve(0.1, 0.2, spread=0.05) for i in range(5) for kind in ("return", "success")}
     other = {"Eval/success/T0": curve(0.5), "Train/return/T5": curve(1.0, 2.0)}

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
 from tests.pages import ROOT
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill, filled_pages
-from tools.pages.studies import read_studies
+from tools.pages.studies import bars_figure, read_studies
 from tools.pages.tables import arms_table, classes_table
 
 no_weights = test_collect.no_weights
@@ -107,6 +108,19 @@ def test_a_block_shows_what_compare_computes(page: Path, capsys: pytest.CaptureF
     assert rows[1]["success, IQM"] == f"{100 * value:.1f} % [{100 * ends[0]:.1f}, {100 * ends[1]:.1f}]"
     assert (rows[1]["seeds"], rows[1]["steps"], rows[1]["parameters"]) == ("2", "1,000", "12,345")
     assert rows[1]["A"] == "5.5" and rows[1]["hours"] == f"{known['hours']:.2f}" and rows[2]["A"] == "0.125"
+
+
+def test_bars_are_as_long_as_each_arm_succeeds_and_lines_span_its_seeds(page: Path) -> None:
+    (study,) = read_studies(data(page), "tiny")
+    (axis,) = bars_figure(study).axes
+    widths = [[bar.get_width() for bar in bars] for bars in axis.containers]
+    assert widths == [pytest.approx([90.0, 25.0]), pytest.approx([55.0, 25.0])]
+    ends = [tuple(line.get_xdata()) for line in axis.lines]
+    assert ends == [pytest.approx(each) for each in [(90.0, 90.0), (25.0, 25.0), (50.0, 60.0), (25.0, 25.0)]]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["A", "B"]
+    page.write_text("<!-- results: study=tiny,tiny show=bars -->\n<!-- end -->\n")
+    with pytest.raises(BidexError, match="two arms are named 'long"):
+        fill(page, data(page))
 
 
 def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:

@@ -20,7 +20,7 @@ def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None
     plan = planner.search()
     assert plan.actions.shape == (len(plan.rewards), 52) and len(plan.rewards) <= 75
     assert np.abs(plan.actions * LEVELS - np.rint(plan.actions * LEVELS)).max() < 1e-4
-    # What the planner says it got is what the actions give.
+    # The actions give the return and success that the planner reports.
     played = replay("HandOver", Witness(plan.actions.astype(np.float32), {}), threads=1)
     assert played.total == pytest.approx(plan.total, rel=1e-9)
     assert played.first_success == plan.first_success
@@ -73,6 +73,6 @@ def test_an_episode_of_a_script_that_does_not_hold_is_kept_in_a_named_file_alone
 @pytest.mark.parametrize("name", ["StackBlock", "GraspAndPlace", "LiftUnderarm", "PourWater", "ReOrientation"])
 def test_a_script_gives_the_stored_witness_again(name: str, tmp_path: Path) -> None:
     main(["script", "--task", name, "--file", str(tmp_path / "again.npz")])
-    # Feedback on chaos: in StackBlock five of 13,000 actions are two steps of the file off.
+    # StackBlock reacts chaotically: five of 13,000 actions differ by two steps of the file.
     played = load_witness(name, tmp_path / "again.npz").actions
     np.testing.assert_allclose(played, load_witness(name).actions, atol=2.5 / 127)

@@ -101,8 +101,9 @@ def test_a_file_a_line_and_a_dict_are_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("agents", "message"),
-    [({"a": ALL, "b": ["left/palm"]}, "left/palm is of a and of b"),
-     ({"a": [*ALL, "left/palm"]}, "left/palm is of a and of a"), ({"a": ALL[:-1]}, "left/thumb is of no agent"),
+    [({"a": ALL, "b": ["left/palm"]}, "left/palm belongs to a and to b"),
+     ({"a": [*ALL, "left/palm"]}, "left/palm belongs to a and to a"),
+     ({"a": ALL[:-1]}, "left/thumb belongs to no agent"),
      ({"a": [*ALL[:-1], "left/thum"]}, "Did you mean 'left/thumb'"), ({}, "agents: expected"),
      ({"a": "right/palm"}, "agents.*expected a list"), ("hand", "expected single, hands, fingers"),
      ("a=right/palm;a=left/palm", "a twice"), ("none.toml", "none.toml")]

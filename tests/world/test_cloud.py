@@ -48,12 +48,12 @@ def test_points_of_a_shape_lie_on_it_evenly_and_normals_point_outward(name: str)
     turn, place = data.geom_xmat[0].reshape(3, 3), data.geom_xpos[0]
     world, out = points @ turn.T + place, normals @ turn.T
     np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1.0, atol=1e-9)
-    # From a millimetre outside, looking back along the normal, the surface is a millimetre away.
+    # From a millimetre outside, looking back along the normal, the surface is one millimetre away.
     for point, normal in zip(world[::40], out[::40], strict=True):
         away = mujoco.mj_ray(model, data, point + 1e-3 * normal, -normal, None, 1, -1, np.zeros(1, np.int32), None)
         assert away == pytest.approx(1e-3, abs=1e-5)
     if name != "mesh":
-        # All but those within a millimetre of an edge.
+        # Points within a millimetre of an edge are left out.
         assert inside(model, 0, points - 2e-3 * normals, 1e-3).mean() > 0.85
         assert not inside(model, 0, points + 1e-3 * normals, 0.0).any()
     # Projected area by Cauchy: points that face a direction, each weighing its area, show the shape's outline.
@@ -98,7 +98,7 @@ def test_a_cloud_lies_on_what_a_camera_sees(name: str) -> None:
         points = cloud(*poses)[0].double().numpy()
         far, met, geom = rays(model, data, eye, points)
         assert (np.abs(far - met) < 0.005).mean() >= 0.95
-        # Every object's body that takes more than a hundredth of the image has points.
+        # Every body of an object that covers more than a hundredth of the image has points.
         at = (np.arange(_PIXELS) + 0.5) / _PIXELS - 0.5
         across, down = (x.ravel()[:, None] / camera.focal for x in np.meshgrid(at, at))
         right, below, forward = camera.axes
@@ -136,7 +136,7 @@ def middle(*points: tuple[float, float, float, float]) -> list[int]:
 def test_a_point_is_drawn_where_the_camera_sees_it() -> None:
     picture = draw(np.array([[0.0, 0.2, 0.1, HAND]]), _CAMERA, 200, 100)
     rows, columns = (picture != picture[0, 0]).any(axis=2).nonzero()
-    # A width of the image is 2 tan 30 deg at a distance of 1: 100 pixels, the smaller side.
+    # At a distance of 1, the width of the image is 2 tan 30 deg, which is 100 pixels on the smaller side.
     assert abs(columns.mean() - (100 + 0.2 * _CAMERA.focal * 100)) < 1.0
     assert abs(rows.mean() - (50 - 0.1 * _CAMERA.focal * 100)) < 1.0
 

@@ -69,7 +69,9 @@ def test_a_saved_world_goes_on_with_the_same_tasks() -> None:
     for other, others in ((copied, steps[1]), (loaded, steps[2])):
         assert_same(steps[0], others)
         assert same_pools(world.pools, other.pools)
-    with pytest.raises(BidexError, match="made alike, got 1 differences: tasks without number, here none"):
+    with pytest.raises(
+        BidexError, match="made with the same arguments, got 1 differences: tasks without number, here none"
+    ):
         suite_world(SUITE, 8).load_state_dict(world.state_dict())
 
 

@@ -130,7 +130,7 @@ def test_what_no_joint_moves_is_the_scene(name: str) -> None:
     of_body = body_kinds(model)
     fast = {model.body(i).name for i, kind in enumerate(of_body) if kind == FIXTURE}
     assert fast == {"world"} | HELD_FAST.get(name, set())
-    # Objects are what physics moves: a joint of their own or of what carries them.
+    # Objects are bodies that physics moves: they have a joint, or their parent has one.
     for body in (i for i, kind in enumerate(of_body) if kind == OBJECT):
         carriers = [body]
         while carriers[-1]:

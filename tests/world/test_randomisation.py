@@ -295,7 +295,7 @@ def test_bad_input(tmp_path: Path) -> None:
     for named in ({"suite": "MT4"}, {"task": "HandOver"}):
         world = open_worlds({**named, "randomisation": str(file)}).world(rows=4 if "suite" in named else 2)
         assert list(world.randomised) == ["friction"]  # type: ignore[attr-defined]
-    with pytest.raises(BidexError, match="Worlds of our own are randomised, got metaworld/MT3"):
+    with pytest.raises(BidexError, match="Only bidex-meta's own worlds can be randomised, got metaworld/MT3"):
         open_worlds({"suite": "metaworld/MT3", "randomisation": str(file)})
     suite = randomised_suite(tmp_path)
     worlds = open_worlds({"suite": suite})

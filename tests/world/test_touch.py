@@ -94,7 +94,7 @@ def test_mujoco_warp_feels_the_same() -> None:
         force, other = torch.stack(wanted), torch.stack(found)
         felt = (force > 0.0) | (other > 0.0)
         apart = ((other - force).abs() / force.clamp(min=1.0))[felt]
-        # Twice what was measured; in the first class a grazing contact exists on one engine alone.
+        # The bounds are twice the measured values; in the first class a grazing contact exists on one engine only.
         assert len(apart) > 50 and apart.median() < 6e-5 and apart.quantile(0.95) < 5e-3
 
 
@@ -164,7 +164,7 @@ def test_states_of_worlds_with_and_without_are_told_apart() -> None:
 def test_worlds_without_our_hands_have_none() -> None:
     for name in ("metaworld/MT3", "gymnasium/Humanoid-v5"):
         kind = "suite" if name.startswith("metaworld") else "task"
-        with pytest.raises(BidexError, match=r"Touch sensors are of our hands.*Leave --touch out"):
+        with pytest.raises(BidexError, match=r"Only bidex-meta's hands have touch sensors.*Leave --touch out"):
             open_worlds(WorldsConfig(**{kind: name}, touch=True))
 
 
@@ -179,7 +179,7 @@ def test_runs_and_their_data_keep_them(tmp_path: Path, capsys: pytest.CaptureFix
     train = [*same, "--algo", "ppo", "--steps", "500", "--record", "500"]
     assert main([*train, "--touch", "--run-dir", felt]) == 0
     assert main([*train, "--run-dir", plain]) == 0
-    # What looks at the run, checks its data or learns from them has touch without being told.
+    # Commands that show the run, check its data or learn from them use touch automatically.
     worlds, *_ = looked_at(LookFlags(Path(felt)))
     assert worlds.touch and acting(felt, worlds.world(rows=1), 0)
     assert main(["data", "check", f"{felt}/replay"]) == 0

@@ -23,7 +23,7 @@ def named(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, object]:
     return {"threads": 1, "suite": str(file)}
 
 
-# Of each split: slots, tasks of each, rows of an evaluation world, observations, actions.
+# For each split: slots, tasks of each, rows of an evaluation world, observations and actions.
 WORLDS: list[Any] = [
     ({"suite": "MT4"}, {"train": (4, 50, 200, 450, 52)}),
     ({"suite": "ML1"}, {"train": (1, 3, 3, 422, 52), "test": (1, 1, 1, 422, 52)}),
@@ -114,9 +114,9 @@ def test_an_unknown_name_is_one_line(config: dict[str, object], told: str) -> No
     ("config", "split", "told"),
     [
         ({"suite": "MT4"}, "test", "MT4 has the splits train, got 'test'"),
-        ({"task": "HandOver"}, "test", "HandOver alone has no test split. Leave --split out."),
-        ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has the split train alone, got 'test'."),
-        ({"task": "gymnasium/Humanoid-v5"}, "test", "gymnasium/Humanoid-v5 has the split train alone, got 'test'."),
+        ({"task": "HandOver"}, "test", "A run on the single task HandOver has no test split. Leave --split out."),
+        ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has only the split train, got 'test'."),
+        ({"task": "gymnasium/Humanoid-v5"}, "test", "gymnasium/Humanoid-v5 has only the split train, got 'test'."),
         ({"suite": "metaworld/MT3", "device": "cuda"}, "train", "got --device cuda. Add --device cpu."),
         ({"suite": "metaworld/MT3", "engine": "warp"}, "train", "got --engine warp. Add --device cpu."),
     ],

@@ -52,7 +52,7 @@ def against(
         classes: Also measure each class of the suite on its own, as it is in the suite.
         threads: Engine threads; None takes all CPUs.
         seed: Seed of worlds and actions.
-        out: File that takes the result.
+        out: JSON file to write the result to; None: only print it.
 
     Returns:
         ``old`` and ``new`` (git commit, and whether anything was changed since), the settings, and ``table``: for the
@@ -93,9 +93,9 @@ def _pairs(old: "_Worker", new: "_Worker", world: Json, steps: int, repeats: int
     walls: dict[_Worker, list[float]] = {old: [], new: []}
     cpus: dict[_Worker, list[float]] = {old: [], new: []}
     for repeat in range(repeats + 1):
-        for worker in (old, new) if repeat % 2 else (new, old):  # alternate which side finds a warm machine
+        for worker in (old, new) if repeat % 2 else (new, old):  # alternates which side finds a warm machine
             took = worker.ask("step", steps=steps, seed=repeat)
-            if repeat:  # the first one warms up
+            if repeat:  # the first repeat warms up
                 walls[worker].append(took["wall"])
                 cpus[worker].append(took["cpu"])
     done = world["num_envs"] * steps

@@ -76,7 +76,7 @@ def _capacity(made: World, steps: int, seed: int) -> Json:
 
 
 def _summary(counts: Tensor) -> Json:
-    # torch.quantile takes no more than 16 million numbers; sorting does.
+    # torch.quantile accepts at most 16 million numbers, so we sort.
     ordered = counts.sort().values
     last = len(ordered) - 1
     return {"samples": len(ordered)} | {n: int(ordered[math.ceil(q * last)]) for n, q in _QUANTILES.items()}

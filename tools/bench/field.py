@@ -54,7 +54,7 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
     for repeat in range(repeats + 1):
         for (_, vector, _, _), found in zip(entries, speeds, strict=True):
             speed = _speed(vector, steps, rng)
-            if repeat:  # the first one warms up
+            if repeat:  # the first repeat warms up
                 found.append(speed)
     table = [_row(entry, found, speeds[0]) for entry, found in zip(entries, speeds, strict=True)]
     for _, vector, _, _ in entries:
@@ -69,7 +69,7 @@ Speed = tuple[float, float]
 
 
 def _metaworld(seed: int) -> Iterator[Entry]:
-    ours = MetaWorldWorld("metaworld/MT10", _METAWORLD_ROWS, seed=seed)  # which mends Meta-World for both
+    ours = MetaWorldWorld("metaworld/MT10", _METAWORLD_ROWS, seed=seed)  # the import corrects Meta-World for both
     theirs: Any = gymnasium.make_vec("Meta-World/MT10", vector_strategy="sync", seed=seed)
     singles = [env.unwrapped for env in theirs.envs]
     dofs = [single.model.nv for single in singles]

@@ -92,7 +92,7 @@ def _measured(
     if learning:
         kind = learner_kind("mtppo")
         learner = kind.make(made, kind.presets[choose_preset(kind, "auto", device)[0]], 0)
-        for _ in range(5):  # its update is recorded as a graph after a few
+        for _ in range(5):  # the update is recorded as a graph after a few iterations
             numbers = learner.iterate()
         row["training_steps_per_s"] = round(numbers["Perf/steps_per_second"])
         row["stages"]["learning"] = round(1000.0 * size / row["training_steps_per_s"] - row["stages"]["step"], 3)

@@ -57,7 +57,7 @@ def stability(
     """
     result = {}
     for name, moving in variants(suite, task):
-        # Rows that end are reset by hand, so that the step that ended them is measured too.
+        # Rows that end are reset here, so that the step that ended them is measured too.
         where = {"device": device, "engine": engine, "threads": threads}
         made = make_task_world(name, num_envs, seed=seed, autoreset_mode="DISABLED", moving_base=moving, **where)
         rough = _stability(made, steps, seed)

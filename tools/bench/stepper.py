@@ -67,7 +67,7 @@ def _world_of(slot: Any, num_envs: int, **settings: object) -> Any:
 
     module: Any = world
     if not hasattr(module, "WorldConfig"):
-        return module.World([slot], num_envs, **settings)  # older code takes the settings themselves
+        return module.World([slot], num_envs, **settings)  # older code takes the settings as arguments
     return module.World([slot], module.WorldConfig(num_envs, **settings))
 
 
@@ -78,13 +78,13 @@ def _slot(benchmark: Any, task: str) -> Any:
 
     variations = [one.variation for one in benchmark.train_tasks if one.env_name in (task, f"{task}-v2")]
     task_class = benchmark.train_classes[task]
-    task_class = getattr(task_class, "task_class", task_class)  # older code has descriptions there
+    task_class = getattr(task_class, "task_class", task_class)  # older code has descriptions here
     return Slot(task, task_class, np.stack(variations))
 
 
 def main() -> None:
     """Answer commands until stdin ends."""
-    # Whatever a library prints must not stand between the answers.
+    # Output of a library must not mix with the answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     stepper = Stepper()

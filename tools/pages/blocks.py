@@ -26,7 +26,7 @@ from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
 from tools.pages.pretrained import pretrained_table
 from tools.pages.scaling import rows_figure, rows_table
-from tools.pages.studies import curves_figure, digest_of, read_studies
+from tools.pages.studies import bars_figure, curves_figure, digest_of, read_studies
 from tools.pages.validity import validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
@@ -45,6 +45,7 @@ _WITHOUT_STUDY = {
     "pretrained": pretrained_table,
 }
 _FIGURES = {
+    "bars": (bars_figure, "Success per class"),
     "curves": (curves_figure, "Return and success over training"),
     "ladder-curves": (ladder_figure, "Success against exploring episodes"),
     "row-curves": (rows_figure, "Return over training, by number of environments"),
@@ -78,7 +79,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
     """
     text, changed = page.read_text(), []
     if text.count("<!-- results:") != text.count("<!-- end -->"):
-        raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Mend it.")
+        raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Fix it.")
 
     def replaced(found: re.Match[str]) -> str:
         try:

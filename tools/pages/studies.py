@@ -153,6 +153,24 @@ def curves_figure(study: Study) -> "Figure":
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 
 
+def bars_figure(*studies: Study) -> "Figure":
+    """Draw success per class as bars, one colour per arm, with the range over seeds.
+
+    Raises ValueError if two arms have the same name.
+    """
+    groups: dict[str, list[plots.Bar]] = {}
+    for arm in chain.from_iterable(study.arms for study in studies):
+        label = arm.group.label
+        if label in groups:
+            raise ValueError(f"two arms are named {label!r}")
+        percent = 100.0 * arm.group.success.T  # (classes, seeds)
+        groups[label] = [
+            (name, seeds.mean(), (seeds.min(), seeds.max()))
+            for name, seeds in zip(arm.group.classes, percent, strict=True)
+        ]
+    return plots.draw_bars(groups, "success (%); lines show the range over seeds")
+
+
 def _subject(runs: Sequence[StoredRun]) -> str:
     """Return the suite or class of the runs; among several suites with the same classes, the shipped suite."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
@@ -179,5 +197,5 @@ def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
             if key not in _FREE and first[key] != other[key]:
                 raise BidexError(
                     f"{run.path} and {same.path.name} are both of the arm {name!r}, but {key} is {other[key]} and "
-                    f"{first[key]}. Collect one anew with --arm."
+                    f"{first[key]}. Collect one again with --arm."
                 )

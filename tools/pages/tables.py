@@ -144,7 +144,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     several = sum(len(study.runs) for study in studies) > 1
     order = registry.names()
     references = [load("witness"), load("script")]
-    experts = {name: row["return"] for name, row in load("expert").items()}  # of whom a score would say nothing
+    experts = {name: row["return"] for name, row in load("expert").items()}  # an expert has no score relative to itself
     rows = []
     for name in sorted(found, key=lambda name: order.index(name) if name in order else len(order)):
         run, best = max(found[name], key=lambda pair: (pair[1].success, pair[1].mean_return))
@@ -154,7 +154,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         cells.append(Estimate(best.mean_return, best.return_interval).text(form=".4g"))
         cells.append("–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}")
         cells.append("–" if random is None else f"{random.mean_return:.4g}")
-        wide = str(run.config().suite).endswith("-v2")  # references are of version 1
+        wide = str(run.config().suite).endswith("-v2")  # the references are for version 1
         for known in references:
             cells.append(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–")
         if several:

@@ -30,7 +30,9 @@ def validity_table(suite: str, data: Path) -> list[str]:
         cells = [share_cell(row, key) for key in _SHARES]
         if (aligned := row["alignment"]) is None:
             cells += ["", ""]
-        else:  # the rank correlation, and the mean return of successes versus the most that a failing policy gets
+        # These are the rank correlation, and the mean return of successes compared with the maximum of a failing
+        # policy.
+        else:
             cells += [f"{aligned['rank']:.2f}", f"{aligned['solved']:.4g} / {aligned['unsolved']:.4g}"]
         lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
     means = (_mean([row.get(key) for row in classes.values()]) for key in _SHARES)

@@ -23,7 +23,7 @@ from tools.witness_search.whole import searched
 class Search:
     """Arguments of every search, and the storage of the episode that it finds."""
 
-    task: str  # Task class.
+    task: str  # Task class to solve.
     file: Path | None = None
     """Store the episode here, even if it does not hold. None: store it in witnesses/TASK.npz, but only if it holds. An
     episode holds if it solves the task from its start and from eight of ten shifted starts."""

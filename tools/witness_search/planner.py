@@ -90,7 +90,7 @@ class Planner:
         played.
         """
         cfg, sim = self.config, self.simulator
-        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not the starts of the replay
+        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # the starts differ from those of the replay
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
         if earlier is not None:
             mean = knots_of(earlier, 0, cfg)

@@ -34,7 +34,7 @@ def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads
     knots = steps // _SPACING + 1
     weights = interpolation(steps, knots)
     mean = torch.linalg.lstsq(weights, base).solution
-    rest = base - weights @ mean  # what the knots cannot say stays as it is
+    rest = base - weights @ mean  # the part that the knots cannot represent stays unchanged
     std, elites, best = torch.full_like(mean, _STD), mean[None], base
     for number in range(rounds):
         tried = _tries(mean, std, elites, generator)

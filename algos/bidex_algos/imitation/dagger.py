@@ -22,7 +22,7 @@ class DAggerConfig(NetworkConfig):
     """All options of DAgger; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (512, 512)  # Widths of the hidden layers.
-    activation: Activation = "elu"  # Non-linearity of the hidden layers.
+    activation: Activation = "elu"  # Activation function of the hidden layers.
     init_std: Positive = 0.2
     """Standard deviation of the actions for learners that start from this policy. DAgger itself acts with the mean."""
     rollout_steps: Count = 8  # Steps in every environment before each series of updates.

@@ -47,7 +47,7 @@ class MetaPolicy(nn.Module):
             actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
             config.step_sizes
         )  # fmt: skip
-        self.step_sizes = self.adapter.step_sizes  # part of the weights of a checkpoint, unless None
+        self.step_sizes = self.adapter.step_sizes  # these weights are stored in checkpoints, unless None
         self.seed = seed
         self.generator: torch.Generator | None = None
         self.rows: TaskRows | None = None
@@ -168,7 +168,7 @@ class MetaLearner(Learner):
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
-        # The tasks to draw from; the world's own pools will hold the tasks of a meta-batch.
+        # Tasks are drawn from these pools, because the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
         self.endless = getattr(world, "endless", False)
         counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()

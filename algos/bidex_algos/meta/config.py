@@ -30,7 +30,7 @@ class MetaConfig(LearnerConfig):
     inner_steps: Count = 1  # Adaptation steps before the outer objective is measured.
     inner_learning_rate: Positive = 0.1  # Size of an adaptation step.
     adapted: Adapted = "all"
-    """Parameters that an adaptation step moves: all, or only the output layer of the mean (ANIL, Raghu et al. 2020)."""
+    """Parameters that adaptation changes: all, or only the output layer of the mean (ANIL, Raghu et al. 2020)."""
     step_sizes: StepSizeKind = "fixed"
     """Inner step sizes that the outer step learns, starting from inner_learning_rate: one per tensor (layer, MAML++),
     one per weight (Meta-SGD), or none (fixed)."""
@@ -41,9 +41,10 @@ class MetaConfig(LearnerConfig):
     """Divisor of the advantages in each task. With the variance, as in garage and Meta-World's baselines, the inner
     step depends on the scale of the rewards."""
     first_order: bool = False  # Leave out the second derivatives of the inner step.
-    gamma: Fraction = 0.95  # Discount per step.
-    lam: Fraction = 1.0  # Trace decay of the advantage estimate.
-    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+    gamma: Fraction = 0.95  # Discount factor per step.
+    lam: Fraction = 1.0  # Lambda of generalised advantage estimation.
+    normalise_observations: bool = True
+    """Normalise observations to zero mean and unit variance with running statistics."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,29 +63,30 @@ class OuterConfig(MetaConfig):
     max_grad_norm: Positive  # Meta-gradients are clipped to this norm.
 
 
-# Table 48 of the Bi-DexHands appendix (ProMP), except the outer step. Its rollouts are eight steps of running episodes,
-# and its inner step moves the weights too little to matter.
+# These values are from Table 48 of the Bi-DexHands appendix (ProMP), except the outer step. Rollouts there are eight
+# steps of running episodes, and the inner step changes the weights too little to matter.
 TABLE_48: Options = {
     "hidden": (2048, 1024, 512), "activation": "elu", "init_std": 1.0, "slice_steps": 8, "inner_steps": 1,
     "inner_learning_rate": 3e-4, "gamma": 0.9, "lam": 0.95, "normalise_observations": False,
 }  # fmt: skip
 
-# For policies that MT-PPO's preset laptop has trained on the same tasks (--start-from): its network and discount.
-# Before any meta-training (seed 0) we measured the return on ML1-wide's held-out task 8 after five shots of 100
-# episodes. With inner steps of 0.05 it rose by 2.2 (0.02: 0.8; 0.1: it fell), for all layers and for the head only. It
-# rose by 1.7 with a trace of 0.95, and by 0.0 with 0.7.
+# This preset is for policies that MT-PPO's preset laptop has trained on the same tasks (--start-from), and has the same
+# network and discount. Before any meta-training (seed 0) we measured the return on ML1-wide's held-out task 8 after
+# five shots of 100 episodes. With inner steps of 0.05 it rose by 2.2 (0.02: 0.8; 0.1: it fell), for all layers and for
+# the head only. It rose by 1.7 with a trace of 0.95, and by 0.0 with 0.7.
 TUNED: Options = {
     "hidden": (256, 256, 128), "activation": "elu", "std_range": (0.05, 1.5), "adapted": "head",
     "inner_learning_rate": 0.05, "gamma": 0.93, "lam": 0.9,
 }  # fmt: skip
 
-# The same for test tasks of unseen classes (ML4, ML20): smaller steps and whole episodes. In docs/results/ml20.md
-# LiftUnderarm lost 317 of return when it adapted to the first 150 of its 500 steps, and gained 352 with all steps.
+# This preset is the same for test tasks of unseen classes (ML4, ML20), with smaller steps and whole episodes. In
+# docs/results/ml20.md LiftUnderarm lost 317 of return when it adapted to the first 150 of its 500 steps, and gained 352
+# with all steps.
 UNSEEN: Options = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}
 
-# For version 2 of the suites (docs/results/ladder.md), from scratch or from a policy of MT-PPO's preset v2. The
-# discount sees a whole episode of 250 steps; small noise lets the policy hold still, as success asks. The same
-# step size changes a narrow distribution more. From a blind policy of a door (seed 1000), one inner step of 0.05 lost
-# return in ProMP's meta-batches (six or seven episodes per task). With 15 episodes per task, two steps of 0.02 raised
-# the return from 147 to 165, and two steps of 0.01 raised it to 157.
+# This preset is for version 2 of the suites (docs/results/ladder.md), from scratch or from a policy of MT-PPO's preset
+# v2. The discount covers a whole episode of 250 steps; low noise lets the policy hold still, as success requires. The
+# same step size changes a narrow distribution more. From a blind policy of a door (seed 1000), one inner step of 0.05
+# lost return in ProMP's meta-batches (six or seven episodes per task). With 15 episodes per task, two steps of 0.02
+# raised the return from 147 to 165, and two steps of 0.01 raised it to 157.
 V2: Options = TUNED | {"gamma": 0.99, "init_std": 0.3, "step_sizes": "layer", "inner_learning_rate": 0.02}

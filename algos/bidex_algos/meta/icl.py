@@ -99,7 +99,7 @@ class ICL(TrialLearner):
     def _make_policy(
         cls, config: ICLConfig, shape: Shape, init: torch.Generator, device: torch.device, belief: Belief | None = None
     ) -> BeliefPolicy:
-        # at least one entry, which is 0 if no value is hidden
+        # There is at least one entry, which is 0 if no value is hidden.
         seen = cls._inputs(config, shape)
         goals = max(1, shape.hidden)
 
@@ -200,7 +200,8 @@ class ICL(TrialLearner):
         self.adam.zero_grad()
         losses[:3].mean(1).sum().backward()
         losses = sum_gradients(weights, losses.detach().flatten()).view_as(losses)
-        parts = [actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])]  # of one loss each
+        # Each list has the parts of one loss.
+        parts = [actor.head, nn.ModuleList([actor.encoder, actor.goal, actor.paid])]
         for part in [*parts, actor.which] if actor.classes > 1 else parts:
             nn.utils.clip_grad_norm_(part.parameters(), self.config.max_grad_norm)
         self.adam.step()
@@ -210,7 +211,7 @@ class ICL(TrialLearner):
         """Draw ``count`` trials evenly over the classes; return the trial, environment and class of each draw, (B,)."""
         shape = len(self.tasks), math.ceil(count / len(self.tasks))
         trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
-        # The remainder of so large a number favours no row by more than 1 in 2^40 / rows.
+        # A remainder of this large number favours no row by more than 1 in 2^40 / rows.
         row = torch.randint(2**40, shape, generator=self.generator, device=self.device) % self.count[:, None]
         rows = self.rows[self.first[:, None] + row]
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])

@@ -54,7 +54,7 @@ class MemoryAgent:
             return
         valid = timestep.valid
         ended = timestep.terminated | timestep.truncated
-        # Meta-World's evaluation does not pass valid rows: all are valid.
+        # Meta-World's evaluation does not pass valid rows, because all are valid.
         if valid is None:
             known = torch.ones_like(ended)
         else:

@@ -54,7 +54,7 @@ class PEARLConfig(MTSACConfig):
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
 
 
-# v2: MT-PPO's discount.
+# The preset v2 uses MT-PPO's discount.
 PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.99)}
 
 

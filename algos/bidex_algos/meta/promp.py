@@ -39,17 +39,17 @@ class ProMPConfig(OuterConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. The original reads "Desired kl" but never uses
-    # it; here the outer step size follows it, starting at 3e-4, as in PPO's tables.
+    # These values are from Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. The original code reads
+    # "Desired kl" but never uses it; here the outer step size follows it, starting at 3e-4, as in PPO's tables.
     "paper": ProMPConfig(
         **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,
     ),
-    # Outer steps for training from scratch are too large for a trained policy. Five steps of 1e-3 gave a KL of 1.1 and
-    # lost a third of the return. With a KL of 0.05 one seed lost 0.5 of a return of 7.4 in 1.6 M steps.
+    # The outer steps for training from scratch are too large for a trained policy. Five steps of 1e-3 gave a KL of 1.1
+    # and lost a third of the return. With a KL of 0.05 one seed lost 0.5 of a return of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
-    "v2": ProMPConfig(**V2, outer_learning_rate=3e-5, desired_kl=0.03),  # MT-PPO's
+    "v2": ProMPConfig(**V2, outer_learning_rate=3e-5, desired_kl=0.03),  # desired_kl is MT-PPO's
     "laptop": ProMPConfig(),
 }  # fmt: skip
 
@@ -64,13 +64,13 @@ class ProMP(MetaLearner):
     config: ProMPConfig
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        # not that of learned step sizes
         measured = []
         cfg = self.config
+        # This group has the policy's weights. The learning rate of learned step sizes does not adapt.
         group = self.adam.param_groups[0]
         for epoch in range(cfg.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
-            if epoch > 0 and cfg.desired_kl is not None:  # before the first step it is 0 by construction
+            if epoch > 0 and cfg.desired_kl is not None:  # before the first step the KL is 0 by construction
                 low, high = cfg.outer_learning_rate_range
                 group["lr"] = min(max(group["lr"] * float(factor_of(outer_kl.detach(), cfg.desired_kl)), low), high)
             norm = self._descend(cfg.kl_weight * inner_kl - surrogate)

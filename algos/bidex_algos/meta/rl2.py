@@ -76,9 +76,9 @@ class RL2Config(PPOConfig):
 
 
 PRESETS: dict[str, RL2Config] = {
-    # The appendix has no table for RL². Values that ProMP's table (48) also has are from there, except its 8 steps per
-    # rollout. Memory, ten episodes per trial and 250 steps of backpropagation are from RL² in Meta-World's baselines
-    # (metaworld-algorithms).
+    # The appendix has no table for RL². Values that ProMP's table (48) also has are from that table, except its 8 steps
+    # per rollout. Memory, ten episodes per trial and 250 steps of backpropagation are from RL² in Meta-World's
+    # baselines (metaworld-algorithms).
     "paper": RL2Config(
         hidden=(2048, 1024, 512), memory=256, value_heads=False, init_std=1.0, episodes_per_trial=10, gamma=0.9,
         lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
@@ -88,9 +88,9 @@ PRESETS: dict[str, RL2Config] = {
     # episode, with a KL of 0.02: after 5 M steps the policy carried the egg of ML1-wide and did not throw it
     # (docs/results/ml1.md).
     "laptop": RL2Config(),
-    # For version 2 of the suites (docs/results/ladder.md), with 16 environments per class. The discount sees a whole
-    # episode of 250 steps; small noise lets the policy hold still; the reward of a step is at most 1. Chunks of half
-    # an episode, three epochs and the narrow encoder together halved the time of an update.
+    # This preset is for version 2 of the suites (docs/results/ladder.md), with 16 environments per class. The discount
+    # covers a whole episode of 250 steps; low noise lets the policy hold still; the reward of a step is at most 1.
+    # Chunks of half an episode, three epochs and the narrow encoder together halved the time of an update.
     "v2": RL2Config(
         gamma=0.99, init_std=0.3, reward_unit=0.3, chunk=125, hidden=(128, 128), num_minibatches=4, epochs=3,
     ),
@@ -105,7 +105,7 @@ class RL2(TrialLearner):
     config_type = RL2Config
     presets = PRESETS
     config: RL2Config
-    # An update waits for whole trials. With 64 environments a door took 2.3 times the steps to the same success.
+    # An update needs whole trials. With 64 environments, a door took 2.3 times the steps to reach the same success.
     environments_per_class = 16
 
     def __init__(self, world: PooledWorld, config: RL2Config, seed: int):
@@ -134,8 +134,8 @@ class RL2(TrialLearner):
         valid = self.trials.valid & filled
         seen = self.trials.obs[filled], self.trials.rewards[valid]
         if self.trials_played == 0:
-            # The first trial only measures. Statistics of the initial states only, in which nothing moves, made the
-            # policy see so much noise that it would have to unlearn most of what it learned from this trial.
+            # The first trial only updates statistics. Statistics of the initial states alone, in which nothing moves,
+            # amplified noise so much that the policy had to unlearn most of what it learned from this trial.
             self.policy.update_statistics(*seen)
             losses = {}
             explained = self._prepare()[1]
@@ -156,7 +156,7 @@ class RL2(TrialLearner):
         low, high = (math.log(std) for std in cfg.std_range)
         measured = list[Tensor]()
         # Every process makes the same number of parts, independent of the number of its chunks.
-        weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # of each chunk (S,)
+        weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # weights of each chunk (S,)
         batches = mini_batches(weights, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
         for first, index, count in batches:
             measured.append(self._gradients(b, index, count, old_log_std))

@@ -29,7 +29,7 @@ class TaskRows:
         column = torch.arange(width, device=task_of_row.device)
         self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
         self.weight = (column < counts[:, None]).float()
-        # Position of each environment in the flattened rectangle.
+        # This is the position of each environment in the flattened rectangle.
         place = torch.empty_like(order)
         rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
         place[order] = task_of_row[order] * width + rank
@@ -83,7 +83,7 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
         weighted = x * w[:, None]
         gram = (weighted.T @ x).double()
         diagonal = gram.diagonal()
-        # A small penalty on every entry, relative to the mean, so that features may be linearly dependent.
+        # A small penalty on every entry, relative to the mean, allows for linearly dependent features.
         penalty = torch.full_like(diagonal, 1e-5)
         penalty[:-4] += ridge * x.shape[1] / w.sum().clamp_min(1.0)
         diagonal += penalty * diagonal.mean().clamp_min(1.0)

@@ -67,7 +67,8 @@ class TaughtTrials:
     def keep(self) -> None:
         """Store the trial that every environment has just played."""
         t = self.trials
-        # Rewards move one slot later, to the state that they led to; an episode's last reward led to no recorded state.
+        # Rewards move one slot later, to the state that they led to. The state after an episode's last reward is not
+        # recorded.
         rewards, paid = (torch.cat([torch.zeros_like(x[:1]), x[:-1]]) for x in (self.rewards, t.valid & ~t.ended))
         new = {"obs": t.obs, "rewards": rewards, "paid": paid, "labels": self.labels, "goals": self.goals}
         for name, value in (new | {"taught": self.taught, "lengths": t.lengths}).items():

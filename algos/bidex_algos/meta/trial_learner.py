@@ -45,7 +45,7 @@ class TrialLearner(Learner):
         self.limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
         """Maximum number of steps per episode, for each environment (N,)."""
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
-        # Pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
+        # These are the pools and row counts of classes with fewer rows than tasks. Each trial takes one task per row.
         rows = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
         each = zip(world.task_names, world.pools, rows, strict=True)
         self.pools = {name: (torch.tensor(pool), count) for name, pool, count in each if count < len(pool)}

@@ -191,7 +191,7 @@ class Batch:
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
-    # Inputs of the memory besides the observation; see Trials.previous.
+    # These are the memory's inputs besides the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
     old_means: Tensor  # means of the sampling policy (T, N, a)
     old_log_probs: Tensor  # log-density of the actions under the sampling policy (T, N)
@@ -253,7 +253,7 @@ def make_batch(
     Also returns the explained variance per task (num_tasks,). ``return_stats`` is updated with the trial's returns.
     """
     num_tasks = len(return_stats.mean)
-    # The only host sync: the number of steps of the longest trial.
+    # This is the only host sync: it reads the number of steps of the longest trial.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
     means = []
@@ -277,7 +277,7 @@ def make_batch(
     valid = t.valid[:slots] & filled
     # The value after the trial's last slot is never used.
     next_values = torch.cat([values[1:], values[-1:]])
-    # The end of an episode does not end the trial: the next episode follows with the same memory.
+    # The end of an episode does not end the trial, because the next episode continues with the same memory.
     advantages = gae(
         t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
         gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid

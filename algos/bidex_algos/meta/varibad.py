@@ -47,7 +47,7 @@ class VariBADConfig(RL2Config):
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
-# v2: as RL²'s (rl2.py). Beliefs are learned from whole trials, whatever the chunk.
+# The preset v2 has RL²'s values (rl2.py). Beliefs are learned from whole trials, whatever the chunk.
 PRESETS: dict[str, VariBADConfig] = {
     "laptop": VariBADConfig(),
     "v2": VariBADConfig(gamma=0.99, init_std=0.3, chunk=125, hidden=(128, 128), num_minibatches=4, epochs=3),
@@ -110,7 +110,7 @@ class BeliefCritic(nn.Module):
 
     def __init__(self, actor: BeliefActor, values: MLP):
         super().__init__()
-        self._actor = (actor,)  # A tuple, so that its weights are not this module's.
+        self._actor = (actor,)  # a tuple, so that the actor's weights are not this module's
         self.values = values
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

@@ -86,7 +86,7 @@ class InTurnConfig(LearnerConfig):
         super().__post_init__()
         if 0 < self.max_factor < 1:
             raise BidexError(
-                f"{self.algo}: max_factor: expected 0 or at least 1, which is no change at all, got {self.max_factor}."
+                f"{self.algo}: max_factor: expected 0 or at least 1 (which means no change), got {self.max_factor}."
             )
 
 

@@ -30,7 +30,7 @@ class HAPPOConfig(InTurnConfig, MultiAgentPPOConfig):
 
 
 PRESETS: dict[str, HAPPOConfig] = {
-    # Table 44; an on-policy learner has no use for its replay, Polyak factor and reward scale.
+    # These values are from Table 44. An on-policy learner does not use its replay, Polyak factor and reward scale.
     "paper": HAPPOConfig(
         **PAPER_PPO, learning_rate=1e-4, critic_learning_rate=1e-4, max_grad_norm=1.0, init_std=1.0,
         max_factor=0.0,

@@ -29,7 +29,7 @@ class IPPOConfig(MAPPOConfig):
 
 
 PRESETS: dict[str, IPPOConfig] = {
-    # There is no table for IPPO. The values are MAPPO's; B.2.1 has a policy and a critic for each agent.
+    # There is no table for IPPO, so the values are MAPPO's. B.2.1 describes a policy and a critic for each agent.
     "paper": IPPOConfig(**vars(replace(MAPPO_PRESETS["paper"], share_parameters=False))),
     "laptop": IPPOConfig(),
 }

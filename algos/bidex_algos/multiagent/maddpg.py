@@ -35,7 +35,7 @@ class MADDPGConfig(DDPGConfig):
         keep_partition(self)
 
 
-# There is no table for MADDPG (B.2.5 describes it). The values are DDPG's preset of this name.
+# There is no table for MADDPG (B.2.5 describes it), so the values are DDPG's preset of this name.
 PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop": MADDPGConfig()}
 
 
@@ -89,7 +89,8 @@ class MADDPG(DDPG):
         for agent, view in enumerate(self.views):
             mine = torch.where(self.owner == agent, actions, draw.actions)
             value = self._values(self.critic, obs, mine)[0]
-            # The price is relative to all actions, not the agent's own, so that it does not depend on the partition.
+            # The penalty is averaged over all actions, not the agent's own, so that it does not depend on the
+            # partition.
             price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())
         loss = torch.stack(losses).sum()

@@ -26,7 +26,8 @@ class MAPPOConfig(MultiAgentPPOConfig):
 
 
 PRESETS: dict[str, MAPPOConfig] = {
-    # Table 45. Its std is 0.5 sigmoid(s), initially s = 1 (std y and x coef); B.2.4 has one policy for all agents.
+    # These values are from Table 45. Its std is 0.5 sigmoid(s), initially with s = 1 (std y and x coef). B.2.4
+    # describes one policy for all agents.
     "paper": MAPPOConfig(
         **PAPER_PPO, learning_rate=5e-4, critic_learning_rate=5e-4, max_grad_norm=10.0, adam_eps=5e-4,
         init_std=0.3655, std_range=(0.01, 0.5), share_parameters=True,
@@ -52,7 +53,7 @@ class MAPPO(OwnAdams):
         old_values = self._old_values(batch)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
         given = zip(*(actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)), strict=True)
-        old_log_probs = torch.stack([gaussian_log_prob(*each) for each in given], dim=1)  # of each agent
+        old_log_probs = torch.stack([gaussian_log_prob(*each) for each in given], dim=1)  # log-densities of each agent
         measured: list[Tensor] = []
         for first, index, count in mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches, self.generator):
             part = batch.select(index)

@@ -71,7 +71,7 @@ class Team(nn.Module):
         nets = [cast(MLP, self.nets[self.net_of[i]]) for i in family]
         if self.share:
             return nets[0](x.flatten(0, 1)).unflatten(0, x.shape[:2])
-        if not nets[0].encoder.identity:  # encoders are each agent's own
+        if not nets[0].encoder.identity:  # each agent has its own encoder
             return torch.stack([net(own) for net, own in zip(nets, x, strict=True)])
         parameters = [dict(net.named_parameters()) for net in nets]
         stacked = {name: torch.stack([each[name] for each in parameters]) for name in parameters[0]}

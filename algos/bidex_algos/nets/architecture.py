@@ -73,7 +73,7 @@ def check_networks(config: Networks) -> None:
     architecture = config.architecture
     if architecture in ("multi_head", "towers", "separate"):
         for heads in ("policy_heads", "value_heads"):
-            object.__setattr__(config, heads, True)  # so that a checkpoint's config has them too
+            object.__setattr__(config, heads, True)  # stores the value, so that a checkpoint's config contains it
     if shares_a_trunk(architecture):
         return
     if vars(config).get("task_embedding"):

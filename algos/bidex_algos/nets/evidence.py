@@ -26,7 +26,7 @@ _TAIL = 4.0  # degrees of freedom of the Student distribution assumed for the mo
 def spread(count: int, size: int) -> Tensor:
     """Return points (count, size) spread evenly over [-1, 1]: an additive recurrence (R_d of Roberts 2018)."""
     root = 1.5
-    for _ in range(50):  # x^(size + 1) = x + 1
+    for _ in range(50):  # solves x^(size + 1) = x + 1
         root = (1.0 + root) ** (1.0 / (size + 1.0))
     steps = torch.tensor([root ** -(axis + 1.0) for axis in range(size)], dtype=torch.float64)
     return (2.0 * ((0.5 + torch.arange(1.0, count + 1.0)[:, None] * steps) % 1.0) - 1.0).float()

@@ -21,7 +21,7 @@ class Columns(nn.Module):
         index = sorted(chain.from_iterable(range(part.start, part.stop) for part in ranges))
         self.size = len(index)
         first = index[0] if index else 0
-        # A slice is a view; columns with gaps have to be copied.
+        # A slice is a view, but columns with gaps must be copied.
         if index == list(range(first, first + self.size)):
             self.range = slice(first, first + self.size)
         else:

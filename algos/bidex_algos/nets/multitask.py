@@ -265,7 +265,7 @@ class Towers(Headed):
         features = self.encoder(x)
         for layer in self.common:
             features = self.between(layer(features))
-        if not self.own:  # tasks differ by the output layer alone
+        if not self.own:  # tasks differ only in the output layer
             return features
         if maths.may_look(x.device):
             parts = zip(*(layer.each() for layer in self.own), strict=True)
@@ -313,5 +313,5 @@ class Transformer(Headed):
     def features(self, x: Tensor) -> Tensor:
         """Compute the features as in the base class."""
         tokens = [token(encoder(x)) for encoder, token in zip(self.encoders, self.tokens, strict=True)]
-        with sdpa_kernel(SDPBackend.MATH):  # the others have no gradient of their gradient, which TRPO needs
+        with sdpa_kernel(SDPBackend.MATH):  # the other kernels have no second derivative, which TRPO needs
             return self.norm(self.blocks(torch.stack(tokens, dim=1)).mean(1))

@@ -136,7 +136,7 @@ def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
     """Select from outputs (..., heads * n) the outputs (..., n) of the head that a one-hot (..., heads) marks."""
     if heads == 1:
         return out
-    with torch.autocast(out.device.type, enabled=False):  # like the output layer: means would be rounded
+    with torch.autocast(out.device.type, enabled=False):  # as in the output layer, because bfloat16 would round means
         return torch.einsum("...h,...ha->...a", one_hot.to(out.dtype), out.unflatten(-1, (heads, -1)))
 
 

@@ -74,7 +74,7 @@ class ObservationNormaliser(nn.Module):
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
-        # float32 copies for forward, refreshed by update.
+        # These are float32 copies for forward, refreshed by update.
         self.shift: Tensor
         self.scale: Tensor
         self.register_buffer("shift", torch.zeros(inputs.width))

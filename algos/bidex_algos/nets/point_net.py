@@ -36,7 +36,7 @@ class PointNet(nn.Module):
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0), generator=generator)
             nn.init.zeros_(layer.bias)
             layers += [layer, nn.ReLU()]
-        self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
+        self.shared = nn.Sequential(*layers[:-1])  # the maximum serves as the last non-linearity
 
     def forward(self, x: Tensor) -> Tensor:
         """Encode point clouds (..., entries) as (..., size)."""
@@ -52,8 +52,8 @@ class PointNet(nn.Module):
         last = cast(nn.Linear, self.shared[-1])
         if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
-        # Only the point with the maximum of a feature has a gradient: find these points first, then differentiate only
-        # them.
+        # Only the point with the maximum of a feature has a gradient, so we find these points first and differentiate
+        # only them.
         with torch.no_grad():
             found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
         chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
@@ -85,7 +85,7 @@ def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
             continue
         if "point_widths" not in options:
             raise BidexError(
-                f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
+                f"{config.algo} does not read point clouds. Use another learner, such as mtppo or mtsac, or leave "
                 "--points (a suite's table [points]) out."
             )
         make = partial(PointNet, widths=tuple(options["point_widths"]), channels=channels)

@@ -143,7 +143,7 @@ def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     ``raw`` (..., a) is the value before squashing, and the result is (...). The squashed action is not enough, because
     in float32 tanh rounds to 1 at 9 and above, and 1 has no finite inverse.
     """
-    # log(1 - tanh(u)^2), written without a difference of almost equal numbers.
+    # This is log(1 - tanh(u)^2), written without a difference of almost equal numbers.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
     return gaussian_log_prob(raw, mean, log_std) - log_slope.sum(-1)
 

@@ -134,7 +134,7 @@ def _pays(x: Tensor, weight: Tensor) -> bool:
     """Return whether oneDNN should compute ``x @ weight.T``."""
     return (
         x.device.type == "cpu"
-        and torch.backends.mkldnn.enabled  # before sizes, which an export leaves open
+        and torch.backends.mkldnn.enabled  # checked before sizes, which an export leaves open
         and x.numel() * len(weight) >= _LEAST
         and x.dtype == weight.dtype == torch.float32
         and not torch.is_autocast_enabled("cpu")
@@ -148,7 +148,7 @@ def is_faster_here() -> bool:
     both = torch.backends.mkl.is_available() and torch.backends.mkldnn.is_available()
     if not both or torch.backends.cpu.get_cpu_capability() != "AVX512" or "AuthenticAMD" not in _processor():
         return False
-    try:  # an operation that PyTorch keeps for its compiler: another version may call it otherwise
+    try:  # PyTorch keeps this operation for its compiler, and another version may name it differently
         return _onednn(torch.ones(2, 3), torch.ones(2, 3), None).shape == (2, 2)
     except (AttributeError, RuntimeError, TypeError):
         return False
@@ -158,4 +158,4 @@ def _processor() -> str:
     try:
         return Path("/proc/cpuinfo").read_text(errors="ignore")
     except OSError:
-        return platform.processor()  # not on Linux
+        return platform.processor()  # fallback for systems other than Linux

@@ -28,7 +28,7 @@ class RecurrentNet(nn.Module):
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
         self.encoder = nn.Sequential(last, ACTIVATIONS[activation]())
-        # The layer is made without memory first: the default initialisation would draw from the global generator.
+        # The layer is created without memory, because the default initialisation would draw from the global generator.
         self.gru = nn.GRU(hidden[-1], memory, device="meta").to_empty(device=torch.get_default_device())
         for name, weight in self.gru.named_parameters():
             if "bias" in name:

@@ -88,6 +88,6 @@ def check_discounts(name: str, world: VectorWorld, by_class: bool) -> None:
     own = [task for task, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
     if own and not by_class:
         raise BidexError(
-            f"{name}: has one discount for all classes, but the suite gives {', '.join(own)} one of its own. "
+            f"{name}: uses one discount for all classes, but the suite gives {', '.join(own)} one of its own. "
             "Leave gamma out of the suite's file."
         )

@@ -52,7 +52,7 @@ class OfflineConfig(NetworkConfig):
 class CriticConfig(OfflineConfig):
     """Additional options of learners with critics."""
 
-    value_heads: bool = True  # Give each critic one output per task instead of one for all.
+    value_heads: bool = True  # Give each critic one output per task instead of one output for all tasks.
     critic_layer_norm: bool = True
     """Apply layer norm in the critics. It keeps the values of actions that do not occur in the data from growing."""
     critic_learning_rate: Positive = 3e-4  # Adam's step size for the critics.
@@ -84,7 +84,7 @@ class Batches:
     def draw(self, batches: int, generator: torch.Generator) -> Tensor:
         """Draw indices uniformly within each task: int64 (batches, num_tasks * per_task), ordered by task."""
         shape = (batches, len(self._count), self._per_task)
-        # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
+        # A remainder of this large number favours no transition by more than 1 in 2^40 / transitions.
         drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]
         return self._of_task[self._first[:, None] + drawn].flatten(1)
 
@@ -244,6 +244,6 @@ class Offline(Learner):
         if here and state["data"] and here != state["data"]:
             differ = next(name for name in here if here[name] != state["data"].get(name))
             raise BidexError(
-                f"{self.name}: the checkpoint's data have {differ} {state['data'].get(differ):,.6g}, these "
+                f"{self.name}: the checkpoint's data sets have {differ} {state['data'].get(differ):,.6g}, these "
                 f"{here[differ]:,.6g} (sums; transitions: their number). Resume with the run's own data sets."
             )

@@ -15,7 +15,7 @@ class BCConfig(OfflineConfig):
     """All options of BC; the defaults are the preset ``laptop``."""
 
 
-# Bi-DexHands has results for BC but no table; layers, step size and batch are TD3+BC's in Table 46.
+# Bi-DexHands has results for BC but no table, so layers, step size and batch are TD3+BC's from Table 46.
 PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 
 

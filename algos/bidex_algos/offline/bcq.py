@@ -204,7 +204,7 @@ class BCQ(Offline):
 
     def _parts(self) -> Parts:
         parts = super()._parts()
-        del parts["critic"]  # the policy's
+        del parts["critic"]  # the critic is a part of the policy
         return parts
 
     def _own_parts(self) -> Parts:

@@ -34,7 +34,7 @@ from bidex_meta.world.contract import Info, VectorWorld
 class OffPolicyConfig(NetworkConfig):
     """Options of networks, replay, updates, statistics; a vector step is one step in every environment of the world."""
 
-    value_heads: bool = True  # Give each critic one output per task instead of one for all.
+    value_heads: bool = True  # Give each critic one output per task instead of one output for all tasks.
     critic_layer_norm: bool = True
     """Apply layer norm in the critics. It keeps values from diverging with many updates per step."""
     replay_steps: Count = 500  # Vector steps that the replay keeps, if replay_memory allows.
@@ -135,7 +135,7 @@ class OffPolicy(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
         self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
-        # Rewards that have left the replay also fade from the statistics.
+        # Rewards that the replay no longer holds also fade from the statistics.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)

@@ -120,7 +120,7 @@ class BRC(Categorical, MTSAC):
         gamma = discounts(self.world, self.config.gamma, tasks)
         bound = self.config.value_bound
         each = abs(self.target_entropy) / (1.0 - gamma)
-        # Room for the entropy of all future steps, but at least half of the range is left for rewards.
+        # The range leaves room for the entropy of all future steps, and at least half of it for rewards.
         room = bound - (self.log_alpha.detach().exp() * each).clamp_max(0.5 * bound)
         return (self.returns.bound / room).clamp_min(1e-8)
 

@@ -47,7 +47,7 @@ class Atoms(nn.Module):
         the atom at that end. ``shift`` and ``factor`` are (B,).
         """
         moved = shift[:, None] + factor[:, None] * self.values
-        # Positions in units of the distance between two atoms, counted from the lowest.
+        # These are positions in units of the distance between two atoms, counted from the lowest.
         place = (moved.clamp(self.low, self.high) - self.low) * ((self.count - 1) / (self.high - self.low))
         share = place - place.floor()
         # NaN must stay NaN and must not become an index.
@@ -119,7 +119,7 @@ class CategoricalCritics(nn.Module):
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
-RECENT = 0.9  # decay per step of the mean of recent rewards: about the last ten steps count
+RECENT = 0.9  # decay per step of the mean of recent rewards, so that about the last ten steps count
 
 
 class ReturnBound(ReturnScale):

@@ -56,9 +56,9 @@ PRESETS: dict[str, FastTD3Config] = {
         squash_price=0.0,
     ),
     "laptop": FastTD3Config(),
-    # For Meta-World's suites on one core: discount, steps and bound are from the authors' class for these suites.
-    # Layers are narrower and there is one update of fewer transitions, because a vector step has 4 rows per class here
-    # instead of hundreds.
+    # This preset is for Meta-World's suites on one core. Discount, steps and bound are from the authors' class for
+    # these suites. Layers are narrower and there is one update of fewer transitions, because a vector step has 4 rows
+    # per class here instead of hundreds.
     "metaworld": FastTD3Config(
         hidden=(256, 256, 128), critic_hidden=(256, 256, 128), replay_steps=100_000, warmup_steps=500,
         steps_per_iteration=500, updates_per_step=1, batch_per_task=256, gamma=0.97, n_steps=8, tau=0.05,
@@ -97,7 +97,7 @@ class FastTD3(Categorical):
         next_obs = self.policy.observations(draw.next_obs)
         # Step 1: the critics' distributions move towards the projected targets, by cross-entropy.
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        # Step 2: the actor learns at every policy_delay-th update.
+        # Step 2: the actor learns in every policy_delay-th update.
         self.updates += 1
         if self.updates % self.config.policy_delay == 0:
             self._climb(obs, weights, counts)

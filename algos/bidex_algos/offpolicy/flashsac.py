@@ -183,7 +183,8 @@ class FlashSAC(Categorical, MTSAC):
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         critics = super()._make_critics(inputs, heads)
-        # Weights of length 1 could not outweigh the biases of a narrow initial distribution, which reach 50.
+        # With weights of length 1, the network could not overcome the biases of a narrow initial distribution, which
+        # reach 50.
         for net in _of(critics):
             nn.init.zeros_(net.head.bias)
         return critics

@@ -52,23 +52,24 @@ _PLAIN = MTSACConfig(
 )  # fmt: skip
 
 PRESETS: dict[str, MTSACConfig] = {
-    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"); there is no table for MT-SAC. Its entropy coefficient
-    # 0.2 is the initial value of each temperature; its 4 mini-batches of 32 follow every vector step, for each task.
-    # The 32 steps between two reports are from Table 49 (SAC on Humanoid). Both tables omit non-linearity, bounds of
-    # the standard deviation, target entropy and warm-up, and learn no temperature.
+    # These values are from Table 43 of the Bi-DexHands appendix (SAC, "other tasks"), because there is no table for
+    # MT-SAC. Its entropy coefficient 0.2 is the initial value of each temperature; its 4 mini-batches of 32 follow
+    # every vector step, for each task. The 32 steps between two reports are from Table 49 (SAC on Humanoid). Both
+    # tables omit non-linearity, bounds of the standard deviation, target entropy and warm-up, and learn no temperature.
     "paper": replace(
         _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
     ),
     "laptop": MTSACConfig(),
-    # MT-SAC as Meta-World's baselines run it, with one environment of each task.
+    # This preset is MT-SAC as in Meta-World's baselines, with one environment per task.
     "metaworld": replace(
         _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
         updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
     ),
 }  # fmt: skip
 
-# Table 49: its 2 epochs of one mini-batch follow every vector step; its replay of 40,000 counts vector steps.
+# These values are from Table 49. Its 2 epochs of one mini-batch follow every vector step; its replay of 40,000 counts
+# vector steps.
 _TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,

@@ -22,11 +22,12 @@ class TD3Config(DDPGConfig):
     policy_delay: Count = 2  # Updates of the critics for each update of the actor and of all target networks.
 
 
-# Smoothing and delay of "paper", like the defaults, are from Fujimoto et al. (2018, section 6.1).
+# Smoothing and delay of "paper" and of the defaults are from Fujimoto et al. (2018, section 6.1).
 PRESETS: dict[str, TD3Config] = {
     "paper": TD3Config(**OF_PAPER),
     "laptop": TD3Config(),
-    # For Meta-World's suites: discount, Polyak, layers, replay and batches are from MT-SAC's preset of this name.
+    # This preset is for Meta-World's suites. Discount, Polyak factor, layers, replay and batches are from MT-SAC's
+    # preset of this name.
     "metaworld": TD3Config(
         hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=500, steps_per_iteration=500, updates_per_step=1,
         batch_per_task=128, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,

@@ -45,7 +45,7 @@ class Demonstrations:
         size = (self.batch_size,)
         device = self._obs.device
         task = torch.randint(len(self._count), size, generator=self.generator, device=device)
-        # The remainder of so large a number favours no entry by more than 1 in 2^40 / transitions.
+        # A remainder of this large number favours no entry by more than 1 in 2^40 / transitions.
         place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
         chosen = self._of_task[self._first[task] + place]
         return self._obs[chosen], self._actions[chosen]

@@ -51,9 +51,9 @@ class OnPolicyConfig(LearnerConfig):
     """Widths of the layers that all points of a point cloud share (PointNet), if the world shows a point cloud."""
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    rollout_steps: Count = 8  # Steps taken in every environment between two updates.
-    gamma: Fraction = 0.93  # Discount per step.
-    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
+    rollout_steps: Count = 8  # Steps in every environment between two updates.
+    gamma: Fraction = 0.93  # Discount factor per step.
+    lam: Fraction = 0.95  # Lambda of generalised advantage estimation.
     normalise_observations: bool = True
     """Give observations zero mean and unit variance by running statistics; the task's one-hot is not changed."""
     autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
@@ -99,19 +99,19 @@ class MTPPOConfig(OnPolicyConfig):
 
 
 PRESETS: dict[str, MTPPOConfig] = {
-    # Table 47 of the Bi-DexHands appendix.
+    # These values are from Table 47 of the Bi-DexHands appendix.
     "paper": MTPPOConfig(
         hidden=(2048, 1024, 512), value_heads=False, init_std=0.8, rollout_steps=8, num_minibatches=4, gamma=0.96,
         lam=0.95, normalise_observations=False, epochs=5, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
         critic_learning_rate=None,
     ),
     "laptop": MTPPOConfig(),
-    # Version 2 of the suites (docs/results/ladder.md). The discount sees a whole episode of 250 steps; small noise lets
-    # the policy hold still, as success asks.
+    # This preset is for version 2 of the suites (docs/results/ladder.md). The discount covers a whole episode of 250
+    # steps; low noise lets the policy hold still, as success requires.
     "v2": MTPPOConfig(gamma=0.99, init_std=0.3),
-    # For Meta-World's multi-task suites: discount, trace and clip are from its authors' MTPPO (metaworld-algorithms).
-    # Networks are small, and rollouts have 100 steps instead of 10,000. With 250 steps (ELU, 8 mini-batches) success on
-    # MT3 was 24 % after 150 k steps instead of 42 %.
+    # This preset is for Meta-World's multi-task suites. Discount, trace and clip are from its authors' MTPPO
+    # (metaworld-algorithms). Networks are small, and rollouts have 100 steps instead of 10,000. With 250 steps (ELU, 8
+    # mini-batches) success on MT3 was 24 % after 150 k steps instead of 42 %.
     "metaworld": MTPPOConfig(
         activation="tanh", rollout_steps=100, epochs=5, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02,
         std_range=(0.1, 1.5),
@@ -173,7 +173,7 @@ class OnPolicy(Learner):
         """Return the optimisers by their names in a checkpoint."""
 
     def _iterate(self) -> dict[str, float]:
-        # Step 1: collect a rollout with the present policy.
+        # Step 1: collect a rollout with the current policy.
         with self._collecting():
             if self.obs is None:
                 self.obs = self._first_observations()
@@ -225,7 +225,7 @@ class OnPolicy(Learner):
         if self.low_precision:
             obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
 
-        # Several critics make several columns per row, each treated as a separate row.
+        # Several critics give several columns per row; each column is treated as a separate row.
         def each(x: Tensor) -> Tensor:
             return x.repeat_interleave(self.num_critics, 1)
 
@@ -293,7 +293,7 @@ class MTPPO(OnPolicy):
         )  # fmt: skip
         self.balance = balance_of(config.gradient_surgery, world.num_tasks, self.device)
         self._graphs = None
-        # The weight of demonstrations is no tensor, so that an update with them cannot be recorded.
+        # The weight of demonstrations is not a tensor, so an update with demonstrations cannot be recorded.
         alone = self.balance is None and sources.demonstrations is None and world_size() == 1
         if alone and self.device.type == "cuda":
             self._graphs = GraphCache(dict, lambda _: None, cuda_graph)
@@ -303,7 +303,7 @@ class MTPPO(OnPolicy):
         if sources.teachers is not None:
             self.lessons = Lessons(world, self.policy, sources.teachers, config.rollout_steps)
             self.per_process = (*self.per_process, "data")
-            self.rollout.ended[-1] = True  # episodes begin with the first step, for teachers too
+            self.rollout.ended[-1] = True  # episodes of the teachers also begin with the first step
 
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and not self.env_steps:
@@ -339,7 +339,8 @@ class MTPPO(OnPolicy):
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
             reported["Policy/demonstration_weight"] = means.new_tensor(self.demonstrations.weight(self.env_steps))
-        # Beyond the paper: teachers' labels hold each class to what the policy could do, in proportion to its failure.
+        # This loss is not in the paper: the teachers' labels keep each class near what the teacher does, in proportion
+        # to the policy's failures.
         if self.lessons is not None:
             self.lessons.take_moments(cfg.rollout_steps)
             updates = 0 if critic_alone else cfg.teacher_updates
@@ -351,7 +352,8 @@ class MTPPO(OnPolicy):
         *fields, count, old_log_std = inputs
         b = Batch(*fields)
         actor = self.policy.actor
-        # Step 4: the clipped surrogate (equation 7) and the critic's squared error, means over the mini-batch.
+        # Step 4: compute the clipped surrogate (equation 7) and the critic's squared error, as means over the
+        # mini-batch.
         loss = self._loss(b, count, old_log_std)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
         rest = _VALUE_LOSS_WEIGHT * value
@@ -360,7 +362,7 @@ class MTPPO(OnPolicy):
         if self.demonstrations is not None:
             imitated = self.demonstrations.loss(self.policy) / world_size()
             rest = rest + self.demonstrations.weight(self.env_steps) * imitated
-        # Step 5: their gradients, summed over processes; the tasks' conflicting gradients may be balanced.
+        # Step 5: compute the gradients and sum them over processes; conflicting gradients of tasks may be balanced.
         self.adams.zero_grad()
         if self.balance is not None:
             losses = self._per_task(-loss.earned, b.task_id)
@@ -372,7 +374,8 @@ class MTPPO(OnPolicy):
         if imitated is not None:
             numbers.append(imitated.detach())
         summed = sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
-        # Step 6: a step of Adam, whose size follows the KL (element 2) of the mini-batch. The first one's KL is 0.
+        # Step 6: take a step of Adam, whose size follows the KL (element 2) of the mini-batch. The first mini-batch's
+        # KL is 0.
         self.adams.descend(None if first else summed[2], _MAX_GRAD_NORM, critic_alone)
         self._bound_std()
         if self.balance is not None:
@@ -410,7 +413,8 @@ class MTPPO(OnPolicy):
         if self._graphs is not None:
             self._graphs.forget()
         self._bound_std()
-        # A KL is known only after a step: of a policy trained by DAgger the first was 187 with a step size of 3e-4.
+        # The KL is known only after a step. After a policy trained by DAgger, the first KL was 187 with a step size of
+        # 3e-4.
         self.adams.rate.fill_(self.adams.bounds[0])
 
     def _optimisers(self) -> Parts:

@@ -44,8 +44,8 @@ class MTTRPOConfig(OnPolicyConfig):
 
 
 PRESETS: dict[str, MTTRPOConfig] = {
-    # The Bi-DexHands appendix has no table for TRPO. Networks, rollouts and returns are those of the nearest one, Table
-    # 47 (MT-PPO); trust region and line search are the defaults of Bi-DexHands' MTTRPO class.
+    # The Bi-DexHands appendix has no table for TRPO. Networks, rollouts and returns are from the most similar one,
+    # Table 47 (MT-PPO); trust region and line search are the defaults of Bi-DexHands' MTTRPO class.
     "paper": MTTRPOConfig(
         hidden=(2048, 1024, 512), value_heads=False, init_std=0.8, rollout_steps=8, num_minibatches=4, gamma=0.96,
         lam=0.95, normalise_observations=False, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1,
@@ -89,7 +89,8 @@ def kl_from_itself(
     The divergence is 0, but its second derivative is the Fisher matrix.
     """
     sample = torch.arange(len(weights), device=weights.device)
-    # The samples are steps by rows. Each later step starts at a later row; otherwise some rows would never be taken.
+    # The samples are steps by rows. Each later step starts at a later row, because otherwise some rows would never be
+    # used.
     taken = (sample + sample // rows) % stride == 0
     mean, log_std = distribution(taken)
     kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)

@@ -5,15 +5,16 @@ from dataclasses import replace
 from bidex_algos.nets.architecture import Options
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 
-# Table 42, column "Other Tasks". Other values are from Table 47.
+# These values are from Table 42, column "Other Tasks", and the others from Table 47.
 _PAPER = replace(PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
-# Table 50. Other values are from Table 47 (``paper``) or those for hands (``laptop``, with narrower layers).
+# These values are from Table 50. The others are from Table 47 (``paper``) or from the preset for hands (``laptop``,
+# with narrower layers).
 _TABLE_50: Options = {
     "rollout_steps": 32, "epochs": 5, "num_minibatches": 4, "clip": 0.1, "learning_rate": 3e-4, "gamma": 0.99,
     "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01,
 }  # fmt: skip
 TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
-    # Table 42's own columns.
+    # These values are from Table 42's own columns.
     "LiftUnderarm": {"paper": replace(_PAPER, rollout_steps=20, epochs=10)},
     "StackBlock": {"paper": replace(_PAPER, num_minibatches=8, epochs=2, gamma=0.9)},
     "gymnasium/Humanoid-v5": {

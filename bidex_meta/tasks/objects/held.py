@@ -75,7 +75,7 @@ class HeldObject:
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
         """Return the contact buffer sizes of a class with ``count`` such objects, given the sizes that eggs need."""
-        # A flat face meets its support in four points, and each geom may meet palm and fingers at once.
+        # A flat face meets its support in four points, and each geom may meet palm and fingers at the same time.
         more = count * (8 + 4 * self.geoms)
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
 
@@ -150,7 +150,7 @@ def held_object(name: object) -> HeldObject | None:
     try:
         state = os.stat(file)
     except (OSError, ValueError):
-        return _loaded(file, (0, 0))  # raises the error with the reason
+        return _loaded(file, (0, 0))  # raises BidexError with the reason
     return _loaded(file.resolve(), (state.st_mtime_ns, state.st_size))
 
 
@@ -162,9 +162,12 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
         raise BidexError(f"{file}: expected one <body> with geoms, got {len(bodies)}. Put all geoms into one body.")
     joints = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
     if joints:
-        raise BidexError(f"{file}: expected a body without joints, got {joints[0].name or 'one'}. It flies freely.")
+        raise BidexError(
+            f"{file}: expected a body without joints, got {joints[0].name or 'one'}. Remove joints; the object "
+            "moves freely without them."
+        )
     if list(spec.worldbody.geoms):
-        raise BidexError(f"{file}: expected geoms inside the body, got some beside it. Move them into the body.")
+        raise BidexError(f"{file}: expected geoms inside the body, got some outside. Move them into the body.")
     if (spec.body("object") or bodies[0]) is not bodies[0] or not list(bodies[0].geoms):
         raise BidexError(f"{file}: expected a <body> with geoms, got none. Add its shape.")
     model = compiled(file, spec)
@@ -177,13 +180,13 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 
 
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
-    # a hand has 5
+    # The mass is limited to 2 kg, because a hand weighs 5 kg.
     mass = float(model.body_mass[1])
     longest = float((high - low).max())
     least = 0.002
     most = 2.0
     if not least <= mass <= most:
-        raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
+        raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Fix mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:
         raise BidexError(
             f"{file}: expected an object of {100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which "

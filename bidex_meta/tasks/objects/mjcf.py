@@ -60,7 +60,7 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
     except ValueError as error:
         raise BidexError(f"{path}: expected an object in MJCF, but {_reason(error)}") from None
     if not math.isfinite(float(model.body_mass.sum() + model.body_inertia.sum() + model.geom_size.sum())):
-        raise BidexError(f"{path}: expected finite sizes and masses, got others. Mend the file.")
+        raise BidexError(f"{path}: expected finite sizes and masses, got others. Fix the file.")
     return model
 
 
@@ -82,7 +82,7 @@ def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
     """Return the number of colliding geoms; raise BidexError for 0, more than ``most``, or too much friction."""
     geoms = colliding(model)
     if not 0 < geoms <= most:
-        raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Mend it.")
+        raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Fix it.")
     friction = float(model.geom_friction[:, 0].max())
     if not friction <= _MOST_FRICTION:
         raise BidexError(f"{path}: expected friction of at most {_MOST_FRICTION:g}, got {friction:.4g}. Lower it.")
@@ -90,7 +90,7 @@ def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
 
 
 def _reason(error: Exception) -> str:
-    return f"MuJoCo says: {one_line(error)[:200].rstrip('.')}. Mend the file."
+    return f"MuJoCo says: {one_line(error)[:200].rstrip('.')}. Fix the file."
 
 
 def _beside(path: Path, name: Path) -> Path:
@@ -98,9 +98,11 @@ def _beside(path: Path, name: Path) -> Path:
     folder = path.resolve().parent
     found = (folder / name).resolve()
     if not found.is_relative_to(folder):
-        raise BidexError(f"{path}: expected files in its own folder, got {one_line(name)}. Put it beside the object.")
+        raise BidexError(
+            f"{path}: expected files in its own folder, got {one_line(name)}. Put it next to the object's file."
+        )
     if not is_file(found):
-        raise BidexError(f"{path}: expected the file {one_line(name)} beside it, but there is none. Mend the path.")
+        raise BidexError(f"{path}: expected the file {one_line(name)} next to it, but there is none. Fix the path.")
     if found.stat().st_size > _MOST_MESH_BYTES:
         raise BidexError(f"{path}: expected {one_line(name)} with at most {_MOST_MESH_BYTES:,} bytes. Simplify it.")
     return found
@@ -129,7 +131,7 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
             refuse("a texture in one file", "one with a file for each side", "Leave it out.")
         for key, value in attributes.items():
             if _NOT_FINITE.search(value):
-                refuse("finite numbers", f"{key}={shortened(one_line(value))}", "Mend the file.")
+                refuse("finite numbers", f"{key}={shortened(one_line(value))}", "Fix the file.")
         for key in ("meshdir", "texturedir", "assetdir"):
             if Path(attributes.get(key, "")).is_absolute():
                 refuse("a folder beside the file", f"{key} with an absolute path", "Write a relative one.")
@@ -148,7 +150,7 @@ def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
     except (expat.ExpatError, ValueError) as error:
         if isinstance(error, BidexError):
             raise
-        raise BidexError(f"{path}: expected MJCF, but it is no XML: {one_line(error)}.") from None
+        raise BidexError(f"{path}: expected MJCF, but it is not XML: {one_line(error)}.") from None
 
 
 _AROUND, _OVER = 12, 128

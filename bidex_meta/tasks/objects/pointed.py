@@ -106,7 +106,7 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
     mass = float(model.body_mass.sum())
     low, high = _box(model)
     if not 0.0 < mass <= _MOST_MASS:
-        raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Mend mass or density.")
+        raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Fix mass or density.")
     if (high - low).max() > _LARGEST:
         raise BidexError(f"{file}: expected at most {_LARGEST:g} m, got {(high - low).max():.4g}. Scale it.")
     foot = _box(like)[0][2]

@@ -3,7 +3,7 @@
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, beside
 
-_DOWN = 0.2  # bend of the wrist that brings straight fingers below the forearm, rad
+_DOWN = 0.2  # bend of the wrist, rad, that brings straight fingers below the forearm
 
 
 # A fork of forefinger and little finger: distances from the block to the hand's point while it pushes and while it lets
@@ -42,7 +42,7 @@ def push_blocks(hands: HandController) -> Actions:
                 lead = way * 0.0
             else:
                 lead = way * 1.0
-            # Where the fork is, if it follows its block; it never runs ahead.
+            # The fork is at this position if it follows its block; it never runs ahead.
             ahead = float(lead[0])
             behind_block = _BEHIND + ahead if ahead < -0.004 else _CLEAR
             points.append(beside(place, behind_block, float(lead[1]), _LOW))

@@ -9,8 +9,9 @@ from torch import Tensor
 from bidex_meta.utils.maths import rotate
 from bidex_meta.witness.controller import Actions, HandController, Point, beside, point
 
-_TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
-_HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
+_TIP = 0.035  # distance in metres from a finger's last joint to the part of its tip that touches a cap's axis
+# Joint angles, rad, at which the right thumb stays behind the bottle.
+_HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 _FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"), (1, 2))}
 
 
@@ -69,7 +70,7 @@ _RADIUS = 0.068
 _TIP_RADIUS = 0.078
 _TOUCH = 0.2
 _FAR = 0.5
-_FINGERTIP = 0.031  # from a finger's last joint to its tip, metres
+_FINGERTIP = 0.031  # distance in metres from a finger's last joint to its tip
 
 
 def swing_cup(hands: HandController) -> Actions:
@@ -122,7 +123,7 @@ def _push_on(hands: HandController) -> Actions:
         yield from hands.lead(tip(_TOUCH, 0.03), aside, speed=0.4)
     while hands.steps_left and _missing(hands) > 0.05:
         yield from hands.lead(tip(_TOUCH - min(0.3, _missing(hands))), aside, speed=0.2)
-    # The hand stays: a cup that is bumped on its way back turns on.
+    # The hand stays, because a cup that is touched on the way back turns further.
     yield from hands.lead(point(hands.at("right")), aside, hands.episode_steps)
 
 

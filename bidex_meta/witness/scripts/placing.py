@@ -3,14 +3,14 @@
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.between import Between, Take
 
-# The right forefinger and the left little finger press, spread towards each other, until they are straight.
+# The right forefinger and the left little finger spread towards each other and press until they are straight.
 _SPREAD = 0.12
 _WRIST = 0.06
 _YAW = 0.12
 _PRESSED = ("FFJ3", "LFJ3"), (_SPREAD, -_SPREAD), (0.0, 0.0)
 _BUCKET = Take(0.065, 0.013, 0.775, 0.145, 0.02, *_PRESSED)
 _BLOCK = Take(0.075, 0.005, 0.775, 0.115, 0.02, *_PRESSED)
-# heights of a bucket on the table, and of the block over it, metres
+# These are heights in metres: of a bucket on the table, and of the block above it.
 _STANDS = 0.657
 _OVER = 0.765
 
@@ -27,7 +27,7 @@ def place_in_bucket(hands: HandController) -> Actions:
         place = hands.where("bucket/position")
         goal = hands.frozen("goal") if hands.wide else place
         gap = float((place - hands.where("block/position"))[1])
-        # The right hand must not come down on the bucket.
+        # The right hand must not descend onto the bucket.
         bucket = Between(hands, "bucket", _BUCKET)
         block = Between(hands, "block", _BLOCK, (max(0.1, gap - 0.12), 1.0))
         lifted = bucket.held > 0.5 and bucket.thing[2] > _STANDS + 0.012

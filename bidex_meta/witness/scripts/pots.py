@@ -6,20 +6,22 @@ from torch import Tensor
 
 from bidex_meta.witness.controller import Actions, HandController, beside
 
-_BACK = 0.698  # how far a wrist bends back, rad
-# Position of a hand's point, from the pot's origin, if its fingertips carry a grip of the pot, metres.
+_BACK = 0.698  # angle in rad by which a wrist bends back
+# This is the position in metres of a hand's point relative to the pot's origin when its fingertips carry a grip of the
+# pot.
 _REACH = 0.1755 + 0.085
 _GRIP_HEIGHT = 0.068
 
 
 def lift_underarm(hands: HandController) -> Actions:
     """Bring the hands under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
-    # A pot that is thrown to its goal pays before one that is lifted there.
+    # Throwing the pot to its goal earns more reward than lifting it there.
     pot = hands.where("object/position")
-    out = (hands.where("object/right_handle_position") - pot) / 0.15  # from the pot to the right grip, of length 1
+    out = (hands.where("object/right_handle_position") - pot) / 0.15  # unit vector from the pot to the right grip
     yaw = math.atan2(-float(out[0]), float(out[1]))
     for side, sign in (("right", -1.0), ("left", 1.0)):
-        hands.bend(side, 0.0, 0.0, WRJ0=-_BACK)  # against the joint's limit: a wrist's motor is weaker than the pot
+        # The wrist rests against the joint's limit, because its motor is too weak for the pot.
+        hands.bend(side, 0.0, 0.0, WRJ0=-_BACK)
         hands.hold(side, roll=sign * (_BACK + 0.1), yaw=yaw)
     out[2] = 0.0
 

@@ -8,11 +8,12 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, Point, beside, point
 from bidex_meta.witness.scripts.between import ramp
 
-# Turn that lays the left fingers on the underside of the kettle's trough; the kettle's tilt when it pours, rad.
+# The first value is the rotation that lays the left fingers on the underside of the kettle's trough, the second the
+# kettle's tilt in rad when it pours.
 _TROUGH = math.radians(59.0)
 _POUR = math.radians(50.0)
-_RUNNING = 25  # steps in which the water runs out
-# Metres.
+_RUNNING = 25  # number of steps in which the water runs out
+# These values are in metres.
 _STANDS = 0.457  # height of a bucket on the table
 _AHEAD = 0.03  # offset of the hands' points from the bucket along x
 _UP = 0.03  # height of the hands' points above a standing bucket's origin; below, the left thumb would touch the table
@@ -24,7 +25,7 @@ _SIGNS = (1.0, -1.0)  # sides of the bucket along y on which the right and the l
 
 def pour_water(hands: HandController) -> Actions:
     """Grip handle and spout, lift the kettle and tilt it; in version 2 then put it down and carry the bucket."""
-    # Water itself is not paid.
+    # The reward ignores the water itself.
     kettle = hands.where("kettle/position")
     bucket = hands.where("bucket/position")
     back = hands.where("kettle/handle_position") - kettle  # from spout to handle
@@ -48,14 +49,15 @@ def pour_water(hands: HandController) -> Actions:
         )
 
     hands.bend("right", 0.0, 0.0)
-    hands.bend("left", 0.0, 0.0, THJ4=1.047, THJ3=1.222)  # its thumb across the palm, off the kettle's wall
+    hands.bend("left", 0.0, 0.0, THJ4=1.047, THJ3=1.222)  # the thumb lies across the palm, away from the kettle's wall
     yield from grip(kettle, aside=0.15, loose=0.025, steps=26)
     yield from grip(kettle, loose=0.025, steps=17)
     hands.bend("right", 1.2, 1.5)
     yield from grip(kettle, steps=17)
     sine = math.sin(_POUR)
     cosine = math.cos(_POUR)
-    lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine  # of a tilted kettle, along ``back`` and up
+    # Position of the tilted kettle's lip along ``back`` and up.
+    lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine
     way = bucket + (0.07 - lip[0]) * back - kettle
     way[2] += 0.098 - lip[1]
     across = back.new_tensor([-float(back[1]), float(back[0]), 0.0])
@@ -64,14 +66,14 @@ def pour_water(hands: HandController) -> Actions:
         if hands.wide and share > 0.5:  # the left hand may have moved the spout aside
             way += 0.1 * across.dot(bucket - hands.where("kettle/spout_position")) * across
         there = kettle + share * way
-        there[2] = kettle[2] + min(1.0, 1.3 * share) * way[2]  # up first: the left hand must clear the bucket's rim
+        there[2] = kettle[2] + min(1.0, 1.3 * share) * way[2]  # the left hand first rises, to clear the bucket's rim
         yield from grip(there, share * _POUR)
     if not hands.wide:
         yield from grip(kettle + way, _POUR, steps=hands.episode_steps)
         return
     yield from grip(kettle + way, _POUR, steps=_RUNNING)
     away = kettle.clone()
-    away[1] += 0.2  # else the hand and the kettle meet when the hand takes the bucket
+    away[1] += 0.2  # otherwise hand and kettle meet when the hand takes the bucket
     for i in range(60):
         share = 1.0 - (i + 1) / 60
         there = away + share * (kettle + way - away)
@@ -87,7 +89,7 @@ def pour_water(hands: HandController) -> Actions:
 def _carry_bucket(hands: HandController) -> Actions:
     """Clamp the bucket between both palms, carry it to its goal and hold it there until the episode ends."""
     goal = hands.frozen("goal")[:3]
-    # Thumbs out of the way; the left one points down, so it is bent.
+    # The thumbs are moved out of the way. The left thumb points down, so it is bent.
     hands.bend("right", 0.3, 0.0, THJ4=-1.047)
     hands.bend("left", 0.3, 0.0, THJ4=-1.047, THJ1=-0.5, THJ0=-1.57)
     for side in SIDES:
@@ -100,7 +102,7 @@ def _carry_bucket(hands: HandController) -> Actions:
         for way, sign in zip(ways, _SIGNS, strict=True):
             around *= _beside(way, sign) * ramp(float(way[2]) - _UP, 0.05, 0.03)
         held = around * ramp(width, 0.065, 0.06)
-        # The nearer hand waits for the other: a bucket that is pushed on one side tips.
+        # The nearer hand waits for the other, because a bucket that is pushed on one side tips over.
         farther = max(float(ways[0][1]), -float(ways[1][1]))
         closer = farther + held * (width - farther) - 0.015 - 0.02 * ramp(width, 0.075, 0.095)
         half = _APART + around * (closer - _APART)

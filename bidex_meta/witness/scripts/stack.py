@@ -4,12 +4,12 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.between import Between, Take, ramp
 
-# Bend of the knuckles, rad: the fingers point down, and give way to what their backs press. About 2 N are enough; more
-# turn the hands, whose torque is weak.
+# This is the bend of the knuckles in rad. The fingers point down and yield when their backs press a block. A force of
+# 2 N is enough; a larger one would turn the hands, whose torque is low.
 _BENT = 1.3
 _FIRM = 1.4
 _TAKE = Take(0.0, 0.065, 0.765, 0.097, 0.012, ("MFJ2", "MFJ2"), (_BENT, _BENT), (_FIRM, _FIRM))
-# height of a block on the table; a block's edge, metres
+# These lengths in metres are the height of a block on the table, and a block's edge.
 _LIES = 0.629
 _EDGE = 0.05
 
@@ -26,7 +26,7 @@ def stack_in_order(hands: HandController) -> Actions:
     for side in SIDES:
         hands.hold(side)
     while hands.steps_left:
-        for side in SIDES:  # up, before the fingers swing down
+        for side in SIDES:  # the hands rise before the fingers swing down
             knuckle = float(hands.where(f"{side}/MFJ2_position"))
             height = float(hands.at(side)[2])
             hands.bend(side, _BENT * max(ramp(height, 0.72, 0.75), ramp(knuckle, 0.3, 0.6)), 0.0)

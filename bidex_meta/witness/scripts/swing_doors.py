@@ -42,7 +42,7 @@ _OUTWARD = _Leaf((-0.0085, 0.4265), 0.3752, 0.0830), _Leaf((-0.0056, 0.4204), 0.
 
 def open_inward(hands: HandController) -> Actions:
     """Put bent fingers behind the bars from the side, and pull the leaves open; the hands turn with them."""
-    # One leaf open and the other shut pays as much as both half open.
+    # One open and one shut leaf earn as much reward as two half-open leaves.
 
     def go(
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
@@ -69,8 +69,8 @@ def open_inward(hands: HandController) -> Actions:
 
 def close_outward(hands: HandController) -> Actions:
     """Put straight fingers between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
-    # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded, since
-    # more force straightens bent fingers.
+    # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded,
+    # because more force straightens bent fingers.
     start = _angles(hands)
 
     def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
@@ -90,7 +90,7 @@ def close_outward(hands: HandController) -> Actions:
     yield from go(start, back=0.2, steps=16, speed=1.0)
     yield from go(start, steps=22, speed=1.2)
     led = start
-    lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
+    lasts = _goals(hands, -0.2, 0.1)  # a finger has this clearance
     while hands.steps_left:
         triples = zip(led, _angles(hands), lasts, strict=True)
         led = [max(angle - 0.012, now - 0.22, last) for angle, now, last in triples]
@@ -104,7 +104,7 @@ def push(hands: HandController) -> Actions:
     if inward:
         leaves = _INWARD
         sign = 1.0
-        usual = -0.1  # they are shut
+        usual = -0.1  # the leaves are shut
     else:
         leaves = _OUTWARD
         sign = -1.0

@@ -9,7 +9,7 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, Point, point
 from bidex_meta.witness.scripts.between import ramp
 
-_LEVER = 0.035  # from a rocker's hinge to its button, metres
+_LEVER = 0.035  # distance in metres from a rocker's hinge to its button
 
 
 def press_switches(hands: HandController) -> Actions:

@@ -5,7 +5,7 @@ from bidex_meta.utils.maths import conjugate, multiply, rotate, rotation_angle
 from bidex_meta.witness.controller import GAIN, Actions, HandController, Point
 
 _CUBES = {"right": ("object2", "goal2"), "left": ("object1", "goal1")}
-# Joint angles of a hand that waits for its cube, and that holds it, rad.
+# These are joint angles in rad of a hand that waits for its cube, and of a hand that holds it.
 _CUP = {"knuckles": 0.6, "middles": 0.55, "THJ4": 0.4, "THJ3": 0.6, "THJ1": 0.0, "THJ0": 0.0}
 _FIST = {"knuckles": 1.3, "middles": 1.35, "THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
 _CUBE_KNUCKLES = ("FFJ2", "MFJ2", "RFJ2")
@@ -19,8 +19,8 @@ _FOLLOW = 0.5
 
 def turn_cubes(hands: HandController) -> Actions:
     """Keep each hand below its cube until the cube lies in it, close to a fist, and turn the cube at its goal."""
-    # Noise on the bases throws cubes off open hands, and a turn moves its cube, which costs as much as it earns. All is
-    # a function of the state alone, so that it can be cloned.
+    # Noise on the bases throws cubes off open hands. A turn moves its cube, which costs as much as it earns. All values
+    # are functions of the state alone, so that the script can be cloned.
     while hands.steps_left:
         points = {side: _next(hands, side) for side in SIDES}
         yield from hands.lead(points["right"], points["left"])
@@ -32,16 +32,17 @@ def _next(hands: HandController, side: str) -> Point:
     place = hands.where(f"{cube}/position")
     knuckles = _knuckles(hands, side, "position")
     mount = hands.orientation(f"{side}/mount_quaternion")
-    height = -float(rotate(conjugate(mount), place - hands.at(side))[1])  # above the palm; 3 cm where it lies
+    # Height above the palm; 3 cm if the cube lies there.
+    height = -float(rotate(conjugate(mount), place - hands.at(side))[1])
     speed = float(hands.where(f"{cube}/linear_velocity").norm())
-    # Half closed fingers go on closing, whatever the cube does.
+    # Half-closed fingers keep closing, independent of the cube.
     lies = _falls(speed, 0.06, 0.12) * _falls(height, 0.05, 0.06)
     closed = max(lies, 1.0 - _falls(knuckles, 0.62, 0.67))
     hands.bend(side, **{name: (1.0 - closed) * cup + closed * _FIST[name] for name, cup in _CUP.items()})
     moving = abs(_knuckles(hands, side, "velocity"))
     held = (1.0 - _falls(knuckles, 0.7, 0.8)) * _falls(moving, 0.3, 1.1)
     left = multiply(hands.frozen(goal)[3:].double(), conjugate(hands.orientation(f"{cube}/quaternion")))
-    axis = left[:3] * left[3].sign()  # of the turn that takes the cube to its goal's orientation
+    axis = left[:3] * left[3].sign()  # axis of the rotation that takes the cube to its goal's orientation
     hands.turn(side, held * (min(_RATE * float(rotation_angle(left)), _FASTEST) / GAIN * axis / (axis.norm() + 1e-9)))
     below = place - hands.at(side)
     below[2] = 0.0
