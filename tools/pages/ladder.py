@@ -222,7 +222,9 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
     if SHOWN not in lines or BLIND not in lines:
         return "This suite is not judged yet, because blind or goal-shown PPO is missing."
     if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:
-        return f"This suite is not judged yet: every learner needs {_SEEDS_AT_LEAST} seeds, and some learner has {seeds}."
+        return (
+            f"This suite is not judged yet: every learner needs {_SEEDS_AT_LEAST} seeds, and some learner has {seeds}."
+        )
     reasons = []
     shown = float(lines[SHOWN].last.mean())
     blind = float(lines[BLIND].last.mean())
