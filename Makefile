@@ -65,8 +65,8 @@ goldens: .venv/.installed-dev
 	$(BIN)/python -m tests.goldens write
 
 # What needs a GPU; another start goes on where this one stopped. On a machine that has the packages already, name its
-# interpreter: make gpu-quarter CLI="python3 -m bidex_meta.cli". A dry run: DEVICE=cpu SIZES="4 8" ROWS=32 SUITE=MT1-v2
-# TRAIN_SECONDS=1.
+# interpreter: make gpu-quarter CLI="python3 -m bidex_meta.cli". A dry run: DEVICE=cpu SUITE=MT1-v2 SIZES="4 8" ROWS=32
+# TRAIN_SECONDS=1 ARGS="--rest 1".
 DEVICE ?= cuda:0
 OUT ?= gpu-results
 SUITE ?= MT20-v2
@@ -85,7 +85,7 @@ bench: $(INSTALLED)
 
 gpu-quarter: $(INSTALLED)
 	$(BENCH) quarter --device $(DEVICE) --out $(OUT) --suite $(SUITE) --sizes $(SIZES) --num-envs $(ROWS) \
-		--seconds $(TRAIN_SECONDS) --minutes $(QUARTER)
+		--seconds $(TRAIN_SECONDS) --minutes $(QUARTER) $(ARGS)
 
 results: .venv/.installed-dev
 	$(BIN)/python -m tools.pages

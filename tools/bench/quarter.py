@@ -48,6 +48,7 @@ def quarter(
     seconds: float = 60.0,
     rest: float | None = None,
     minutes: float = 13.0,
+    slack: float = 1.0,
 ) -> Json:
     """Do what needs a GPU, in order: kernels, tests, switches, pictures, short trainings, a training for the rest.
 
@@ -63,6 +64,7 @@ def quarter(
         seconds: Training time of each short training.
         rest: Training time of the last training, seconds; None: until ``minutes`` are up.
         minutes: Time of this start.
+        slack: Factor of the steps' time limits, for a dry run on a busy machine.
 
     Returns:
         ``steps`` (state and seconds by name), ``switches``, ``pictures``, ``training`` by name, and ``versions``.
@@ -75,10 +77,11 @@ def quarter(
         result["steps"] = json.loads(file.read_text())["steps"]
     for step in _steps(out, device, suite, sizes, num_envs, seconds, rest, end):
         left = end - time.monotonic()
+        limit = min(slack * step.limit, left)
         if result["steps"].get(step.name, {}).get("state") == "done" or left < min(_LEAST, step.limit):
             continue
-        print(f"{step.name}: at most {min(step.limit, left):.0f} s", file=sys.stderr, flush=True)
-        result["steps"][step.name] = _run(step, min(step.limit, left), out / f"{step.name}.log")
+        print(f"{step.name}: at most {limit:.0f} s", file=sys.stderr, flush=True)
+        result["steps"][step.name] = _run(step, limit, out / f"{step.name}.log")
         write_json(file, result | _results(out))
     return result | _results(out)
 
