@@ -16,7 +16,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-input -c co
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run quick results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint style types tests format docs dist clean
+.PHONY: help run quick results collect experts gallery witness test test-all test-parity goldens bench gpu-quarter lint style types tests format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -35,7 +35,7 @@ help:
 	@echo "make dist      build wheel and sdist into dist/, check them, and test the wheel on its own (docs/releasing.md)"
 	@echo "make format    format the code and fix what ruff can fix"
 	@echo "make bench ARGS=\"stability --task HandOver\"  measure speed or stability (ARGS=--help lists the measurements)"
-	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure the speed of a GPU (docs/gpu.md)"
+	@echo "make gpu-quarter  test, measure and train on a GPU for 13 minutes (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files, but not runs/"
 
 run: .venv/.installed
@@ -66,36 +66,28 @@ test-parity: .venv/.installed-dev
 goldens: .venv/.installed-dev
 	$(BIN)/python -m tests.goldens write
 
-# These targets measure a GPU; an interrupted target continues when it is called again. On a machine that has the
-# packages already, name its interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
+# `gpu-quarter` needs a GPU; an interrupted call continues when it is called again. On a machine that has the packages
+# already, name its interpreter: make gpu-quarter CLI="python3 -m bidex_meta.cli". For a dry run, add DEVICE=cpu
+# SUITE=MT1-v2 SIZES="4 8" ROWS=32 TRAIN_SECONDS=1 ARGS="--rest 1".
 DEVICE ?= cuda:0
 OUT ?= gpu-results
-SIZES ?= 1024 8192 32768 131072
+SUITE ?= MT20-v2
+SIZES ?= 8192 32768
 ROWS ?= 8192
-TRAIN_STEPS ?= 60000000
+TRAIN_SECONDS ?= 60
+QUARTER ?= 13
 CLI ?= $(BIN)/python -m bidex_meta.cli
 BENCH := $(CLI:bidex_meta.cli=tools.bench)
 INSTALLED := $(if $(filter $(BIN)/%,$(CLI)),.venv/.installed)
 
-bench bench-gpu-compile bench-gpu-sweep bench-gpu-train: export PYTHONPATH := .:algos:$(PYTHONPATH)
+bench gpu-quarter: export PYTHONPATH := .:algos:$(PYTHONPATH)
 
 bench: $(INSTALLED)
 	$(BENCH) $(ARGS)
 
-bench-gpu-compile: $(INSTALLED)
-	$(BENCH) gpu --suite MT20 --tasks --sizes 1024 --steps 1 --device $(DEVICE) --engine warp
-
-bench-gpu-sweep: $(INSTALLED)
-	mkdir -p $(OUT)
-	$(BENCH) gpu --suite MT20 --device $(DEVICE) --engine warp --sizes $(SIZES) --learning --out $(OUT)/sweep.json --json
-
-# Each suite trains for 225 seconds; timeout then ends it with exit code 124.
-bench-gpu-train: $(INSTALLED)
-	for suite in MT4 MT20; do \
-		if test -d $(OUT)/$$suite; then what="--resume $(OUT)/$$suite"; \
-		else what="--suite $$suite --algo mtppo --device $(DEVICE) --engine warp --num-envs $(ROWS) --run-dir $(OUT)/$$suite"; fi; \
-		timeout --signal=INT --kill-after=30 225 $(CLI) run $$what --steps $(TRAIN_STEPS) || test $$? = 124 || exit 1; \
-	done
+gpu-quarter: $(INSTALLED)
+	$(BENCH) quarter --device $(DEVICE) --out $(OUT) --suite $(SUITE) --sizes $(SIZES) --num-envs $(ROWS) \
+		--seconds $(TRAIN_SECONDS) --minutes $(QUARTER) $(ARGS)
 
 results: .venv/.installed-dev
 	$(BIN)/python -m tools.pages

@@ -9,6 +9,19 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 
+CAMERA = "picture"
+"""Name of the camera by which an engine's renderer draws."""
+GHOST_GROUP = 4
+"""Group of geoms that an engine's renderer draws translucent."""
+
+
+class Renderer(Protocol):
+    """Draws many environments of one model at once."""
+
+    def draw(self, placement: Tensor) -> Tensor:
+        """Return pictures (num, edge, edge, 3), uint8, of placements (num, nq + 7 nmocap); see ``Engine.placement``."""
+        ...
+
 
 class Engine(Protocol):
     """A batch of simulations of equal structure.
@@ -23,6 +36,8 @@ class Engine(Protocol):
     masked: bool
     """True if the engine suits accelerators: resets write all rows under a mask, and nothing in a step may wait for a
     value or have a shape that depends on a value."""
+    has_renderer: bool = False
+    """True if the engine draws all environments at once on its device (``renderer``)."""
     qpos: Tensor  # shape (num, nq)
     qvel: Tensor  # shape (num, nv)
     ctrl: Tensor  # position targets, shape (num, nu)
@@ -87,6 +102,14 @@ class Engine(Protocol):
 
     def data(self, row: int) -> mujoco.MjData:
         """Return a copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
+
+    def renderer(self, model: mujoco.MjModel, num: int, edge: int, alpha: float) -> Renderer:
+        """Return a renderer of ``num`` environments of a model, for square pictures of ``edge`` pixels.
+
+        The model has the camera ``CAMERA``. Geoms of ``GHOST_GROUP`` have the opacity ``alpha``. Only if the engine
+        ``has_renderer``.
+        """
+        ...
 
     def contact_depth(self, row: int) -> float:
         """Return the deepest penetration among a simulation's contacts, metres, 0 without contact."""

@@ -24,6 +24,7 @@ from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
 from bidex_meta.engine.lean import lean
 from bidex_meta.engine.protocol import Engine
+from bidex_meta.engine.renderer import BatchRenderer
 from bidex_meta.engine.scratch import Scratch
 from bidex_meta.errors import BidexError
 
@@ -52,6 +53,7 @@ class WarpEngine(Engine):
     """
 
     masked = True
+    has_renderer = True
 
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], capacity: Capacity,
@@ -202,6 +204,9 @@ class WarpEngine(Engine):
             target[...] = self._state[name][row].cpu().numpy().reshape(target.shape)
         mujoco.mj_forward(model, data)
         return data
+
+    def renderer(self, model: mujoco.MjModel, num: int, edge: int, alpha: float) -> BatchRenderer:
+        return BatchRenderer(_adapted(model), num, edge, alpha, self._on_device)
 
     def contact_depth(self, row: int) -> float:
         distances = self.data(row).contact.dist

@@ -157,9 +157,7 @@ class Scene:
     @cached_property
     def dressed(self) -> mujoco.MjModel:
         """Return the model for pictures: the same bodies and joints with hands as ``looks.dress`` shows them."""
-        spec = build_spec(self.task)
-        dress(spec)
-        return spec.compile()
+        return dressed_spec(self.task).compile()
 
     @cached_property
     def base_bodies(self) -> tuple[int, int]:
@@ -193,6 +191,13 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
             body.gravcomp = _FALL
     for geom in spec.geoms:
         geom.condim = min(geom.condim, task.solver.most_condim)
+    return spec
+
+
+def dressed_spec(task: "TaskClass") -> mujoco.MjSpec:
+    """Build the editable scene of ``Scene.dressed``."""
+    spec = build_spec(task)
+    dress(spec)
     return spec
 
 

@@ -73,7 +73,7 @@ class HiddenParts:
                 middle, half = self._ranges[slot.name]
                 tasks = pool.to(sensors)[world.task_index[env_ids]].repeat(len(given), 1)
                 hidden = given[:, env_ids, : len(columns)].flatten(0, 1)
-                tasks[:, columns] = hidden.to(sensors) * half.to(sensors) + middle.to(sensors)
+                tasks[:, indices(columns, tasks)] = hidden.to(sensors) * half.to(sensors) + middle.to(sensors)
                 task = member.scene.task
                 sensed = sensors[member.engine_rows].repeat(len(given), 1)
                 state = TaskState(sensed, member.scene.sensors, task.frozen(tasks))

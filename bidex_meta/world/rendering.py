@@ -7,13 +7,18 @@ import mujoco
 import numpy as np
 import torch
 
+from bidex_meta.engine.protocol import CAMERA, GHOST_GROUP
 from bidex_meta.errors import BidexError, shortened
+from bidex_meta.tasks.scene import dressed_spec
 from bidex_meta.utils import gl_backend
 from bidex_meta.utils.maths import wxyz
 
 if TYPE_CHECKING:
-    from bidex_meta.engine.protocol import Engine
+    from bidex_meta.engine.protocol import Engine, Renderer
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.tasks.goals import Ghost
     from bidex_meta.tasks.scene import Scene
+    from bidex_meta.world.groups import Member
     from bidex_meta.world.part import Part, PartedWorld
 
 CAMERAS = {"front": None, "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
@@ -48,6 +53,7 @@ class Painter(threading.local):
 
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int, int], tuple[mujoco.Renderer, mujoco.MjData]] = {}
+        self._batches: dict[tuple[int, int], Renderer] = {}
 
     def __reduce__(self) -> tuple[type["Painter"], tuple[()]]:
         return Painter, ()
@@ -66,16 +72,34 @@ class Painter(threading.local):
         return self._draw(world, env_id, name, (width, height), scene, engine.placement()[engine_row])
 
     def pictures(self, world: "PartedWorld", size: int) -> torch.Tensor:
-        """Draw all environments by their classes' own cameras, (num_envs, size, size, 3), uint8, on the CPU."""
-        pictures = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8)
+        """Draw all environments by their classes' own cameras, (num_envs, size, size, 3), uint8.
+
+        mujoco_warp's worlds are drawn on their device, where they are; others on the CPU, one after another.
+        """
+        pictures = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8, device=world.device)
         for part in world.parts:
-            placement = part.group.engine.placement().cpu()
+            placement = part.group.engine.placement()
+            if part.group.engine.has_renderer:
+                for member, rows, state in part.states(part.group.take(world.task_index)):
+                    goals = [] if world.hides_goals else member.scene.task.ghosts(state)
+                    poses = [torch.cat((pose[:, :3], wxyz(pose[:, 3:])), dim=1) for pose, *_ in goals]
+                    renderer = self._batch(part.group.engine, member, size, goals)
+                    pictures[member.env_ids] = renderer.draw(torch.cat((placement[rows], *poses), dim=1))
+                continue
             env_ids = part.group.env_ids.tolist()
             for member in part.group.members:
                 for at in range(member.engine_rows.start, member.engine_rows.stop):
                     picture = self._draw(world, env_ids[at], "front", (size, size), member.scene, placement[at])
                     pictures[env_ids[at]] = torch.from_numpy(picture)
         return pictures
+
+    def _batch(self, engine: "Engine", member: "Member", size: int, goals: "list[Ghost]") -> "Renderer":
+        """Return the renderer of a member's environments."""
+        key = member.slot, size
+        if key not in self._batches:
+            num = member.env_ids.stop - member.env_ids.start
+            self._batches[key] = engine.renderer(stage(member.scene.task, goals), num, size, GHOST_ALPHA)
+        return self._batches[key]
 
     def _draw(
         self,
@@ -112,6 +136,7 @@ class Painter(threading.local):
 
     def close(self) -> None:
         """Free the renderers of this thread."""
+        self._batches.clear()
         while self._renderers:
             self._renderers.popitem()[1][0].close()
 
@@ -123,6 +148,28 @@ def _camera(world: "PartedWorld", env_id: int, name: str) -> mujoco.MjvCamera:
     view.distance = task.camera_distance
     view.azimuth, view.elevation = CAMERAS[name] or task.camera_angle
     return view
+
+
+def stage(task: "TaskClass", goals: "list[Ghost]") -> mujoco.MjModel:
+    """Return a class's model for pictures with its own camera and a movable, translucent body for each goal.
+
+    The goals' poses follow those of the movable fixtures in a placement.
+    """
+    spec = dressed_spec(task)
+    azimuth, elevation = np.radians(task.camera_angle)
+    forward = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
+    right = np.array((np.sin(azimuth), -np.cos(azimuth), 0.0))
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.stack((right, np.cross(right, forward), -forward), axis=1).ravel())
+    position = np.array(task.camera_target) - task.camera_distance * forward
+    spec.worldbody.add_camera(name=CAMERA, pos=position, quat=quaternion, fovy=spec.visual.global_.fovy)
+    for _, size, colour in goals:
+        body = spec.worldbody.add_body(mocap=True)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=size, rgba=(*colour, 1.0), group=GHOST_GROUP,
+            contype=0, conaffinity=0
+        )  # fmt: skip
+    return spec.compile()
 
 
 def simulation(world: "PartedWorld", env_id: int) -> "tuple[Engine, int, Scene]":

@@ -134,25 +134,15 @@ def test_every_way_to_make_a_world_asks_the_engine_to_repeat(
 
 
 @pytest.mark.gpu
+@pytest.mark.slow
 def test_a_deterministic_run_on_a_gpu_repeats(tmp_path: Path) -> None:
     """Two runs of 2,000 steps of each environment, with learning, have equal weights."""
     digests = []
     for number in range(2):
         out = str(tmp_path / str(number))
-        argv = [
-            "run",
-            "--suite",
-            "MT20",
-            "--algo",
-            "mtppo",
-            "--device",
-            "cuda:0",
-            "--num-envs",
-            "400",
-            "--episodes",
-            "0",
-        ]
-        assert main([*argv, "--steps", "800000", "--deterministic", "--logger", "none", "--out", out]) == 0
+        argv = ["run", "--suite", "MT20", "--algo", "mtppo", "--device", "cuda:0", "--num-envs", "400"]
+        argv += ["--steps", "800000", "--deterministic", "--logger", "none", "--no-evaluate", "--run-dir", out]
+        assert main(argv) == 0
         state, _ = checkpoint(RunFolder.open(out))
         digests.append(content_of(state["learner"]))
     assert digests[0] == digests[1]

@@ -17,9 +17,13 @@ from tools.bench.against import against
 from tools.bench.capacity import capacity
 from tools.bench.field import field
 from tools.bench.gpu import gpu
+from tools.bench.pictures import pictures
+from tools.bench.quarter import quarter
 from tools.bench.stability import stability
+from tools.bench.switches import kernels, switches
 
-KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in (against, field, stability, capacity, gpu)}
+_KINDS = (against, field, stability, capacity, gpu, switches, pictures, kernels, quarter)
+KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _KINDS}
 
 
 def main(arguments: Sequence[str]) -> None:

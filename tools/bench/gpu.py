@@ -18,7 +18,7 @@ from bidex_meta.world import World
 _SIZES = (1024, 8192, 32768, 131072)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
 """Classes with a thrown egg, a jointed object and a movable fixture."""
-_RECORDED = 32
+RECORDED = 32
 """Number of steps after which a world on CUDA replays all of its work: starts are drawn at every eighth step, and the
 first draws are not replayed."""
 
@@ -51,9 +51,8 @@ def gpu(
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
         ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning.
     """
-    machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
-    setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
-    rows = _known(out, setting)
+    setting = {"device": device, "engine": engine, "steps": steps, "machine": machine_of(device)}
+    rows = known_rows(out, setting)
     for subject in (suite, *tasks):
         for size in sizes:
             key = f"{subject} {size}"
@@ -64,7 +63,15 @@ def gpu(
     return {"setting": setting, "rows": rows}
 
 
-def _known(out: Path | None, setting: Json) -> Json:
+def machine_of(device: str) -> str:
+    """Return the name of the GPU, or ``cpu``."""
+    if torch.device(device).type == "cpu":
+        return "cpu"
+    return torch.cuda.get_device_name(device)
+
+
+def known_rows(out: Path | None, setting: Json) -> Json:
+    """Return the rows that a file of results has already; raise BidexError if they were measured differently."""
     if out is None or not out.exists():
         return {}
     stored = json.loads(out.read_text())
@@ -82,22 +89,28 @@ def _measured(
     else:
         made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
     made.reset(seed=seed)
-    _random_steps(made, max(steps, _RECORDED))
-    seconds = _random_steps(made, steps)
+    random_steps(made, max(steps, RECORDED))
+    seconds = random_steps(made, steps)
     row: Json = {
         "env_steps_per_s": round(size * steps / seconds),
         "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
         "stages": _stages(made, steps),
     }
     if learning:
-        kind = learner_kind("mtppo")
-        learner = kind.make(made, kind.presets[choose_preset(kind, "auto", device)[0]], 0)
-        for _ in range(5):  # the update is recorded as a graph after a few iterations
-            numbers = learner.iterate()
-        row["training_steps_per_s"] = round(numbers["Perf/steps_per_second"])
+        row["training_steps_per_s"] = training_speed(made, choose_preset(learner_kind("mtppo"), "auto", device)[0])
         row["stages"]["learning"] = round(1000.0 * size / row["training_steps_per_s"] - row["stages"]["step"], 3)
     made.close()
     return row
+
+
+def training_speed(world: World, preset: str) -> int:
+    """Return the environment steps per second of MT-PPO's fifth iteration, whose update is a recorded graph."""
+    kind = learner_kind("mtppo")
+    learner = kind.make(world, kind.presets[preset], 0)
+    numbers: dict[str, float] = {}
+    for _ in range(5):
+        numbers = learner.iterate()
+    return round(numbers["Perf/steps_per_second"])
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
@@ -106,7 +119,7 @@ def _stages(made: World, steps: int) -> dict[str, float]:
     ``launching`` is the host's part of the physics. ``overlap`` is 0 if groups run one after the other, and 1 if all
     groups together take no longer than the slowest group.
     """
-    took = {"step": 1000.0 * _random_steps(made, steps) / steps}
+    took = {"step": 1000.0 * random_steps(made, steps) / steps}
     took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
     took["torch"] = took["step"] - took["physics"]
     alone = {}
@@ -119,18 +132,18 @@ def _stages(made: World, steps: int) -> dict[str, float]:
     return {name: round(value, 3) for name, value in took.items()}
 
 
-def _random_steps(world: World, steps: int) -> float:
+def random_steps(world: World, steps: int) -> float:
     """Return the seconds that steps under uniform actions take; the actions are drawn before the clock starts."""
     generator = torch.Generator(world.device).manual_seed(0)
     shape = steps, world.num_envs, world.action_size
     actions = 2.0 * torch.rand(shape, generator=generator, device=world.device) - 1.0
-    start = _now(world.device)
+    start = now(world.device)
     for action in actions:
         world.step(action)
-    return _now(world.device) - start
+    return now(world.device) - start
 
 
-def _now(device: torch.device) -> float:
+def now(device: torch.device) -> float:
     """Return the clock's seconds after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
@@ -139,11 +152,11 @@ def _now(device: torch.device) -> float:
 
 def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
     """Return the mean milliseconds of a run of ``work`` until all is done, and until the host has launched it."""
-    start = _now(made.device)
+    start = now(made.device)
     for _ in range(steps):
         work()
     launched = time.perf_counter() - start
-    return 1000.0 * (_now(made.device) - start) / steps, 1000.0 * launched / steps
+    return 1000.0 * (now(made.device) - start) / steps, 1000.0 * launched / steps
 
 
 def _memory(device: str) -> int:

@@ -21,6 +21,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table
+from tools.pages.gpu import gpu_table
 from tools.pages.ladder import ladder_figure, ladder_table, suites_table
 from tools.pages.leaderboard import leaderboard_table
 from tools.pages.offline import offline_table
@@ -40,6 +41,7 @@ _TABLES = {
     "rows": rows_table,
 }
 _WITHOUT_STUDY = {
+    "gpu": gpu_table,
     "validity": validity_table,
     "leaderboard": leaderboard_table,
     "pretrained": pretrained_table,

@@ -70,7 +70,18 @@ class ICLConfig(LearnerConfig):
         return kept + network_bytes(self.head, width, 1)
 
 
-PRESETS: dict[str, ICLConfig] = {"laptop": ICLConfig()}
+PRESETS: dict[str, ICLConfig] = {
+    "laptop": ICLConfig(),
+    # For 4,096 to 8,192 environments on a GPU. These values follow from the rules below, by the ladder's runs with 64
+    # environments (results/sweeps/ladder-rung0.toml), and were never tried.
+    "gpu": ICLConfig(
+        batch_size=16384,  # 16 times laptop's; each of 64 times as many steps is seen a quarter as often
+        updates_per_iteration=200,  # the ladder's: as many Adam steps per trial
+        learning_rate=2e-3,  # twice laptop's; the root of the ratio of batches would be 4
+        teacher_steps=6_000_000,  # two trials of 4,096 environments, as 100,000 are of the ladder's 64
+        trials=16384,  # four of each of 4,096 environments: 12 GB; at least one is kept
+    ),
+}  # fmt: skip
 
 
 class ICL(TrialLearner):
@@ -136,6 +147,11 @@ class ICL(TrialLearner):
         self.tasks, self.count = torch.unique_consecutive(self.world.task_id[rows], return_counts=True)
         self.rows = rows
         self.first = self.count.cumsum(0) - self.count
+        sizes = [0] * self.world.num_tasks
+        if teachers.privileged is not None:
+            sizes = [len(teachers.privileged.hidden_columns[name]) for name in self.world.task_names]
+        self.hidden_sizes = torch.tensor(sizes, device=self.device)
+        """Number of hidden values of each class (num_tasks,)."""
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
         self.data = TaughtTrials(
             trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, max(1, self.shape.hidden)
@@ -301,8 +317,7 @@ class _Pupil:
         goals = self._data.goals
         world = self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
-        sizes = torch.tensor([len(privileged.hidden_columns[name]) for name in world.task_names], device=goals.device)
-        used = torch.arange(goals.shape[2], device=goals.device) < sizes[world.task_id][:, None]
+        used = torch.arange(goals.shape[2], device=goals.device) < self._learner.hidden_sizes[world.task_id][:, None]
         goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:

@@ -55,7 +55,23 @@ class PEARLConfig(MTSACConfig):
 
 
 # The preset v2 uses MT-PPO's discount.
-PRESETS: dict[str, PEARLConfig] = {"laptop": PEARLConfig(), "v2": PEARLConfig(gamma=0.99)}
+PRESETS: dict[str, PEARLConfig] = {
+    "laptop": PEARLConfig(),
+    "v2": PEARLConfig(gamma=0.99),
+    # v2 with 4,096 environments and more on a GPU. These values follow from the rules below and were never tried.
+    "gpu": PEARLConfig(
+        gamma=0.99,
+        replay_steps=2442,  # FlashSAC's preset gpu: 10 million transitions; a trial has at most 750 vector steps
+        replay_memory=42.0,  # GB: room for these steps of 8,192 environments of 422 entries
+        warmup_steps=25,  # FlashSAC's: 100,000 transitions
+        updates_per_step=2,  # FlashSAC's
+        batch_size=4096,  # 4 times v2's, for 64 times as many new transitions per update
+        tasks_per_update=64,  # as many times v2's, so that each task keeps its share of a batch
+        context=256,  # as many times v2's: a trial's estimate of its evidence has half the noise
+        learning_rate=6e-4,  # v2's times the root of 4
+        critic_learning_rate=2e-3,  # v2's times the root of 4
+    ),
+}  # fmt: skip
 
 
 class PEARL(MTSAC):
