@@ -159,6 +159,8 @@ class RunConfig(Generic[LearnerSettings]):
     """Physics engine: C MuJoCo (CPU only) or mujoco_warp (CPU or GPU); auto: the faster one on the device."""
     deterministic: bool = False
     """Make a run on a GPU repeatable bit for bit. Physics and learning take longer. Runs on a CPU always repeat."""
+    switches: str = ""
+    """Changes of the physics that are on trial, separated by commas, such as incremental (docs/gpu.md)."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
     processes. A resumed run keeps its number."""
