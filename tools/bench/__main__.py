@@ -15,11 +15,15 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json
 from tools.bench.against import against
 from tools.bench.capacity import capacity
+from tools.bench.cones import cones
 from tools.bench.field import field
 from tools.bench.gpu import gpu
+from tools.bench.launches import launches
+from tools.bench.scripted import scripted
 from tools.bench.stability import stability
 
-KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in (against, field, stability, capacity, gpu)}
+_MEASURES = (against, field, stability, capacity, cones, launches, scripted, gpu)
+KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _MEASURES}
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -32,6 +32,8 @@ def gpu(
     seed: int = 0,
     out: Path | None = None,
     learning: bool = False,
+    deterministic: bool = False,
+    switches: str = "",
 ) -> Json:
     """Measure the speed of a suite and of single classes over the number of environments.
 
@@ -45,6 +47,8 @@ def gpu(
         seed: Seed of worlds and actions.
         out: File that takes each row as it is measured; what is in it is not measured again.
         learning: Measure training with MT-PPO too.
+        deterministic: As in ``Benchmark.make_world``.
+        switches: As in ``Benchmark.make_world``.
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
@@ -52,12 +56,14 @@ def gpu(
     """
     machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
+    physics = {"deterministic": deterministic, "switches": switches}
+    setting |= {name: value for name, value in physics.items() if value}
     rows = _known(out, setting)
     for subject in (suite, *tasks):
         for size in sizes:
             key = f"{subject} {size}"
             if key not in rows:
-                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning)
+                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning, physics)
                 if out is not None:
                     write_json(out, {"setting": setting, "rows": rows})
     return {"setting": setting, "rows": rows}
@@ -73,13 +79,14 @@ def _known(out: Path | None, setting: Json) -> Json:
 
 
 def _measured(
-    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
-) -> Json:
+    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool,
+    physics: Json
+) -> Json:  # fmt: skip
     before = _memory(device)
     if whole:
-        made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine)
+        made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine, **physics)
     else:
-        made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
+        made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed, **physics)
     made.reset(seed=seed)
     _random_steps(made, max(steps, _RECORDED))
     seconds = _random_steps(made, steps)
