@@ -80,7 +80,8 @@ def test_a_contacts_part_of_the_hessian_is_the_second_derivative_of_its_cost() -
             second[i, j] = (cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b)) / 4e-8
     (part,) = _parts(np.array([4]), weight[None], x[None], scale[None], np.array([mu]))
     np.testing.assert_allclose(part, second, atol=1e-5 * abs(second).max())
-    quadratic, none = _parts(np.array([1, 0]), *(np.stack([each, each]) for each in (weight, x, scale)), np.full(2, mu))
+    weights, residuals, scales = (np.stack([each, each]) for each in (weight, x, scale))
+    quadratic, none = _parts(np.array([1, 0]), weights, residuals, scales, np.full(2, mu))
     np.testing.assert_array_equal(quadratic, np.diag(weight))
     assert not none.any()
 
