@@ -153,6 +153,7 @@ class Benchmark:
         pixels: int = 0,
         episodes_per_task: int = 1,
         deterministic: bool = False,
+        switches: str = "",
     ) -> World:
         """Make a batched world of one split.
 
@@ -182,13 +183,14 @@ class Benchmark:
                 (docs/clients.md#trials-as-episodes); 1: as described above.
             deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
                 always does.
+            switches: Changes of the physics that are on trial, such as `"incremental"` (docs/gpu.md#switches).
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         if split == OTHERS:
             return self.others.make_world(
                 "train", num_envs, device, seed, autoreset_mode, threads, engine, stagger, randomisation, pixels,
-                episodes_per_task, deterministic
+                episodes_per_task, deterministic, switches
             )  # fmt: skip
         slots = self._slots(self._checked_split(split))
         mode = checked_mode(autoreset_mode)
@@ -217,6 +219,7 @@ class Benchmark:
             device=device,
             engine=engine,
             deterministic=deterministic,
+            switches=switches,
             seed=seed,
             autoreset_mode=mode,
             observation=self.suite.observation,
@@ -301,6 +304,7 @@ def make_task_world(
     task_seed: int | None = None,
     touch: bool = False,
     deterministic: bool = False,
+    switches: str = "",
 ) -> World:
     """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -339,6 +343,7 @@ def make_task_world(
         device=device,
         engine=engine,
         deterministic=deterministic,
+        switches=switches,
         seed=seed,
         autoreset_mode=mode,
         task_sampling=task_sampling,

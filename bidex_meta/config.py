@@ -166,6 +166,8 @@ class RunConfig(Generic[LearnerSettings]):
     deterministic: bool = False
     """Make a run on a GPU repeatable bit for bit, which slows physics and learning down. Runs on a CPU are always
     repeatable."""
+    switches: str = ""
+    """Changes of the physics that are on trial, separated by commas, such as incremental (docs/gpu.md)."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
     processes. A resumed run keeps its number of threads."""

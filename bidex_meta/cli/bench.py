@@ -32,6 +32,7 @@ class BenchFlags:
     device: Device = "cpu"
     engine: str = "auto"  # Physics engine: auto, c or warp.
     deterministic: bool = False  # On a GPU, measure physics that repeats bit for bit.
+    switches: str = ""  # Changes of the physics that are on trial, such as incremental.
     seed: Seed = 0  # Seed of the world and of the actions.
     json: JsonSwitch = False
 
@@ -51,6 +52,7 @@ def main(arguments: Sequence[str]) -> None:
         device=flags.device,
         engine=flags.engine,
         deterministic=flags.deterministic,
+        switches=flags.switches,
         seed=flags.seed,
     )
     if flags.json:

@@ -4,6 +4,7 @@ import torch
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.protocol import EngineMaker
+from bidex_meta.engine.switches import Switches
 from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.utils.validation import whole_number
 
@@ -11,25 +12,29 @@ ENGINES = ("auto", "c", "warp")
 
 
 def choose_engine(
-    device: str | torch.device, engine: str = "auto", threads: int | None = None, deterministic: bool = False
-) -> tuple[torch.device, EngineMaker]:
+    device: str | torch.device, engine: str = "auto", threads: int | None = None, deterministic: bool = False,
+    switches: str = ""
+) -> tuple[torch.device, EngineMaker]:  # fmt: skip
     """Return the device and its engine maker; ``threads`` are the threads of C MuJoCo, None takes all CPUs.
 
     ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" selects
-    C MuJoCo on the CPU and mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing device, C MuJoCo on
-    a GPU, or an impossible number of threads.
+    C MuJoCo on the CPU and mujoco_warp on a GPU. ``switches`` is as ``Switches.of`` reads it. Raises BidexError for an
+    unknown engine or switch, a missing device, C MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)
     place = checked_device(device)
     engine = known_name("engine", engine, ENGINES)
+    on = Switches.of(switches)
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
         from bidex_meta.engine.warp import WarpEngine  # mujoco_warp takes seconds to import
 
-        return place, lambda models, rows, room: WarpEngine(models, rows, room, str(place), deterministic)
-    return place, lambda models, rows, room: CpuEngine(models, rows, threads)
+        return place, lambda models, rows, room: WarpEngine(
+            on.models(models), rows, on.room(models[0], room), str(place), deterministic, on.incremental
+        )
+    return place, lambda models, rows, room: CpuEngine(on.models(models), rows, threads)
 
 
 def known_device(device: str | torch.device) -> torch.device:

@@ -22,7 +22,7 @@ Numbers = wp.array2d[float]
 
 
 @wp.func_native(snippet="WP_TILE_SYNC();")
-def _wait() -> None:
+def wait() -> None:
     """Wait until all threads of the world have reached this point."""
     ...
 
@@ -41,12 +41,12 @@ def _solve(
         for k in range(first_update[i] + lane, first_update[i + 1], lanes):
             factor = lu[world, updates[k, 0]] / pivot
             lu[world, updates[k, 2]] = lu[world, updates[k, 2]] - lu[world, updates[k, 1]] * factor
-        _wait()
+        wait()
         ancestors = diagonal[i]  # every ancestor's row has been updated, and the factors stay
         for a in range(lane, ancestors, lanes):
             k = updates[first_update[i] + a * ancestors, 0]
             lu[world, k] = lu[world, k] / pivot
-    _wait()
+    wait()
     levels = first_of_level.shape[0] - 1
     for back in range(levels):
         level = levels - 1 - back
@@ -56,7 +56,7 @@ def _solve(
             for at in range(rows[i] + diagonal[i] + 1, rows[i + 1]):
                 total = total - lu[world, at] * x[world, columns[at]]
             x[world, i] = total
-        _wait()
+        wait()
     for level in range(levels):
         for k in range(first_of_level[level] + lane, first_of_level[level + 1], lanes):
             i = by_level[k]
@@ -64,7 +64,7 @@ def _solve(
             for at in range(rows[i], rows[i] + diagonal[i]):
                 total = total - lu[world, at] * x[world, columns[at]]
             x[world, i] = total / lu[world, rows[i] + diagonal[i]]
-        _wait()
+        wait()
 
 
 class ImplicitSolver:

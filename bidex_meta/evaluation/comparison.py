@@ -22,7 +22,7 @@ from bidex_meta.utils.files import portable
 from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
-_SETTINGS += ("base", "points", "touch", "object", "tasks_per_class")
+_SETTINGS += ("base", "points", "touch", "object", "tasks_per_class", "switches")
 _MADE = "made with"  # entry for versions that differ from those of other runs on the same worlds
 _POINTS = 200  # number of points of a curve over several runs
 

@@ -13,7 +13,7 @@ from bidex_meta.world import World
 
 def world_speed(
     suite: str, *, num_envs: int, steps: int, repeats: int, threads: int | None, device: str, engine: str, seed: int,
-    deterministic: bool = False
+    deterministic: bool = False, switches: str = ""
 ) -> Json:  # fmt: skip
     """Measure environment steps per second of a suite's world and of bare engines, in turns within one process.
 
@@ -22,7 +22,7 @@ def world_speed(
     world's resets, so both do the same physics. ``groups`` has the number of environments in each engine batch.
     """
     options = {"device": device, "num_envs": num_envs, "threads": threads, "engine": engine}
-    options["deterministic"] = deterministic
+    options |= {"deterministic": deterministic, "switches": switches}
     full, bare = (Benchmark(suite, seed=seed).make_world("train", **options) for _ in range(2))
     full.reset(seed=seed)
     bare.reset(seed=seed)

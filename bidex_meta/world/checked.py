@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
+from bidex_meta.engine.switches import Switches
 from bidex_meta.errors import BidexError, one_line, shortened, unknown_name
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
@@ -46,6 +47,16 @@ def num_envs(given: object, slots: Sequence[str]) -> int:
 def seed(given: object) -> int:
     """Return the seed of a world; raise BidexError unless it is a non-negative integer."""
     return whole_number("seed", given, 0, _LARGEST_SEED)
+
+
+def switches(given: str, slots: Sequence[Slot]) -> None:
+    """Raise BidexError for unknown switches, and if contacts of a class of version 1 would change."""
+    narrow = [slot.name for slot in slots if not slot.task_class.rules.wide]
+    if Switches.of(given).changes_contacts and narrow:
+        raise BidexError(
+            f"switches: expected classes of version 2 for {shortened(given)}, got {narrow[0]}. Write {narrow[0]}-v2, "
+            "or a suite such as MT20-v2."
+        )
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:

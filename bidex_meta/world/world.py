@@ -56,6 +56,7 @@ class WorldConfig:
         device: "cpu", "auto" (CUDA if there is one) or a CUDA device, e.g. "cuda:0".
         engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": the faster one on the device.
         deterministic: Make physics on a GPU repeat bit for bit; on a CPU it always does.
+        switches: Changes of the physics that are on trial, such as "incremental" (``engine.switches.Switches``).
         seed: Seed of all random draws.
         autoreset_mode: SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation), as a
             member or its name.
@@ -79,6 +80,7 @@ class WorldConfig:
     device: str | torch.device = "cpu"
     engine: str = "auto"
     deterministic: bool = False
+    switches: str = ""
     seed: int = 0
     autoreset_mode: str | AutoresetMode | None = None
     observation: Rule = "plain"
@@ -118,8 +120,11 @@ class World(BatchedWorld):
         check_argument("slots", slots, Annotated[Sequence[Slot], Meta(min_length=1)])
         check_argument("config", config, WorldConfig | None)
         self._config = config = config or WorldConfig()
-        device, make_engine = choose_engine(config.device, config.engine, config.threads, config.deterministic)
+        device, make_engine = choose_engine(
+            config.device, config.engine, config.threads, config.deterministic, config.switches
+        )
         names = [slot.name for slot in slots]
+        checked.switches(config.switches, slots)
         num_envs = checked.num_envs(_DEFAULT_SIZES[device.type] if config.num_envs is None else config.num_envs, names)
         if device.type == "cpu":
             if config.points:

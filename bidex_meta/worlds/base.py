@@ -42,6 +42,7 @@ class WorldsConfig:
     threads: int | None = None
     engine: str = "auto"
     deterministic: bool = False  # whether a world on a GPU repeats bit for bit
+    switches: str = ""  # changes of the physics that are on trial
     randomisation: str | None = None  # file whose table randomises all worlds; None: training as in the suite
 
     @staticmethod
@@ -82,6 +83,7 @@ class Worlds(ABC):
         self.threads = config.threads
         self.engine = config.engine
         self.deterministic = config.deterministic
+        self.switches = config.switches
         self.points = config.points
         self.touch = config.touch
         if config.randomisation is None:

@@ -49,7 +49,8 @@ class OwnSuite(Worlds):
             rows = max(map(len, pools), default=1) * max(len(pools), 1)
         given = split, rows, self.device, self.seed, mode or "DISABLED", self.threads, self.engine
         randomisation = self.randomisation or mode is not None
-        return self.benchmark.make_world(*given, randomisation=randomisation, deterministic=self.deterministic)
+        physics = {"deterministic": self.deterministic, "switches": self.switches}
+        return self.benchmark.make_world(*given, randomisation=randomisation, **physics)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return the task names that the file lists, or numbers if it lists none; see ``Worlds``."""
@@ -94,7 +95,8 @@ class SingleClass(Worlds):
         if split != "train":
             raise BidexError(f"A run on the single task {self.name} has no {split} split. Leave --split out.")
         named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
-        named |= {"randomisation": self.randomisation, "touch": self.touch, "deterministic": self.deterministic}
+        named |= {"randomisation": self.randomisation, "touch": self.touch}
+        named |= {"deterministic": self.deterministic, "switches": self.switches}
         given = self.class_name, rows or _TASKS_ALONE, self.device, self.seed, mode or "DISABLED", self.threads
         return make_task_world(*given, **named)
 

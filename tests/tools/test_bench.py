@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import metaworld
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,9 @@ from tools.bench import stability as physics
 from tools.bench.__main__ import main
 from tools.bench.against import HERE
 from tools.bench.capacity import capacity
+from tools.bench.cones import _parts, cones
+from tools.bench.launches import launches
+from tools.bench.scripted import scripted
 from tools.bench.stability import stability
 
 
@@ -44,6 +48,61 @@ def test_capacity_counts_what_c_and_the_warp_engine_see() -> None:
     for counts in result.values():
         assert 0 <= counts["median"] <= counts["q999"] <= counts["q9999"] <= counts["max"]
     assert 0 < result["contacts"]["max"] <= result["candidates"]["max"] < 60
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.xdist_group("warp")
+def test_cones_counts_what_changes_between_iterations() -> None:
+    assert cones(task="CatchUnderarm-v2", steps=2, num_envs=2, threads=1) == {"table": []}, "it has pyramids"
+    (row,) = cones(task="Switch-v2", steps=40, every=20, num_envs=4, threads=1)["table"]
+    assert row["class"] == "Switch-v2" and row["played"] == "script"
+    assert 1.0 <= row["iterations"] <= row["loops"] < 20.0
+    assert 0.0 < row["cone"] <= row["active"] <= 100.0 and row["part changes"] > 0.0
+    assert 0.0 < row["work of cones"] <= 100.0 and row["still"] < 100.0
+
+
+def test_a_contacts_part_of_the_hessian_is_the_second_derivative_of_its_cost() -> None:
+    rng = np.random.default_rng(0)
+    weight = rng.uniform(1.0, 5.0, 6)
+    friction = rng.uniform(0.1, 1.0, 5)
+    mu = 0.3
+    scale = np.concatenate(([mu], friction))
+
+    def cost(x: np.ndarray) -> float:
+        tangent = np.linalg.norm(friction * x[1:])
+        return 0.5 * weight[0] / (mu**2 * (1.0 + mu**2)) * (mu * x[0] - mu * tangent) ** 2
+
+    x = np.concatenate(([0.2], rng.normal(size=5)))
+    step = 1e-4 * np.eye(6)
+    second = np.empty((6, 6))
+    for i, a in enumerate(step):
+        for j, b in enumerate(step):
+            second[i, j] = (cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b)) / 4e-8
+    (part,) = _parts(np.array([4]), weight[None], x[None], scale[None], np.array([mu]))
+    np.testing.assert_allclose(part, second, atol=1e-5 * abs(second).max())
+    weights, residuals, scales = (np.stack([each, each]) for each in (weight, x, scale))
+    quadratic, none = _parts(np.array([1, 0]), weights, residuals, scales, np.full(2, mu))
+    np.testing.assert_array_equal(quadratic, np.diag(weight))
+    assert not none.any()
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.xdist_group("warp")
+def test_launches_lists_the_kernels_of_a_substep() -> None:
+    plain, ours = (
+        launches("Switch-v2", 4, steps=20, threads=1, most=99, switches=text) for text in ("", "incremental")
+    )
+    by_kernel = {row["kernel"]: row for row in plain["table"]}
+    assert sum(row["launches"] for row in plain["table"]) == pytest.approx(plain["kernels"], abs=2.0)
+    assert by_kernel["_solve_done"]["launches"] >= by_kernel["_solve_done"]["passes"] > 0.0
+    kernels = {row["kernel"] for row in ours["table"]}
+    assert {"_prepare", "_finish"} <= kernels and "_solve_done" not in kernels
+    assert ours["kernels"] < plain["kernels"]
+
+
+def test_scripted_compares_success_with_and_without_switches() -> None:
+    (row,) = scripted(["pyramids"], ["Switch"], threads=1)["table"]
+    assert row["class"] == "Switch" and 0 <= row["pyramids"] <= 100 and row["none"] > 50
 
 
 def test_gpu_measures_no_row_of_its_file_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

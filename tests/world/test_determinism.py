@@ -110,19 +110,19 @@ def test_a_loaded_world_of_other_tasks_continues_bit_for_bit_over_several_episod
     assert_same(unbroken, play(world, actions[before:]))
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize(("deterministic", "switches"), [(False, ""), (True, "incremental")])
 @pytest.mark.parametrize("kind", ["suite", "others", "class", "worlds of a suite", "worlds of a class"])
-def test_every_way_to_make_a_world_asks_the_engine_to_repeat(
-    kind: str, deterministic: bool, monkeypatch: pytest.MonkeyPatch
+def test_every_way_to_make_a_world_asks_the_engine_to_repeat_and_for_switches(
+    kind: str, deterministic: bool, switches: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[bool] = []
+    asked: list[tuple[bool, str]] = []
 
-    def choose(device: str, engine: str, threads: int | None, repeat: bool) -> Any:
-        asked.append(repeat)
+    def choose(device: str, engine: str, threads: int | None, repeat: bool, switches: str) -> Any:
+        asked.append((repeat, switches))
         return choose_engine("cpu", engine, threads)
 
     monkeypatch.setattr(world_module, "choose_engine", choose)
-    config = {"threads": 1, "deterministic": deterministic}
+    config = {"threads": 1, "deterministic": deterministic, "switches": switches}
     if kind in ("suite", "others"):
         Benchmark("MT1").make_world({"suite": "train"}.get(kind, kind), 4, "cpu", **config).close()
     elif kind == "class":
@@ -130,7 +130,7 @@ def test_every_way_to_make_a_world_asks_the_engine_to_repeat(
     else:
         named = {"suite": "MT1"} if kind.endswith("suite") else {"task": "HandOver"}
         open_worlds({**named, **config}).world("train", 4).close()
-    assert asked == [deterministic]
+    assert asked == [(deterministic, switches)]
 
 
 @pytest.mark.gpu

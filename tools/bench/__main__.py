@@ -15,15 +15,18 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import Json
 from tools.bench.against import against
 from tools.bench.capacity import capacity
+from tools.bench.cones import cones
 from tools.bench.field import field
 from tools.bench.gpu import gpu
+from tools.bench.launches import launches
 from tools.bench.pictures import pictures
 from tools.bench.quarter import quarter
+from tools.bench.scripted import scripted
 from tools.bench.stability import stability
 from tools.bench.switches import kernels, switches
 
-_KINDS = (against, field, stability, capacity, gpu, switches, pictures, kernels, quarter)
-KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _KINDS}
+_MEASURES = (against, field, stability, capacity, cones, launches, scripted, gpu, switches, pictures, kernels, quarter)
+KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _MEASURES}
 
 
 def main(arguments: Sequence[str]) -> None:

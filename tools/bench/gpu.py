@@ -33,6 +33,8 @@ def gpu(
     seed: int = 0,
     out: Path | None = None,
     learning: bool = False,
+    deterministic: bool = False,
+    switches: str = "",
 ) -> Json:
     """Measure the speed of a suite and of single classes over the number of environments.
 
@@ -46,18 +48,22 @@ def gpu(
         seed: Seed of worlds and actions.
         out: File to which each row is written as it is measured; rows that are in the file are not measured again.
         learning: Measure training with MT-PPO too.
+        deterministic: As in ``Benchmark.make_world``.
+        switches: As in ``Benchmark.make_world``.
 
     Returns:
         By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
         ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning.
     """
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine_of(device)}
+    physics = {"deterministic": deterministic, "switches": switches}
+    setting |= {name: value for name, value in physics.items() if value}
     rows = known_rows(out, setting)
     for subject in (suite, *tasks):
         for size in sizes:
             key = f"{subject} {size}"
             if key not in rows:
-                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning)
+                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning, physics)
                 if out is not None:
                     write_json(out, {"setting": setting, "rows": rows})
     return {"setting": setting, "rows": rows}
@@ -81,13 +87,14 @@ def known_rows(out: Path | None, setting: Json) -> Json:
 
 
 def _measured(
-    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
-) -> Json:
+    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool,
+    physics: Json
+) -> Json:  # fmt: skip
     before = _memory(device)
     if whole:
-        made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine)
+        made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine, **physics)
     else:
-        made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
+        made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed, **physics)
     made.reset(seed=seed)
     random_steps(made, max(steps, RECORDED))
     seconds = random_steps(made, steps)

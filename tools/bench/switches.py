@@ -21,6 +21,8 @@ from tools.bench.gpu import RECORDED, known_rows, machine_of, random_steps, trai
 SWITCHES: dict[str, dict[str, Any]] = {
     "none": {},
     "deterministic": {"deterministic": True},
+    "incremental": {"switches": "incremental"},
+    "pyramids": {"switches": "pyramids"},
 }
 """Arguments of ``Benchmark.make_world`` by the name of a switch; another switch is another line."""
 _REPLAYED = 50
