@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.errors import BidexError
 
 CAMERA = "picture"
 """Name of the camera by which an engine's renderer draws."""
@@ -109,7 +110,7 @@ class Engine(Protocol):
         The model has the camera ``CAMERA``. Geoms of ``GHOST_GROUP`` have the opacity ``alpha``. Only if the engine
         ``has_renderer``.
         """
-        ...
+        raise BidexError(f"Expected an engine that draws (mujoco_warp), got {type(self).__name__}.")
 
     def contact_depth(self, row: int) -> float:
         """Return the deepest penetration among a simulation's contacts, metres, 0 without contact."""
