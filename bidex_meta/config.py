@@ -116,19 +116,18 @@ class RunConfig(Generic[LearnerSettings]):
     number of gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
     """Minutes to train for, summed over all resumes. Training ends after --minutes or --steps, whichever is reached
-    first. Building the world and evaluations do not count; in short runs they can take longer than training. None: no
-    limit."""
+    first. Building the world and evaluations do not count and can take longer in short runs. None: no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations and keep the best policy as checkpoints/best.pt, without effect on training. An
-    evaluation plays one episode of up to ten tasks per class, at least ten in all; learners that adapt play train tasks
-    after two shots. None: never."""
+    """Evaluate every N iterations and keep the best policy as checkpoints/best.pt. Evaluations do not affect training.
+    Each plays one episode of up to ten tasks per class, at least ten in all; learners that adapt play train tasks after
+    two shots. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations; films go into videos/ and to the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
     """Logger that receives metrics, config and films in addition to metrics.jsonl."""
     dataset: Several = ()
     """Learn offline from this data set (a name from `bidex-meta data list`, or a folder) on the suite or task that it
-    was recorded on. Needs --algo bc, bcq, td3bc or iql. Repeat the flag to use several data sets."""
+    was recorded on. Needs --algo bc, bcq, td3bc or iql. Repeatable."""
     task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
     """Seed of the tasks that the data sets were recorded on."""
     demonstrations: Several = ()
@@ -136,8 +135,8 @@ class RunConfig(Generic[LearnerSettings]):
     demonstrations` and --learner.demonstration-batch). Repeat the flag to use several data sets."""
     teacher: Several = ()
     """With --algo dagger, icl, mtppo and ppo: teacher that labels the states that the policy visits. scripts: the
-    scripted policies of all classes that have one; otherwise the folder of a run on the same suite or on one of its
-    classes. Repeat the flag for several teachers: each class takes the first teacher that knows it."""
+    scripted policies of all classes that have one; otherwise the folder of a run on the suite or on one of its classes.
+    Repeatable: each class takes the first teacher that knows it."""
     record: Steps = 0
     """Store about this number of training transitions as the data set replay/ in the run's folder, in whole episodes of
     some of the environments (docs/data.md). 0: none."""
@@ -155,7 +154,7 @@ class RunConfig(Generic[LearnerSettings]):
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
     seed: Seed = 0
-    """Seed that draws tasks and start states and initialises the learner."""
+    """Seed of tasks, start states and learner."""
     device: Text = "auto"
     """Device to train on: auto (a GPU if there is one), cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"

@@ -54,10 +54,9 @@ class NetworkConfig(LearnerConfig):
     """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     architecture: Architecture = "shared"
-    """Network architecture (docs/learners/multitask.md). shared: one trunk for all tasks; multi_head: a shared trunk
-    with policy_heads and value_heads; towers: only the first layer is shared; separate: one network per task;
-    soft_modules, paco, moore, transformer: other trunks, with or without heads. All but shared need an MT suite, whose
-    observations show the task."""
+    """Network architecture. shared: one trunk for all tasks; multi_head: one trunk with policy_heads and value_heads;
+    towers: a shared first layer; separate: one network per task; soft_modules, paco, moore, transformer: see
+    docs/learners/multitask.md. All but shared need an MT suite."""
     hidden: Layers = (256, 256)  # Widths of the hidden layers of the actor and of the critics.
     activation: Activation = "relu"  # Activation function of the hidden layers.
     policy_heads: bool = False

@@ -44,7 +44,7 @@ class OffPolicyConfig(NetworkConfig):
     small if episodes are shorter than 1 / cut_share; Train/weightless shows this."""
     warmup_steps: Whole = 20  # Vector steps with uniform actions before the first update.
     steps_per_iteration: Count = 8  # Vector steps of an iteration, after which metrics are reported.
-    updates_per_step: Count = 4  # Updates of all networks after each vector step.
+    updates_per_step: Count = 4  # Updates of all networks per vector step.
     batch_size: Count = 1024  # Transitions in the batch of an update, split evenly over the tasks.
     batch_per_task: Count | None = None
     """Transitions per task in the batch of an update; replaces batch_size. None: batch_size decides."""

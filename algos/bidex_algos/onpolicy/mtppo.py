@@ -40,10 +40,9 @@ class OnPolicyConfig(LearnerConfig):
     """Options of networks, rollouts and statistics; the defaults are the preset ``laptop``."""
 
     architecture: Architecture = "shared"
-    """Network architecture (docs/learners/multitask.md). shared: one trunk for all tasks; multi_head: a shared trunk
-    with policy_heads and value_heads; towers: only the first layer is shared; separate: one network per task;
-    soft_modules, paco, moore, transformer: other trunks, with or without heads. All but shared need an MT suite, whose
-    observations show the task."""
+    """Network architecture. shared: one trunk for all tasks; multi_head: one trunk with policy_heads and value_heads;
+    towers: a shared first layer; separate: one network per task; soft_modules, paco, moore, transformer: see
+    docs/learners/multitask.md. All but shared need an MT suite."""
     hidden: Layers = (256, 256, 128)  # Widths of the hidden layers of the actor and of the critic.
     activation: Activation = "elu"  # Activation function of the hidden layers.
     policy_heads: bool = False
