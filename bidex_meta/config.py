@@ -115,8 +115,7 @@ class RunConfig(Generic[LearnerSettings]):
     gradient updates."""
     minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
     """Minutes to train for, summed over all resumes. Training ends after --minutes or --steps, whichever is reached
-    first. Building the world and evaluations do not count; in short runs they can take longer than training. None: no
-    limit."""
+    first. Building the world and evaluations do not count and can take longer in short runs. None: no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation has an episode of up
     to ten tasks of each class, at least ten in all; learners that adapt are evaluated after two shots on train tasks.
@@ -157,7 +156,7 @@ class RunConfig(Generic[LearnerSettings]):
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
     seed: Seed = 0
-    """Seed that draws tasks and start states and initialises the learner."""
+    """Seed of tasks, start states and learner."""
     device: Text = "auto"
     """Device to train on: auto (a GPU if there is one), cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"

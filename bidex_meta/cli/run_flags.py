@@ -36,7 +36,7 @@ class RunFlags(Generic[LearnerSettings]):
     """Continue the run in this folder from its last checkpoint, with its stored config. Only --steps and --minutes
     (totals, including what is already done), --logger, --evaluate-every, --video-every and --stop-at-... may change."""
     evaluate: bool = True  # Evaluate the policy when training ends.
-    print_config: Switch = False  # Print the resolved config as JSON and exit without training.
+    print_config: Switch = False  # Print the resolved config as JSON and exit.
     final: Annotated[FinalEvaluation, tyro.conf.arg(name="")] = USUAL_EVALUATION
 
 

@@ -171,7 +171,7 @@ def test_a_checkpoint_of_other_data_is_refused() -> None:
     world, data = bad_bandit()
     learner = learned("iql", world, data, 1)
     other = IQL(world, SMALL["iql"][1], 0, Sources(replace(data, rewards=data.rewards + 1.0)))
-    with pytest.raises(BidexError, match="data have rewards"):
+    with pytest.raises(BidexError, match="data sets have rewards"):
         other.load_state_dict(learner.state_dict())
     with pytest.raises(BidexError, match="bc: has no data to learn from"):
         BC(world, SMALL["bc"][1], seed=0)
