@@ -220,10 +220,10 @@ def _better(one: list[np.ndarray], other: list[np.ndarray]) -> float:
 def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]]) -> str:
     """Return a sentence that says whether the suite is good by the ladder's rule, and why not."""
     if SHOWN not in lines or BLIND not in lines:
-        return "This suite is not judged yet, because blind or goal-shown PPO is missing."
+        return "We do not yet say whether this suite is good, because blind or goal-shown PPO is missing."
     if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:
         return (
-            f"This suite is not judged yet: every learner needs {_SEEDS_AT_LEAST} seeds, and some learner has {seeds}."
+            f"We do not yet say whether this suite is good: every learner needs {_SEEDS_AT_LEAST} seeds, and one has only {seeds}."
         )
     reasons = []
     shown = float(lines[SHOWN].last.mean())
