@@ -223,7 +223,8 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
         return "We do not yet say whether this suite is good, because blind or goal-shown PPO is missing."
     if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:
         return (
-            f"We do not yet say whether this suite is good: every learner needs {_SEEDS_AT_LEAST} seeds, and one has only {seeds}."
+            f"We do not yet say whether this suite is good: every learner needs {_SEEDS_AT_LEAST} seeds, and one has "
+            f"only {seeds}."
         )
     reasons = []
     shown = float(lines[SHOWN].last.mean())
