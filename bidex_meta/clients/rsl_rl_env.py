@@ -55,7 +55,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps since each environment's start, int64 (num_envs,).
+        """Steps that each environment's running episode has lasted, int64 (num_envs,).
 
         Setting the property shortens the running episodes, which then do not count.
         """
