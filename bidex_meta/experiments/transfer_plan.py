@@ -42,12 +42,12 @@ class Cell:
 
     run: PlannedRun
     task: str  # the held-out class
-    arm: str  # name of the start: a run, or from scratch
+    arm: str  # name of the initial policy: a run, or from scratch
     demonstrations: int | None  # number of episodes; None: by reinforcement
 
 
 class Arm(NamedTuple):
-    """A start of training: a run's policy, or a fresh policy."""
+    """An initial policy of training: the policy of a run, or a fresh policy."""
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy
