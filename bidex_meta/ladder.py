@@ -56,7 +56,7 @@ _OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
 
 
 class Rung(NamedTuple):
-    """A step of the ladder: suites that hide about the same amount."""
+    """A step of the ladder of suites (docs/results/ladder.md): suites whose tasks hide about the same amount."""
 
     hidden: str
     """Hidden part of a task, in words."""

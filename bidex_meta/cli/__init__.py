@@ -128,7 +128,10 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Raise an exception at SIGTERM or ``notices()``, so that files stay whole and the reason is printed."""
+    """Raise an exception when SIGTERM or one of ``notices()`` is received.
+
+    The cleanup of the command then leaves no half-written file, and the reason is printed.
+    """
     # With several processes, signals keep their handlers, because a collective operation waits outside Python and would
     # delay ours.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:

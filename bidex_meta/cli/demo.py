@@ -19,7 +19,7 @@ class DemoFlags:
 
     Example: bidex-meta demo --out demo.webp
 
-    With a screen this is bidex-meta play. Without one, or with --out, it writes a film.
+    With a screen, this command is the same as bidex-meta play. Without one, or with --out, it writes a film.
     """
 
     out: Path | None = None

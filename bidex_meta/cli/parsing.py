@@ -30,7 +30,7 @@ _END = re.compile(r"[.;](?: |$)(?![^(]*\))")
 
 
 class FlagsFound(Exception):
-    """Reports the flags of a command instead of parsing them; only ``flags_of`` requests this."""
+    """An exception that carries the flags of a command out of ``parse``; it is raised only inside ``flags_of``."""
 
     def __init__(self, options: type, default: object) -> None:
         self.options = options
@@ -79,7 +79,8 @@ class LookFlags:
     policy: str = "zero"  # Policy to show: zero (the action 0), random, or the folder of a run.
     checkpoint: str = "last"  # Checkpoint of a run: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
     suite: str | None = None
-    """Show the task with the rules and tasks of this suite. None: as in the run, or the single class."""
+    """Show the task with the rules and tasks of this suite. None: those of the run; without a run, those of the class
+    itself."""
     seed: Seed = 0  # Seed that draws tasks and start states.
 
     @property

@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Few, Pixels
 
 @dataclass(frozen=True)
 class RenderFlags(LookFlags):
-    """Draw a picture of a task's start, or a film of an episode. For a run, show all its classes side by side.
+    """Draw a picture of a task's start, or a film of an episode; with --tiled, show all classes side by side.
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
 
@@ -23,8 +23,8 @@ class RenderFlags(LookFlags):
     """
 
     out: Path | None = None
-    """File to write: .png (picture), .mp4 (film) or .webp (film for web pages). None: for a run, a film in its
-    videos/."""
+    """File to write: .png (picture), .mp4 (film) or .webp (film for web pages). None: a film in videos/ of the run's
+    folder; without a run, --out is needed."""
     tiled: Switch = False
     """Show all classes of the suite side by side; when an episode ends, the next one begins. A class's name is green
     while the episode counts as a success: from the first success on, or in version 2 only while the goal is held."""

@@ -302,7 +302,7 @@ def meta_test_table(title: str, found: SplitSummary) -> Sheet:
 
 
 def _shot_cells(name: str | None, by_shot: Sequence[Summary], gain: Gains | None) -> list[str]:
-    """Return the cells of a class in a meta-test, or of the mean over classes (``name`` None).
+    """Return the cells of a class in a meta-test, or of the mean over classes if ``name`` is None.
 
     The mean only has cells for success, because the returns of different classes have different scales.
     """

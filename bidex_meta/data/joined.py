@@ -29,7 +29,7 @@ class Joined:
     rewards: Tensor  # (N,), float32, in the world's scale
     terminated: Tensor  # whether the episode came to a true end, bool (N,)
     task: Tensor  # slot of the world, int64 (N,)
-    left: Tensor  # later transitions of the same episode, int64 (N,)
+    left: Tensor  # number of later transitions of the same episode, int64 (N,)
 
     def __len__(self) -> int:
         """Return the number of transitions, N."""

@@ -133,10 +133,10 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
-    """Lock a folder against other processes while the block records into it, before anything is written there.
+    """Lock a folder against other processes while the block records into it.
 
-    The folder is created, and removed again if it stays empty. Arguments and errors are those of ``has_begun``;
-    BidexError is also raised if another process records there.
+    The folder is created before the block begins, and removed again if it stays empty. Arguments and errors are those
+    of ``has_begun``; BidexError is also raised if another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]

@@ -332,7 +332,7 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
 
 
 def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonObject) -> dict[str, Any]:
-    """Submit runs to submitit's executor ``slurm``, or to ``local``, which starts all at once as local processes.
+    """Submit runs to submitit's executor ``slurm``, or to ``local``, which starts all jobs at once as local processes.
 
     ``parameters`` are the executor's; the defaults are a time of one day and one processor. Jobs print into
     ``out/jobs/``. Returns submitit's jobs by name. Runs that still have a waiting or running job from an earlier call

@@ -20,7 +20,7 @@ class Launch:
     """Rank of this process and number of processes of the run, from torchrun's environment variables."""
 
     rank: int = 0  # only process 0 writes and prints
-    count: int = 1  # on all machines
+    count: int = 1  # number of processes on all machines
     local_rank: int = 0  # rank among the processes of the same machine
     local_count: int = 1  # number of processes on the same machine
 
