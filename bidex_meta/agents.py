@@ -1,4 +1,4 @@
-"""Protocols of agents, with Meta-World's method names and order of calls: both libraries can evaluate an agent."""
+"""Protocols of agents, with Meta-World's method names and call order, so that both libraries can evaluate agents."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 

@@ -183,7 +183,7 @@ class Benchmark:
                 (docs/clients.md#trials-as-episodes); 1: as described above.
             deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
                 always does.
-            switches: Changes of the physics that are on trial, such as `"incremental"` (docs/gpu.md#switches).
+            switches: Experimental changes of the physics, such as `"incremental"` (docs/gpu.md#switches).
 
         Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """

@@ -38,7 +38,7 @@ _WRITTEN = ("suite", "task", "algo", "learner", "num_envs", "steps", "seed")
 """Fields that every ``config.json`` must have."""
 
 MAY_CHANGE = {"may_change": True}
-"""Metadata of a field that a resumed run may change, because it does not affect what is learned."""
+"""Metadata of a field that a resumed run may change, because the field does not affect what is learned."""
 
 
 def _whole_number(words: list[str]) -> int:
@@ -117,9 +117,9 @@ class RunConfig(Generic[LearnerSettings]):
     """Minutes to train for, summed over all resumes. Training ends after --minutes or --steps, whichever is reached
     first. Building the world and evaluations do not count and can take longer in short runs. None: no limit."""
     evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
-    """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation has an episode of up
-    to ten tasks of each class, at least ten in all; learners that adapt are evaluated after two shots on train tasks.
-    Evaluations do not affect training. None: never."""
+    """Evaluate every N iterations, and keep the best policy as checkpoints/best.pt. An evaluation plays up to ten tasks
+    of each class, one episode each, or more if there would be fewer than ten episodes in all. Learners that adapt are
+    evaluated on train tasks, after two shots. Evaluations do not affect training. None: never."""
     video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
     """Film one environment of each class every N iterations; films go into videos/ and to the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
@@ -142,14 +142,14 @@ class RunConfig(Generic[LearnerSettings]):
     """Store about this number of training transitions as the data set replay/ in the run's folder, in whole episodes of
     some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
-    """``record`` divided by the steps that the run began with: if the run is resumed for more steps, the same
-    environments are recorded."""
+    """``record`` divided by the steps that the run began with. The share is stored so that a run that is resumed for
+    more steps records the same environments."""
     stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """End as soon as the mean return reaches this value: in evaluations with --evaluate-every, otherwise in
-    training."""
+    """End as soon as the mean return reaches this value. It is measured in evaluations if --evaluate-every is given,
+    otherwise in training. None: never."""
     stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
-    """Stop as soon as this fraction of episodes succeeds, such as 0.8: in evaluations with --evaluate-every, otherwise
-    in training with exploration noise. None: never."""
+    """Stop as soon as this fraction of episodes succeeds, such as 0.8. It is measured in evaluations if
+    --evaluate-every is given, otherwise in training with exploration noise. None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
     """Stop as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
     --evaluate-every. None: never."""
@@ -166,7 +166,7 @@ class RunConfig(Generic[LearnerSettings]):
     """Make a run on a GPU repeatable bit for bit, which slows physics and learning down. Runs on a CPU are always
     repeatable."""
     switches: str = ""
-    """Changes of the physics that are on trial, separated by commas, such as incremental (docs/gpu.md)."""
+    """Experimental changes of the physics, separated by commas, such as incremental (docs/gpu.md)."""
     threads: Threads = UNRESOLVED
     """Threads of torch and of the physics in each process; by default the cores of a machine are divided among its
     processes. A resumed run keeps its number of threads."""

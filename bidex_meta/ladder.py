@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 
 class Choice(NamedTuple):
-    """The two hidden components of a class with choice and shared suites, and their values, rad."""
+    """Two hidden components of a class that has choice and shared suites, and the values of its goals, rad."""
 
     first: str
     second: str
@@ -34,7 +34,7 @@ CHOICES = {
     "DoorCloseInward": _CLOSING,
     "Switch": Choice("switch1_angle", "switch2_angle", small=0.18, large=0.48, lowest=0.1, highest=0.5585),
 }
-"""Classes with choice and shared suites."""
+"""Classes that have choice and shared suites, each with the components that its tasks hide."""
 ANY_CLASS = "CLASS"
 """Placeholder for the name of a class, in messages."""
 _VARIANTS = ("choice2", "choice4", "shared")
@@ -51,12 +51,12 @@ HIDDEN_NUMBERS = {
     "CatchAbreast": 3, "CatchOver2Underarm": 3, "CatchUnderarm": 3, "HandOver": 3, "LiftUnderarm": 3, "StackBlock": 3,
     "PushBlock": 4, "TwoCatchUnderarm": 6,
 }  # fmt: skip
-"""Number of values that a task of each class hides in version 2."""
+"""Number of values that a task of a class hides in version 2, by class."""
 _OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
 
 
 class Rung(NamedTuple):
-    """A step of the ladder: suites that hide about the same amount."""
+    """A step of the ladder of suites (docs/results/ladder.md): suites whose tasks hide about the same amount."""
 
     hidden: str
     """Hidden part of a task, in words."""
@@ -102,7 +102,7 @@ class OfOneClass(NamedTuple):
         return f"{self.class_name} with hidden goals: train on fifty, adapt to fifty others"
 
     def tasks(self) -> list[_Task]:
-        """Return name, split and fixed components of each listed task; none if tasks are drawn."""
+        """Return name, split and fixed components of each listed task; an empty list if tasks are drawn."""
         if self.variant == "v2":
             return []
         choice = CHOICES[self.class_name]

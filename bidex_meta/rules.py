@@ -14,8 +14,8 @@ from bidex_meta.utils.validation import check_fields, check_rising
 CONTROL_RATE = 60
 """Control steps per second of every class (docs/figures.md, control)."""
 HELD_STEPS = 15
-"""Number of last control steps in which the condition must hold without a break, if success counts at the end: 0.25
-s."""
+"""Number of control steps at the end of an episode (0.25 s) in which the condition must hold without a break, if
+success counts at the end."""
 
 
 @checked_arguments
@@ -27,12 +27,14 @@ class Rules:
     """``paper``: the formula that the paper prints for each class; ``v2``: the terms of ``aligned_terms``."""
     variation: Literal["narrow", "wide"] = "narrow"
     """Narrow goals vary about as much as success tolerates; wide goals vary several times as much, with a hidden
-    quantity in every class. Wide observations also give objects' and goals' quaternions with w >= 0."""
+    quantity in every class. Wide variation also makes the w of objects' and goals' quaternions non-negative in
+    observations."""
     success: Literal["once", "at-end"] = "once"
     """``once``: the condition must hold in at least one step of the episode; ``at-end``: in the last ``HELD_STEPS``
     steps."""
     starts: Literal["plain", "jittered"] = "plain"
-    """If jittered, every episode of every class draws joint noise and shifts fixtures and objects."""
+    """``plain``: starts as each class defines them; ``jittered``: every episode of every class draws joint noise and
+    shifts fixtures and objects."""
 
     @property
     def wide(self) -> bool:
@@ -41,7 +43,7 @@ class Rules:
 
     @property
     def as_printed(self) -> bool:
-        """Return whether returns can be compared with those of version 1: the same tasks and reward."""
+        """Return whether tasks and reward are those of version 1, so that returns can be compared with version 1."""
         return self.reward == "paper" and not self.wide
 
     @property

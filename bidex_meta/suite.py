@@ -227,7 +227,10 @@ def file_names() -> list[str]:
 
 @checked_arguments
 def metaworld_classes(suite: str) -> tuple[str, ...]:
-    """Return the classes of one of Meta-World's suites; for another name, raise BidexError with the nearest name."""
+    """Return the classes of one of Meta-World's suites.
+
+    Raises BidexError, which suggests the nearest name, if there is no such suite.
+    """
     if suite not in METAWORLD_SUITES:
         raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
     return METAWORLD_SUITES[suite]

@@ -128,7 +128,10 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Turn SIGTERM and ``notices()`` into an exception: no half-written file is left, and the reason is printed."""
+    """Raise an exception when SIGTERM or one of ``notices()`` is received.
+
+    The cleanup of the command then leaves no half-written file, and the reason is printed.
+    """
     # With several processes, signals keep their handlers, because a collective operation waits outside Python and would
     # delay ours.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
@@ -175,7 +178,7 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _failed(reason: str, code: int, debug: bool) -> int:
-    """Print the reason on one line and return the code; with ``debug``, raise the error of the caller's ``except``."""
+    """Print the reason on one line and return the code; with ``debug``, raise the caught error again."""
     if debug:
         raise
     message = one_line(reason)

@@ -21,8 +21,9 @@ class BaselineFlags:
 
     Example: bidex-meta baseline random --suite MT20 --out random.json
 
-    The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts with
-    the return of the worst finished episode of its class here, and with the stored return of random actions elsewhere.
+    The better of random and zero actions scores 0, the expert 100. In this command an episode in which the physics
+    breaks counts with the return of the worst finished episode of its class. Other commands count it with the stored
+    return of random actions.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
@@ -35,7 +36,8 @@ class BaselineFlags:
     threads: Threads | None = None  # CPU threads for the physics; None: one per core.
     out: Path | None = None
     """JSON file to which the results are added; it keeps its results of other classes. None: only print the results.
-    `evaluate` reads assets/references/ of the installation, which is only written if this flag names it."""
+    `evaluate` reads the files in assets/references/ of the installation; they change only if this flag names one of
+    them."""
     json: JsonSwitch = False
 
 

@@ -17,13 +17,13 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Threads
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure the speed of a suite's world on this machine, and of its physics without the rest.
+    """Measure the speed of a suite's world on this machine, and the speed of its bare physics engine.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world")]
-    """world: measure environment steps per second of the world and of its physics without the rest, and their ratio."""
+    """world: measure environment steps per second of the world and of its bare physics engine, and their ratio."""
     suite: str = "MT4"  # Suite to measure.
     num_envs: Environments = 1024  # Environments stepped together.
     steps: Steps = 40  # Environment steps of each repeat.
@@ -32,7 +32,7 @@ class BenchFlags:
     device: Device = "cpu"
     engine: str = "auto"  # Physics engine: auto, c or warp.
     deterministic: bool = False  # On a GPU, measure physics that repeats bit for bit.
-    switches: str = ""  # Changes of the physics that are on trial, such as incremental.
+    switches: str = ""  # Experimental changes of the physics, such as incremental.
     seed: Seed = 0  # Seed of the world and of the actions.
     json: JsonSwitch = False
 

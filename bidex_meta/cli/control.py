@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 
 @dataclass(frozen=True)
 class ControlFlags:
-    """Adapt held-out tasks to their own data and to data of each train task, with common random numbers.
+    """Adapt to held-out tasks from their own data and from data of each train task, with common random numbers.
 
     Example: bidex-meta control runs/ML1-wide/promp/*
 
@@ -35,7 +35,7 @@ class ControlFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play all arms of all runs and print a table per class, or JSON."""
+    """Play all arms (kinds of data to adapt to) of all runs, and print a table per class, or JSON."""
     flags = parse(ControlFlags, arguments, "control")
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")

@@ -10,7 +10,7 @@ from bidex_meta.utils import gl_backend, paths
 from bidex_meta.utils.waiting import tell
 
 FILM = ["--tiled", "--steps", "160", "--every", "8", "--width", "160"]
-"""Flags of ``render``: two and a half seconds of every class, which one core draws in about 90 seconds."""
+"""Flags of ``render`` for a film of 2.5 seconds of every class, which one core draws in about 90 seconds."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class DemoFlags:
 
     Example: bidex-meta demo --out demo.webp
 
-    With a screen this is bidex-meta play. Without one, or with --out, it writes a film.
+    With a screen, this command is the same as bidex-meta play. Without one, or with --out, it writes a film.
     """
 
     out: Path | None = None

@@ -14,8 +14,9 @@ class ExportFlags:
 
     Example: bidex-meta export assets/policies/MT20 --out mt20.onnx
 
-    The file contains the running statistics of observations. Policies that remember or adapt are refused. The file
-    computes in float32; for a policy that computes in bfloat16 here, the command prints the largest difference.
+    The file contains the running statistics of observations. Policies that have a memory or adapt are refused. The file
+    computes in float32; for a policy that computes in bfloat16 on this machine, the command prints the largest
+    difference.
     """
 
     run: RunPath  # Folder of the run to export.

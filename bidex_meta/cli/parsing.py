@@ -30,7 +30,7 @@ _END = re.compile(r"[.;](?: |$)(?![^(]*\))")
 
 
 class FlagsFound(Exception):
-    """Reports the flags of a command instead of parsing them; only ``flags_of`` requests this."""
+    """An exception that carries the flags of a command out of ``parse``; it is raised only inside ``flags_of``."""
 
     def __init__(self, options: type, default: object) -> None:
         self.options = options
@@ -41,7 +41,7 @@ _asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False
 
 
 def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] = ()) -> FlagsFound:
-    """Return the dataclass of the flags of a subcommand's ``main``, and its default if the command has its own.
+    """Return the dataclass of the flags of a subcommand's ``main``, and default values if the command sets its own.
 
     ``arguments`` are the words that the flags may depend on, e.g. ``--algo``.
     """
@@ -79,12 +79,13 @@ class LookFlags:
     policy: str = "zero"  # Policy to show: zero (the action 0), random, or the folder of a run.
     checkpoint: str = "last"  # Checkpoint of a run: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
     suite: str | None = None
-    """Show the task with the rules and tasks of this suite. None: as in the run, or the single class."""
+    """Show the task with the rules and tasks of this suite. None: those of the run; without a run, those of the class
+    itself."""
     seed: Seed = 0  # Seed that draws tasks and start states.
 
     @property
     def actor(self) -> str:
-        """The policy, named by RUN or by --policy."""
+        """Return the name of the policy, given as RUN or by --policy."""
         if self.run is None:
             return self.policy
         return str(self.run)
@@ -99,9 +100,9 @@ def parse(
 ) -> Options:
     """Parse the flags of a subcommand into a dataclass, whose docstring opens with a sentence and an example.
 
-    ``default`` has the values of flags that are not given. With ``usual``, flags under headings, ``--help`` shows these
-    flags alone, and ``--help-all`` shows all flags. BidexError is raised if a flag is unknown (the message names the
-    nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
+    ``default`` has the values of flags that are not given. ``usual`` maps headings to flags; if it is given, ``--help``
+    shows only these flags, and ``--help-all`` shows all flags. BidexError is raised if a flag is unknown (the message
+    names the nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
     """
     if _asked_for_flags.get():
         raise FlagsFound(options, default)
@@ -163,7 +164,10 @@ def _short_help(options: type, command: str, default: object, usual: Mapping[str
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
-    """Return the last value of ``flag`` before the full parse, whose defaults may depend on this value."""
+    """Return the last value of ``flag``, or None.
+
+    The flag is read before the full parse, because the defaults of other flags may depend on it.
+    """
     return next(reversed(peek_all(arguments, flag)), None)
 
 

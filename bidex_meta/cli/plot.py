@@ -64,7 +64,11 @@ def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRu
 
 
 def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:
-    """Return the path to write: ``asked``, else ``name`` in the run's folder or, for several runs, here."""
+    """Return the path to write, after a check that it can be written.
+
+    The path is ``asked``. If that is None, it is ``name`` in the run's folder or, for several runs, in the working
+    folder.
+    """
     out = asked or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / name
     if asked is None:
         refuse_links(out)

@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Few, Pixels
 
 @dataclass(frozen=True)
 class RenderFlags(LookFlags):
-    """Draw a picture of a task's start, or a film of an episode. For a run, show all its classes side by side.
+    """Draw a picture of a task's start, or a film of an episode; with --tiled, show all classes side by side.
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
 
@@ -23,19 +23,19 @@ class RenderFlags(LookFlags):
     """
 
     out: Path | None = None
-    """File to write: .png (picture), .mp4 (film) or .webp (film for web pages). None: for a run, a film in its
-    videos/."""
+    """File to write: .png (picture), .mp4 (film) or .webp (film for web pages). None: a film in videos/ of the run's
+    folder; without a run, --out is needed."""
     tiled: Switch = False
     """Show all classes of the suite side by side; when an episode ends, the next one begins. A class's name is green
-    while the episode counts as a success: from the first success on, in version 2 while the goal is held."""
+    while the episode counts as a success: from the first success on, or in version 2 only while the goal is held."""
     large: Switch = False
     """With --tiled: show one class at a time large next to all tiles."""
     steps: Steps | None = None
-    """Environment steps to film, 60 per second. None: none for a picture, one episode for a film, and with --tiled the
+    """Environment steps to film, 60 per second. None: 0 for a picture, and for a film one episode, or with --tiled the
     longest episode."""
     every: Few | None = None  # Environment steps between two frames of a film; None: 1, with --tiled 2.
-    width: Pixels | None = None  # Width in pixels, with --tiled of one tile; None: 640, with --tiled 240.
-    height: Pixels | None = None  # Height in pixels, with --tiled of one tile; None: three quarters of the width.
+    width: Pixels | None = None  # Width of the picture, or of one tile, in pixels; None: 640, or 240 for tiles.
+    height: Pixels | None = None  # Height of the picture, or of one tile, in pixels; None: three quarters of the width.
     camera: str | None = None  # Camera: front, side, top or back; None: front.
     points: Switch = False
     """Next to each picture, draw the point cloud of the class's depth camera, from the camera and from the side. The

@@ -20,7 +20,7 @@ _USUAL: dict[str, tuple[str, ...]] = {
     "data": ("--start-from", "--dataset", "--teacher"),
     "output": ("--run-dir", "--resume", "--logger", "--evaluate-every", "--no-evaluate", "--print-config"),
 }  # fmt: skip
-"""Flags that ``run --help`` shows; the learner's stand in ``USUAL_SETTINGS``."""
+"""Flags that ``run --help`` shows, by heading; ``USUAL_SETTINGS`` has those of the learners."""
 
 
 @dataclass(frozen=True)

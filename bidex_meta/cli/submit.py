@@ -19,16 +19,16 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry for a meta-test or for runs, which play their own tasks and equally many new tasks.
+    """Write a leaderboard entry for runs, which play their own and an equal number of new tasks, or for a meta-test.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
-    The runs may differ only in the seed. A meta-test of an agent that is not a run is taken as it is, without
+    The runs may differ only in the seed. The results of a meta-test of an agent that is not a run are entered without
     verification.
     """
 
-    runs: RunPaths  # Run folders, a seed each.
-    tuning: str | None = None  # Settings that you tried before you chose these, times seeds of each; 1x1: no others.
+    runs: RunPaths  # Run folders, one for each seed.
+    tuning: str | None = None  # Number of settings that you tried, x seeds of each; 1x1: only the submitted settings.
     check: Path | None = None  # Play the runs of this entry again and compare; writes nothing.
     transfer: Path | None = None
     """Folder of `bidex-meta transfer` for the run, to rank how much its policy helps on held-out classes."""

@@ -33,7 +33,7 @@ class Sheet:
 
     A number with its interval, ``0.7 [0.6, 0.8]`` under ``return [95 %]``, takes two columns. Intervals are left out
     first, then the columns named in ``spare`` in this order, then the last columns; with ``keeps_intervals`` the
-    columns in ``spare`` go before the intervals. Names and numbers are never cut.
+    columns in ``spare`` are left out before the intervals. Names and numbers are never cut.
     """
 
     headers: Sequence[str]
@@ -266,7 +266,7 @@ def _print_played(title: str, played: "PlayedTasks", brief: bool) -> None:
 
 
 def print_meta_test(found: "RunMetaTest") -> None:
-    """Print a table of each split."""
+    """Print a table for each split."""
     subject = f"{found.algo} on {found.worlds.name}"
     if found.steps is not None:
         subject += f", {found.steps:,} steps"
@@ -275,7 +275,7 @@ def print_meta_test(found: "RunMetaTest") -> None:
 
 
 def meta_test_table(title: str, found: SplitSummary) -> Sheet:
-    """Return a table of success after 0, 1, ... shots and of the gains of the last one.
+    """Return a table of success after 0, 1, ... shots, and of the gains from no adaptation to the last shot.
 
     Each class has a second row if the evaluation episodes were also played with hidden rewards.
     """
@@ -302,7 +302,7 @@ def meta_test_table(title: str, found: SplitSummary) -> Sheet:
 
 
 def _shot_cells(name: str | None, by_shot: Sequence[Summary], gain: Gains | None) -> list[str]:
-    """Return the cells of a class in a meta-test, or of the mean over classes (``name`` None).
+    """Return the cells of a class in a meta-test, or of the mean over classes if ``name`` is None.
 
     The mean only has cells for success, because the returns of different classes have different scales.
     """

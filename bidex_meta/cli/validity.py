@@ -25,18 +25,19 @@ class ValidityFlags:
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
     The table has five measures per class. (1) The highest success on unseen tasks that a policy can reach without
-    knowing what a task hides. (2) The share of first observations that identify the task; chance is one over the
-    number of tasks. (3) The share of exploring episodes whose rewards identify the hidden parts; exploration plays
-    rough actions, or a witness or a misled script with noise. (4) The success of untrained policies, and of scripts
-    and runs that know the task. (5) The agreement of return and success over all these episodes.
+    knowing what a task hides. (2) The share of first observations that identify the task; chance is one over the number
+    of tasks. (3) The share of exploring episodes whose rewards identify the hidden parts; exploration plays rough
+    actions, or a witness, or a script that was given a wrong goal, the last two with noise. (4) The success of
+    untrained policies, and of scripts and runs that know the task. (5) The agreement of return and success over all
+    these episodes.
     """
 
     suite: str = "ML20-v2"
     """Suite to measure: a name or a suite file. Its train tasks are measured, and the test tasks of a meta suite
     too."""
     policy: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """Folder of a run whose policy knows the tasks; the run must have the rules of this suite, and may know only some
-    of its classes. Repeat the flag for several runs."""
+    """Folder of a run whose policy knows the tasks; the run must have the rules of this suite, and its policy may know
+    only some of the classes. Repeat the flag for several runs."""
     seed: Seed = 0
     """Seed that draws tasks, start states and actions."""
     threads: Threads | None = None

@@ -56,9 +56,9 @@ def make_suite_world(
     """Make the world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, with environments of all classes.
 
     `seed` chooses tasks, starts and task draws. If `benchmark_seed` is given, it chooses the tasks instead; without
-    `seed`, it also chooses starts and task draws. Without both seeds, the tasks are those of seed 0, and starts and
-    draws differ each time. The render modes, None and `"rgb_array"`, are equivalent, because a world renders only on
-    request. Other arguments are as in `Benchmark.make_world`, except that `stagger` is off: wrappers would count
+    `seed`, it also chooses starts and task draws. If neither seed is given, the tasks are those of seed 0, and starts
+    and draws differ each time. The render modes, None and `"rgb_array"`, are equivalent, because a world renders only
+    on request. Other arguments are as in `Benchmark.make_world`, except that `stagger` is off: wrappers would count
     shortened episodes. With `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is
     Meta-World's vector of single environments with NumPy arrays, and `num_envs` is ignored.
     """

@@ -24,7 +24,7 @@ class RslRlVecEnv(VecEnv):
     episode ended). `policy` lists the `observation_groups` of the world that the policy gets (empty: all); the critic
     gets all groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md);
     rsl-rl's "Mean reward" counts shortened episodes, but `log` does not. Raises BidexError for a mode other than
-    SAME_STEP, an unknown group, or an `episode_length_buf` whose values are not non-negative integers.
+    SAME_STEP, an unknown group, or values of `episode_length_buf` that are negative or not whole.
     """
 
     @checked_arguments
@@ -55,7 +55,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps since each environment's start, int64 (num_envs,).
+        """Steps that each environment's running episode has lasted, int64 (num_envs,).
 
         Setting the property shortens the running episodes, which then do not count.
         """

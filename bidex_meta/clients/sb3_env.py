@@ -85,7 +85,8 @@ class SB3VecEnv(vec_env.VecEnv):
     def get_images(self) -> list[np.ndarray]:
         """Return a picture of each environment, uint8; SB3's `render` and `VecVideoRecorder` tile them.
 
-        One environment has 640 x 480 pixels; several share about 1280 x 960, at least 32 x 24 each.
+        A single picture has 640 x 480 pixels. Several pictures have about 1280 x 960 pixels together, and at least 32 x
+        24 pixels each.
         """
         columns = math.ceil(math.sqrt(self.num_envs))
         width = max(32, min(640, 1280 // columns // 4 * 4))

@@ -1,9 +1,10 @@
 """Checks and summaries of a data set.
 
-The check recomputes rewards by the class's own formula, from the sensors that the observation shows and the variation
-that the episode stores. This reveals shifted environments, wrong tasks and wrong starts. If a formula reads more than
-the observation shows, the check reports this. This concerns most classes with tables, which read the hand's point, and
-data with point clouds, which replace objects' states.
+The check recomputes rewards by the class's own formula, from the sensors that the observation shows and the task's
+values that the episode stores. This reveals transitions that were stored with a wrong environment, task or start. If a
+formula reads a sensor that the observation does not show, the check reports this. Most classes with tables are such
+cases, because their formulas read a point of the hand, and so are data with point clouds, which replace objects'
+states.
 """
 
 import math
@@ -197,7 +198,7 @@ def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Sho
     """Return slice and factor of each sensor that an observation shows completely and unchanged, by sensor.
 
     Sensors with ``hidden`` entries are left out. Joint positions are left out, because the observation maps each one
-    from its joint's range. Blocks that saturate are left out too.
+    from its joint's range. Sensors in blocks of the observation that saturate are left out too.
     """
     shown: _Shown = {}
     for block, where in task.layout:

@@ -82,8 +82,8 @@ class Progress:
     rounds: int  # existing parts
     steps: list[int]  # transitions of each policy
     episodes: list[int]  # episodes of each policy
-    returns: float  # mean unscaled return over all episodes, NaN without any
-    success: float  # share of successful episodes, NaN without any
+    returns: float  # mean unscaled return over all episodes; NaN if there are none
+    success: float  # share of successful episodes; NaN if there are none
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:

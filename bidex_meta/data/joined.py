@@ -29,7 +29,7 @@ class Joined:
     rewards: Tensor  # (N,), float32, in the world's scale
     terminated: Tensor  # whether the episode came to a true end, bool (N,)
     task: Tensor  # slot of the world, int64 (N,)
-    left: Tensor  # later transitions of the same episode, int64 (N,)
+    left: Tensor  # number of later transitions of the same episode, int64 (N,)
 
     def __len__(self) -> int:
         """Return the number of transitions, N."""
@@ -50,8 +50,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
     rewards get the world's scale. Goals that the world hides become zero, and actions from elsewhere are mapped to [-1,
-    1]. With ``every`` each of the world's classes needs data. BidexError is raised if actions, states or clouds have
-    another form, if actions from elsewhere have no bounds, if classes do not match, or if memory is too small.
+    1]. If ``every`` is True, each of the world's classes needs data. BidexError is raised if actions, states or clouds
+    have another form, if actions from elsewhere have no bounds, if classes do not match, or if memory is too small.
     """
     ids = world.num_id_columns
     plain = world.single_observation_space.shape[0] - ids
@@ -113,7 +113,7 @@ def check_touch(dataset: Dataset, touch: bool) -> None:
 
 
 class _Columns(NamedTuple):
-    """Columns of an observation without its task id; padding stands before the cloud."""
+    """Columns of an observation without its task id; padding comes before the point cloud."""
 
     state: np.ndarray  # columns of the state, that is, all but the cloud, ascending
     cloud: np.ndarray  # columns of the point cloud, point after point

@@ -53,7 +53,7 @@ class Episode:
     actions: np.ndarray  # (T, a), float32, clipped to [-1, 1]
     rewards: np.ndarray  # (T,), float32, with the suite's scale of the class
     terminated: np.ndarray  # (T,), bool: true at most for the last transition
-    truncated: np.ndarray  # (T,), bool: the same; ended by time, or before a broken transition
+    truncated: np.ndarray  # (T,), bool: true at most for the last one: time was up, or physics broke next
     task: int = 0  # slot of the world
     task_name: str = ""  # name of the slot: a class, or ``Class/task``
     task_index: int = 0  # index of the task in the slot's pool
@@ -176,7 +176,7 @@ class SealedFile:
 
 
 class PartWriter:
-    """A part that is being written: episodes go to the disk at once; nothing is at ``path`` before ``commit``."""
+    """A part that is being written: episodes go to the disk at once, under a temporary name until ``commit``."""
 
     def __init__(self, path: Path) -> None:
         self._sealed = SealedFile(path)

@@ -48,7 +48,10 @@ def check_file(path: Path) -> bool:
 
 
 def sealed_text(content: Mapping[str, object], ours: Mapping[str, object]) -> bytes:
-    """Return a data set's metadata, ours under ``bidex``, as JSON with one entry per line and a digest."""
+    """Return a data set's metadata as JSON with one entry per line and a digest.
+
+    The metadata are ``content``, and ``ours`` under the key ``bidex``.
+    """
     whole = {**content, "bidex": {**ours, _MARK: True}}
     rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in whole.items() if name != "digest"]
     text = ("{\n" + ",\n".join(rows)).encode()

@@ -86,9 +86,9 @@ class DatasetWriter:
     """Writes episodes of one process into the parts of a data set.
 
     ``folder`` is the data set's folder; the data set is opened by the folder's name within the data folder. Each
-    ``process`` has its own parts: the first ``keep`` parts stay, and later parts are deleted. ``parts`` is the number
-    of committed parts. ``left_out`` counts, by reason, the transitions and episodes that were not stored since the last
-    commit; the collector adds to these counts.
+    ``process`` has its own parts. A new writer keeps the first ``keep`` parts of its process and deletes later ones.
+    ``parts`` is the number of committed parts. ``left_out`` counts, by reason, the transitions and episodes that were
+    not stored since the last commit; the collector adds to these counts.
     """
 
     def __init__(self, folder: Path, process: int = 0, keep: int = 0) -> None:
@@ -133,10 +133,10 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
-    """Lock a folder against other processes while the block records into it, before anything is written there.
+    """Lock a folder against other processes while the block records into it.
 
-    The folder is created, and removed again if it stays empty. Arguments and errors are those of ``has_begun``;
-    BidexError is also raised if another process records there.
+    The folder is created before the block begins, and removed again if it stays empty. Arguments and errors are those
+    of ``has_begun``; BidexError is also raised if another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]
@@ -179,7 +179,7 @@ def stored_plan(folder: Path) -> Json:
 
 
 def has_begun(folder: Path, plan: Json) -> bool:
-    """Return whether the same collection has begun here, so that the same command resumes it.
+    """Return whether the same collection has begun in a folder, so that the same command resumes it.
 
     ``plan`` holds everything that decides what is collected, ready for JSON. BidexError is raised if the data set's
     folder holds a complete data set, another recording, or other files.
@@ -208,9 +208,9 @@ def has_begun(folder: Path, plan: Json) -> bool:
 def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: Json) -> None:
     """Complete a data set: write Minari's index over the parts of all processes, then the metadata.
 
-    ``name`` must be one that Minari accepts; the spaces are those of one observation (d,) and action (a,). ``metadata``
-    is our entry: it must have ``tasks``, and ``left_out`` is added. BidexError is raised for any other name, or a
-    damaged part.
+    The spaces are those of one observation (d,) and action (a,). ``metadata`` is stored as our entry in Minari's
+    metadata; it must contain ``tasks``, and this function adds ``left_out``. BidexError is raised if Minari does not
+    accept ``name``, or if a part is damaged.
     """
     check_name(name)
     inner = folder / "data"

@@ -23,7 +23,8 @@ class Agreement:
 
     name: str  # name of the class; for a meta-test, with split and shot
     outcome: str
-    """``equal``: bit for bit; ``within``: success and return differ no more than their intervals allow; ``differs``."""
+    """``equal``: bit for bit; ``within``: success and return differ no more than their intervals allow; ``differs``:
+    otherwise."""
     recorded: ClassSummary
     again: ClassSummary
 

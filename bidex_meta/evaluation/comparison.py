@@ -37,9 +37,9 @@ class Group:
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
     scores: np.ndarray | None  # normalised score, (seeds, classes); None if a class has no reference
-    steps: int  # environment steps of a seed, summed over its runs: mean over seeds
+    steps: int  # environment steps, summed over the runs of a seed, then averaged over seeds
     steps_range: tuple[int, int]  # smallest and largest number of steps of a seed
-    hours: float  # mean time of a seed's training, over all its runs, without evaluation
+    hours: float  # hours of training without evaluation, summed and averaged like ``steps``
     paths: list[Path]  # the runs' folders, or JSON files
 
     def steps_text(self) -> str:

@@ -1,9 +1,10 @@
 """The control of a meta-test: does adaptation learn from the task's own data?
 
 Any further training may raise the return, even on data of another task. Therefore the agent adapts to the data of each
-held-out task (*own*) and, from the same meta-parameters, to the data of each train task of the class (*foreign*). The
-arms play with common random numbers: the same starts, the same seed of the agent's own draws, the same number of
-episodes. Own minus before is the gain of adaptation. Own minus foreign is the part of the gain that is due to the task.
+held-out task (*own*) and, from the same meta-parameters, to the data of each train task of the class (*foreign*). These
+two, and the agent *before* adaptation, are called arms. They play with common random numbers: the same starts, the same
+seed of the agent's own draws, the same number of episodes. The return of *own* minus that of *before* is the gain of
+adaptation. The return of *own* minus that of *foreign* is the part of the gain that is due to the task's own data.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -52,7 +52,7 @@ class Part:
     """Results after 0, 1, ... shots; for a transfer, results from scratch and then from the run."""
 
     def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
-        """Return success (runs, units) in each class after a shot; ``episodes`` is their number per adaptation."""
+        """Return success (runs, units) in each class after a shot; ``episodes`` is the number per adaptation."""
         return [row_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
 
 
@@ -84,7 +84,7 @@ class Receipt:
 
     weights: list[_Digest]  # digests of the policies, see ``weights_digest``
     config: list[_Digest]
-    code: _Commit | None  # commit of the code that evaluated; + if files differed from it; None: no repository
+    code: _Commit | None  # commit of the code that evaluated, with + if files differed from it; None: no repository
     evaluation: _Digest  # digest of all other content of the entry
 
 
@@ -95,7 +95,7 @@ class Stated:
     seeds: list[Seed]
     hours: list[NonNegative]  # hours of training, without evaluation
     device: _Name  # device that trained
-    commit: list[_Commit | None]  # commit of the code that trained; + if files differed from it
+    commit: list[_Commit | None]  # commit of the code that trained, with + if files differed from it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class _Listed(ABC):
 
     @property
     def result(self) -> list[np.ndarray]:
-        """Return the success (runs, units) in each class that ranks entries: on new tasks, after the last shot."""
+        """Return the success that ranks entries: a table (runs, units) per class, on new tasks, after the last shot."""
         return self.new.tables(self.episodes)
 
     @property
@@ -192,7 +192,7 @@ class _Listed(ABC):
                 yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
 
     def _pools(self, where: str) -> dict[str, int]:
-        """Return the number of tasks per class in a part."""
+        """Return the number of tasks of each class in the part ``where``."""
         suite = _suite(self.suite)
         if self.track == TRANSFER:
             return held_out(suite)
@@ -207,12 +207,12 @@ class _Listed(ABC):
         return {slot: len(tasks) for slot, tasks in suite.task_names(split).items()}
 
     def _train_tasks(self) -> int | None:
-        """Return the number of train tasks per class, if it differs from that of the suite."""
+        """Return the number of train tasks per class; None if it is that of the suite."""
         return None
 
     @abstractmethod
     def _tasks(self, pool: int) -> range:
-        """Return the allowed numbers of evaluated tasks, of ``pool`` tasks in all."""
+        """Return the allowed numbers of evaluated tasks, if a class has ``pool`` tasks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,7 +312,7 @@ class TransferEntry(_OfRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry(_Listed):
-    """A meta-test of an agent that is no run, in ``trials/`` of the folder of entries. Nothing in it is verified."""
+    """A meta-test of an agent that is not a run, in the entries' folder ``trials/``. Its results are not verified."""
 
     verified = False
     track: AdaptationTrack
@@ -321,7 +321,7 @@ class AgentEntry(_Listed):
 
     @property
     def runs(self) -> int:
-        """Return one, because an agent that is no run counts as one."""
+        """Return 1, because an agent that is not a run counts as one run."""
         return 1
 
     def _tasks(self, pool: int) -> range:
@@ -345,7 +345,7 @@ def evaluation_seed(weights: Iterable[str]) -> int:
 
 
 def _suite(name: str) -> Suite | None:
-    """Return a shipped suite, or None for one of Meta-World's; raise BidexError for another name."""
+    """Return a shipped suite, or None for one of Meta-World's suites; raise BidexError for an unknown name."""
     if name in METAWORLD_SUITES:
         return None
     if name not in suite_names():

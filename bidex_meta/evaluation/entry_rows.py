@@ -21,7 +21,7 @@ class ClassRow:
     """The results of a class."""
 
     success: Fraction
-    interval: _Interval | None  # 95 %, of the mean over runs and tasks; None with a single episode
+    interval: _Interval | None  # 95 % interval of the mean over runs and tasks; None with a single episode
     solved: Annotated[list[Annotated[list[Whole], Meta(min_length=1)]], Meta(min_length=1)]
     """Successful episodes of each task, one list per run."""
 

@@ -107,7 +107,7 @@ def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, l
 
 
 def with_clouds(world: PooledWorld) -> PooledWorld:
-    """Return a world of hands whose pictures also show point clouds; raise BidexError for another world."""
+    """Return a world whose pictures also show point clouds; raise BidexError unless it is a world of hands."""
     if not isinstance(world, World):
         raise BidexError("Only bidex-meta's own scenes have point clouds, not Meta-World's. Leave --points out.")
     count = (world.points or PointsRule()).count

@@ -15,7 +15,8 @@ from bidex_meta.world import World
 
 _FOLDS = 5
 _GUESSES = 500
-"""Guesses of each class, over all of its tasks: their share has a standard error of at most 2.3 points."""
+"""Guesses of each class, over all of its tasks: the share of correct guesses has a standard error of at most 2.3
+points."""
 _RIDGE = 1.0
 """Weight of the ridge penalty, for standardised observations."""
 
@@ -67,7 +68,7 @@ def _standardised(starts: np.ndarray) -> np.ndarray:
 
 
 def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both probes' predictions of ``targets`` (episodes, n, k), each from the groups in the other folds."""
+    """Return both probes' predictions of ``targets`` (episodes, n, k), each learned from the groups of other folds."""
     x = seen.reshape(-1, seen.shape[-1])
     y = targets.reshape(-1, targets.shape[-1])
     fold = groups.reshape(-1) % _FOLDS

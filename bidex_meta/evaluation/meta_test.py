@@ -39,7 +39,7 @@ class MetaEvaluation:
     by_shot: list[Evaluation]  # results after 0, 1, ..., K shots (or those requested), on equal episodes
     adaptations: dict[str, np.ndarray]
     """By class, the number, from 0, of the adaptation (a trial of a task) before each episode, ``(episodes,)``."""
-    protocol: Protocol  # as played, with the actual number of rollouts and length of the longest exploring episode
+    protocol: Protocol  # protocol as played, with the actual number of rollouts and longest exploring episode
     adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
     hidden_by_shot: list[Evaluation] | None = None  # results with hidden rewards, if the protocol requests them
 
@@ -63,7 +63,7 @@ class MetaEvaluation:
         return paired_gains(self.by_shot[shot], self.before, self.adaptations)
 
     def summary(self) -> SplitSummary:
-        """Return the results without the single episodes."""
+        """Return the results without the individual episodes."""
         by_shot = [evaluation.summary() for evaluation in self.by_shot]
         hidden = None
         if self.hidden_by_shot is not None:
@@ -76,7 +76,7 @@ class MetaEvaluation:
         )  # fmt: skip
 
     def to_json(self) -> Json:
-        """Return the results without the single episodes, ready for JSON."""
+        """Return the results without the individual episodes, ready for JSON."""
         return to_builtins(self.summary())
 
 

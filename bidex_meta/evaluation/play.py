@@ -1,9 +1,9 @@
 """Evaluation of a policy's mean action: success and return per class, over the same number of episodes of each task.
 
-A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. The suite decides
-whether an episode is a success when it was solved at any step, or only when it was solved in its last steps; both
-measures are reported. The return of an episode is the sum of its unscaled rewards. An episode whose physics broke is a
-failure. It counts with the return of random actions, or with its own return if that is lower.
+A task whose episodes end early is not played more often, so that easy tasks cannot crowd out hard ones. The suite
+decides whether an episode is a success when it was solved at any step, or only when it was solved in its last steps;
+both measures are reported. The return of an episode is the sum of its unscaled rewards. An episode whose physics broke
+is a failure. It counts with the return of random actions, or with its own return if that is lower.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -138,7 +138,7 @@ def _play(
     playing: torch.Tensor,
     observe: Callable[[Timestep], None] | None,
 ) -> dict[str, torch.Tensor]:
-    """Play an episode in each environment of ``playing``; return the results of these, as ``play_tasks`` does."""
+    """Play an episode in each environment of ``playing``; return the results in the form of ``play_tasks``."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)

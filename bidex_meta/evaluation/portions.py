@@ -72,7 +72,10 @@ class Portions:
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
     def labelled(self, episodes: Episodes, portion: int) -> Episodes:
-        """Return a portion's episodes without repetitions; add ``adaptation``; ``task`` is the index in the pool."""
+        """Return a portion's episodes without repetitions, with the number of each one's ``adaptation``.
+
+        ``task`` becomes the index of the task in the pool.
+        """
         parts = []
         for slot, adaptations in enumerate(self._adaptations):
             own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}

@@ -121,7 +121,7 @@ def _returns(kind: Kind) -> dict[str, float]:
 
 
 def references_of(world: object) -> dict[str, Reference]:
-    """Return the references of a world's classes; empty for foreign classes, version 2, and fixed bases."""
+    """Return the references of a world's classes; empty for other libraries' classes, version 2, and fixed bases."""
     classes = [slot.task_class for slot in getattr(world, "slots", ())]
     if classes and all(task.moving_base and task.rules.as_printed for task in classes):
         return references()

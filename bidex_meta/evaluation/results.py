@@ -80,7 +80,7 @@ class ClassResult:
         return np.bincount(task, self.successes).astype(int).tolist()
 
     def summary(self) -> ClassSummary:
-        """Return the results without the single episodes."""
+        """Return the results without the individual episodes."""
         return ClassSummary(
             success=self.success, success_interval=estimate(mean, self.drawn(self.successes)).interval,
             success_once=self.once, success_at_end=self.at_end,
@@ -104,7 +104,7 @@ class Evaluation:
         return sum(rates) / len(rates)
 
     def summary(self) -> Summary:
-        """Return the results without the single episodes."""
+        """Return the results without the individual episodes."""
         results = self.classes.values()
         return Summary(
             episodes_per_task=self.episodes_per_task,
@@ -116,7 +116,7 @@ class Evaluation:
         )
 
     def to_json(self) -> Json:
-        """Return the results without the single episodes, ready for JSON."""
+        """Return the results without the individual episodes, ready for JSON."""
         return to_builtins(self.summary())
 
 
@@ -157,7 +157,7 @@ def _share(episodes: dict[str, np.ndarray], name: str, broken: np.ndarray) -> fl
 
 @checked_arguments
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
-    """Return the mean return of ``a`` minus that of ``b`` for each class of both, with a bootstrap interval."""
+    """Return the mean return of ``a`` minus that of ``b`` for each class that both have, with a bootstrap interval."""
     differences = {}
     for name, ours in a.classes.items():
         if name in b.classes:

@@ -1,8 +1,9 @@
 """Validity of a task class: the best success without knowing its hidden parts, and whether rewards identify them.
 
-Blind ceiling and identifiability need no policy. They assume that the hidden parts are drawn independently and
-uniformly, as in ``TaskClass.variation_space``; ``listed_ceiling`` is for suites that list their tasks. The alignment of
-return and success is computed from policies' results.
+The blind ceiling (the best success of a policy that does not know the hidden parts) and identifiability need no policy.
+They assume that the hidden parts are drawn independently and uniformly, as in ``TaskClass.variation_space``;
+``listed_ceiling`` is for suites that list their tasks. The alignment of return and success is computed from policies'
+results.
 """
 
 import math
@@ -43,7 +44,7 @@ class Alignment:
     episode, the share in which the successful one returns more minus the share in which it returns less. Unlike
     Spearman's correlation it can reach 1 for any share of successes."""
     solved: float  # Mean return of the successful episodes.
-    unsolved: float  # Largest mean return of a policy that never succeeds.
+    unsolved: float  # Largest mean return among the policies that never succeed.
 
 
 def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
@@ -191,8 +192,8 @@ class _EachWith(TaskState):
 def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: int) -> float:
     """Return the largest error of a hidden part in units of its tolerance (infinite for a wrong sign).
 
-    The fit minimises squares by Levenberg-Marquardt from the best of many random starts, with derivatives by finite
-    differences.
+    The fit minimises the sum of squares by Levenberg-Marquardt from the best of many random starts, with derivatives by
+    finite differences.
     """
     task = scene.task
     space = scene.task.variation_space

@@ -77,7 +77,7 @@ def over_seeds(of_seeds: list[float]) -> Json:
 
 
 def add_over_nothing(rows: Sequence[Json], measure: str) -> None:
-    """Add to each row the difference from the row of the same runs from scratch; seeds of both are resampled."""
+    """Add to each row the difference from the corresponding runs from scratch; seeds of both are resampled."""
     alone = {(row["class"], row.get("demonstrations")): row for row in rows if row["from"] == NOTHING}
     for row in rows:
         other = alone.get((row["class"], row.get("demonstrations")), row)

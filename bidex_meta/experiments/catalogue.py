@@ -57,7 +57,7 @@ def _statements(module: str) -> dict[str, ast.AST]:
 
 
 def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
-    """Map each bound name to its class, its value, or the import that it comes from."""
+    """Map each name that ``body`` binds to its class or value, or to the import that it comes from."""
     found: dict[str, ast.AST] = {}
     for node in body:
         match node:

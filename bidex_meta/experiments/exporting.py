@@ -25,7 +25,7 @@ from bidex_meta.worlds import open_worlds
 TOLERANCE = 1e-5
 """Largest allowed difference between an action of the file and torch's action."""
 ROWS = 256
-"""Number of random observations in the check; the export itself uses another number."""
+"""Number of random observations in the check; the export itself uses another batch size."""
 _SHAPE = dict[str, Any]
 
 
@@ -46,8 +46,8 @@ class Export:
 def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last") -> Export:
     """Write a run's policy as an ONNX file: raw observations in, mean actions out, float32.
 
-    ``out`` is the file; the default is ``policy.onnx`` in the run's folder. Raises BidexError for policies that
-    remember or adapt, and if the file's actions differ from those of torch.
+    ``out`` is the file; the default is ``policy.onnx`` in the run's folder. Raises BidexError for policies that have a
+    memory or adapt, and if the file's actions differ from those of torch.
     """
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise BidexError(f"bidex-meta export needs {', '.join(missing)}: pip install 'bidex-meta[export]'.")

@@ -21,7 +21,7 @@ class Film:
 
     out: Path
     seed: int = 0
-    steps: int | None = None  # None: 0 for a picture, one episode for a film (if ``tiled``, the longest)
+    steps: int | None = None  # steps; None: 0 for a picture, one episode for a film (if ``tiled``, the longest one)
     tiled: bool = False
     large: bool = False  # if ``tiled``: also show one environment at a time enlarged
     every: int | None = None  # steps per frame; None: 1, or 2 if ``tiled``

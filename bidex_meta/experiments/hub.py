@@ -141,7 +141,10 @@ def library() -> Any:
 
 
 def called(function: str, name: str, **options: Any) -> Any:
-    """Call a function of the library for a repository (``datasets/NAME`` for data sets); raise errors as one line."""
+    """Call a function of ``huggingface_hub`` for a repository; raise errors as one line.
+
+    Names of data sets begin with ``datasets/``.
+    """
     if name.startswith(DATASETS):
         kind = "dataset"
     else:

@@ -48,8 +48,8 @@ ALGOS: dict[str, str] = {
 USUAL_SETTINGS = (
     "learning_rate", "gamma", "hidden", "architecture", "rollout_steps", "epochs", "replay_steps", "updates_per_step",
 )  # fmt: skip
-"""Fields of learners' configs that are changed most often; ``bidex-meta run --help`` shows those that the learner
-has."""
+"""Fields of learners' configs that are changed most often. ``bidex-meta run --help`` shows these fields if the learner
+has them."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class Options:
     """Episodes of each task; None: 4, or 1 if a task has a fixed start (metaworld/...); for learners that adapt, the
     number of --rollouts."""
     shots: Shots | None = None  # Adaptation rounds, one after the other, of --rollouts episodes each; None: 2.
-    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, but at most 40; else 10.
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as in training, at most 40 (if not set: 10).
     tasks: Few | None = None  # Number of tasks of each class to adapt to, the first of its pool; None: 5.
     trials: Few | None = None
     """Number of adaptations to each task, each from the unadapted policy and with new episodes; None: 1, or enough for

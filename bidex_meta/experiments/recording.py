@@ -66,8 +66,8 @@ class RecordConfig:
     of the class's witness, a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders. The kind decides how many."""
-    suite: str | None = None  # random: suite to act in, a name or a TOML file; else the run's own suite.
-    task: str | None = None  # random: class to act in, instead of a suite; demonstrations: class of the witness.
+    suite: str | None = None  # With random: suite to act in, a name or a TOML file. Runs keep their own suite.
+    task: str | None = None  # With random: class to act in, not a suite. With demonstrations: class of the witness.
     base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class defines it.
     size: Steps = 0
     """Number of transitions; 0: 1e6 (medium-expert: 2e6, demonstrations: 2e4). A few more are stored, because episodes
@@ -79,16 +79,16 @@ class RecordConfig:
     """Standard deviation of the Gaussian noise added to the actions of a witness, or of a policy without a
     distribution."""
     starts: Literal["witness", "tasks"] = "witness"
-    """demonstrations: with witness, replay the witness in its own task, from its own start with shifted objects. With
-    tasks, replay it in all tasks of the class, from their starts: it succeeds less often, but the data are more
-    varied."""
+    """With demonstrations: the starts of the replays. witness: replay the witness in its own task, from its own start
+    with shifted objects. tasks: replay it in all tasks of the class, from their starts; it succeeds less often, but the
+    data are more varied."""
     script: Switch = False
-    """demonstrations, --starts tasks: use a scripted policy instead of the witness. The script computes actions from
-    each start (about a second for 500 steps) and succeeds more often. Eight classes have one."""
+    """With demonstrations and --starts tasks: use a scripted policy instead of the witness. The script computes actions
+    from each start (about a second for 500 steps) and succeeds more often. Eight classes have one."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
-    """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
-    num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
-    seed: Seed = 0  # Seed of starts and actions; for random also of tasks (a run keeps its own tasks).
+    """With demonstrations and --starts witness: distance by which the objects' start is shifted, metres."""
+    num_envs: Environments | None = None  # Environments stepped together; None: one per task, but at least 200.
+    seed: Seed = 0  # Seed of starts and actions; with random also of tasks (a run keeps its own tasks).
     out: Path | None = None  # Folder of the data set; None: NAME/KIND-v0 in the folder of BIDEX_DATA, else in data/.
     device: str = "auto"  # auto, cpu or cuda:N.
     engine: Literal["auto", "c", "warp"] = "auto"  # Physics; auto: the one that is fast on the device.

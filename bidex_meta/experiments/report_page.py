@@ -63,7 +63,10 @@ def _json(config: RunConfig) -> str:
 
 
 def _letter(place: int) -> str:
-    """Return A, B, ..., Z, AA, ...: a legend needs short names, because labels list every difference."""
+    """Return the letters A, B, ..., Z, AA, ... for the places 0, 1, ... of groups.
+
+    A legend needs such short names, because labels list every difference.
+    """
     return ("" if place < 26 else _letter(place // 26 - 1)) + chr(ord("A") + place % 26)
 
 

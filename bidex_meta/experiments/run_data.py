@@ -173,7 +173,7 @@ def _check_shown(dataset: Dataset, source: Worlds) -> None:
 
 
 def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
-    """Open data sets; print their purpose, and a note for each set that was recorded under other rules."""
+    """Open data sets; print their size after the text ``what``, and a note for each set recorded under other rules."""
     datasets = open_datasets(names)
     steps = sum(dataset.num_steps for dataset in datasets)
     episodes = sum(dataset.num_episodes for dataset in datasets)

@@ -209,8 +209,8 @@ def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
 def _was_privileged(config: RunConfig) -> bool | None:
     """Return whether a run, or the run that it started from, had more than the rewards of its own episodes.
 
-    More means privileges that the learner's class states, teachers, demonstrations, data sets, or a suite that shows
-    its goals. The result is None if the run that it started from cannot be found.
+    Such further information comes from teachers, demonstrations, data sets, a suite that shows its goals, or the
+    ``privileges`` of the learner's class. The result is None if the run that it started from cannot be found.
     """
     seen = set[str]()
     while True:

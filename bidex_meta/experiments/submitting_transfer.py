@@ -178,7 +178,7 @@ def _on_new_tasks(run: SubmittedRun, file: Path, config: Json, episodes: int, se
 
 
 def _solved(evaluation: Evaluation) -> list[int]:
-    """Return the successes of each task of the only class; several objects of a class are several rows."""
+    """Return the number of successes of each task of the only class, with all of the class's objects."""
     solved = []
     for row in evaluation.classes.values():
         solved += row.solved

@@ -60,7 +60,10 @@ class _File(_Shared):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a plan. It trains in a separate process: ``bidex-meta`` with the words of ``begin`` or ``resume``."""
+    """A run of a plan.
+
+    It trains in a separate process, which is the command ``bidex-meta`` with the words of ``begin`` or ``resume``.
+    """
 
     path: Path
     """The run's folder, which need not exist yet."""
@@ -75,39 +78,39 @@ class PlannedRun:
 
     @property
     def name(self) -> str:
-        """The name of the run's folder."""
+        """Return the name of the run's folder."""
         return self.path.name
 
     @property
     def folder(self) -> RunFolder:
-        """The run's folder."""
+        """Return the run's folder."""
         return RunFolder(self.path)
 
     @property
     def seed(self) -> int:
-        """The run's seed."""
+        """Return the run's seed."""
         return self.given.seed
 
     @property
     def subject(self) -> str:
-        """The suite or class that the run trains on, as it was given."""
+        """Return the suite or class that the run trains on, as it was given."""
         return self.given.suite or self.given.task or ""
 
     @property
     def after(self) -> Path | None:
-        """The folder of the run whose policy the run starts from."""
+        """Return the folder of the run whose policy the run starts from."""
         if self.given.start_from is None:
             return None
         return Path(self.given.start_from)
 
     @property
     def begin(self) -> list[str]:
-        """The words of the command line that begin the run."""
+        """Return the words of the command line that begin the run."""
         return ["run", *self._words(), f"--run-dir={self.path}"]
 
     @property
     def resume(self) -> list[str]:
-        """The words of the command line that resume the run."""
+        """Return the words of the command line that resume the run."""
         return ["run", f"--resume={self.path}", *self._words(may_change=True)]
 
     def _words(self, may_change: bool = False) -> list[str]:
@@ -261,7 +264,7 @@ def _by_field(flags: JsonObject) -> JsonObject:
 
 
 def _parsed(where: str, values: JsonObject, called: str) -> tuple[RunConfig[JsonObject], FinalEvaluation]:
-    """Return values as a config and an evaluation; ``called`` stands for ``{subject}`` in texts."""
+    """Return values as a config and an evaluation; ``called`` replaces ``{subject}`` in texts."""
     parts: dict[str, JsonObject] = {"config": {}, "learner": {}, "final": {}}
     of_final = {entry.name for entry in fields(FinalEvaluation)}
     of_config = {entry.name for entry in fields(RunConfig)}.difference(_OWN, _NO_FLAGS, ["start_from"])

@@ -1,7 +1,7 @@
 """Train the runs of a plan, several at a time, and resume stopped runs.
 
-On this machine a pool of threads, each bound to a core, calls the runs; on a cluster submitit (extra ``slurm``) calls
-the runs. Both call the same ``Job``, which begins or resumes a run, and waits for the run's process.
+On this machine a pool of threads, each bound to a core, starts the runs. On a cluster, submitit (extra ``slurm``)
+starts them. Both call a ``Job``, which begins or resumes a run and waits for the run's process.
 """
 
 import contextlib
@@ -49,7 +49,7 @@ class State(NamedTuple):
     seconds: float
     """Seconds of training so far."""
     why: str
-    """The last line of the run's log if its last start failed."""
+    """The last line of the run's log if the run failed when it was last begun or resumed."""
 
     @property
     def speed(self) -> float:
@@ -332,7 +332,7 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
 
 
 def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonObject) -> dict[str, Any]:
-    """Submit runs to submitit's executor ``slurm``, or to ``local``, which starts all at once as local processes.
+    """Submit runs to submitit's executor ``slurm``, or to ``local``, which starts all jobs at once as local processes.
 
     ``parameters`` are the executor's; the defaults are a time of one day and one processor. Jobs print into
     ``out/jobs/``. Returns submitit's jobs by name. Runs that still have a waiting or running job from an earlier call
@@ -366,7 +366,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
-    """Return a core per worker, of those ``asked`` for (``0,2-3``); all are None if processes cannot be bound."""
+    """Return a core per worker, from those in ``asked`` (``0,2-3``); None for each if processes cannot be bound."""
     linux = sys.platform == "linux"
     usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable

@@ -42,12 +42,12 @@ class Cell:
 
     run: PlannedRun
     task: str  # the held-out class
-    arm: str  # name of the start: a run, or from scratch
+    arm: str  # name of the initial policy: a run, or from scratch
     demonstrations: int | None  # number of episodes; None: by reinforcement
 
 
 class Arm(NamedTuple):
-    """A start of training: a run's policy, or a fresh policy."""
+    """An initial policy of training: the policy of a run, or a fresh policy."""
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy
@@ -224,8 +224,8 @@ def cells_of(
 ) -> Iterator[Cell]:  # fmt: skip
     """Yield the cells of a class, with the seed of ``config``.
 
-    For each arm there is a cell per count of demonstrations, then one by reinforcement. Without a data set there are
-    only the cells without demonstrations; with 0 steps there are none by reinforcement.
+    There is a cell per arm for each count of demonstrations, and then for learning by reinforcement. Without a data
+    set, counts above 0 are left out. With 0 steps, learning by reinforcement is left out.
     """
     preset = replace(config, learner=learner_kind(config.algo).presets[config.preset]).learner_values
     changed = {key: value for key, value in config.learner_values.items() if value != preset[key]}

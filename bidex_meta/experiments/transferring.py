@@ -30,7 +30,7 @@ from bidex_meta.worlds import Worlds, open_worlds
 USUAL_RUN: RunConfig = RunConfig(
     algo="ppo", preset="laptop", logger="none", num_envs=256, learner={"demonstration_cloning": 5000}
 )
-"""Default config of the runs of a transfer; the transfer sets suite, seed, steps, start and network."""
+"""Default config of the runs of a transfer; the transfer sets suite, seed, steps, initial policy and network."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class TransferResult:
     folder: Path
     """The folder of the runs, ``transfer.json`` and the figures."""
     reinforcement: tuple[JsonObject, ...]
-    """A row per class and start, for runs that learned by reinforcement."""
+    """A row per class and initial policy, for runs that learned by reinforcement."""
     demonstrations: tuple[JsonObject, ...]
-    """A row per class, start and number of demonstrations, for runs that learned from demonstrations."""
+    """A row per class, initial policy and number of demonstrations, for runs that learned from demonstrations."""
     failures: int
     """Runs that failed or were stopped in this call; the rows leave them out."""
 
@@ -76,7 +76,7 @@ def transfer(
         demonstrations: Numbers of demonstrated episodes that runs learn from; empty: no such runs.
         data: Data sets of demonstrations, which replace episodes of the classes' scripts.
         seeds: Number of runs of each kind; their seeds are 0, 1, ...
-        config: The config of every run, whose learner is ``ppo``; suite, seed, steps and start are set here.
+        config: The config of every run, whose learner is ``ppo``; suite, seed, steps and initial policy are set here.
         final: The evaluation at the end of every run.
         workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
         cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.

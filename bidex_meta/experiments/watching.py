@@ -84,7 +84,7 @@ class Watch:
         return every is not None and self._iterations % every == 0
 
     def _policy(self, device: str) -> Agent:
-        """Copy the policy, because recurrent policies keep a memory and adapting policies learn."""
+        """Copy the policy: evaluations change the memory of recurrent policies, and adapting policies learn in them."""
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:

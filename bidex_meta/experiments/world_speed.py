@@ -15,7 +15,7 @@ def world_speed(
     suite: str, *, num_envs: int, steps: int, repeats: int, threads: int | None, device: str, engine: str, seed: int,
     deterministic: bool = False, switches: str = ""
 ) -> Json:  # fmt: skip
-    """Measure environment steps per second of a suite's world and of bare engines, in turns within one process.
+    """Measure environment steps per second of a suite's world and of bare engines, alternating within one process.
 
     The results are medians; ``ratio`` is the median of ratios. The bare engines are those of a second world, with the
     same states, controls, threads, sensors and substeps. Outside the timed region the bare engines follow the first

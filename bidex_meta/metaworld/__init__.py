@@ -26,7 +26,10 @@ _CLASSES = "ALL_V3_ENVIRONMENTS"
 
 
 def __getattr__(name: str) -> object:
-    """Return Meta-World's wrappers by name; raise an error that names the alternative for its suites and classes."""
+    """Return one of Meta-World's wrappers by name, or all our classes for ``ALL_V3_ENVIRONMENTS``.
+
+    For other names of Meta-World's suites and classes, an AttributeError is raised that names our alternative.
+    """
     if name == _CLASSES:
         return {task: MT1(task).train_classes[task] for task in MT1.ENV_NAMES}
     if name in _ABSENT:

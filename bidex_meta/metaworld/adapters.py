@@ -219,7 +219,7 @@ class MetaWorldEnvs(VectorEnv):
             raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
 
     def sample_tasks(self) -> None:
-        """Choose the next tasks of each pool, one per environment, in turn; the tasks apply from the next reset on."""
+        """Choose the next tasks in the order of each pool, one per environment; they apply from the next reset on."""
         chosen = {}
         for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_env_ids, strict=True):
             count = rows.stop - rows.start

@@ -1,8 +1,8 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
 As in Meta-World, `MT1` and `ML1` take any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
-`("ML1")`. Classes of version 2 are named `CatchUnderarm-v2`, and so are their tasks. The hands' bases move, as in every
-suite. `seed` chooses the tasks (None stands for 0).
+`bidex_meta.Benchmark("ML1")`. Classes of version 2, and their tasks, have names such as `CatchUnderarm-v2`. The hands'
+bases move, as in every suite. `seed` chooses the tasks (None stands for 0).
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,7 @@ _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 def make_mt_envs(
     name: str, seed: int | None = None, num_tasks: Few | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
-    """Make environments that show goals and draw a task at each reset: one of a class, or one per class of a suite.
+    """Make environments that show goals and draw a task at each reset: one for a class, or one per class for a suite.
 
     `seed` chooses the tasks (None: 0), the starts and the task draws (None: random); `num_tasks` is the size
     of the one-hot that `use_one_hot=True` appends, by default the number of classes. Options: `vector_strategy`,
@@ -126,9 +126,9 @@ def make_custom(
 ) -> VectorEnv:
     """Make the environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
 
-    Classes in `envs_list` show their goals. Classes in `train_envs` and `test_envs` hide their goals: the environments
-    are of `train_envs`, or of `test_envs` with `split="test"`. `num_envs` is ignored, as in Meta-World. Options are
-    those of `make_mt_envs` or `make_ml_envs`.
+    Classes in `envs_list` show their goals. Classes in `train_envs` and `test_envs` hide their goals; the environments
+    are made from `train_envs`, or from `test_envs` if `split="test"`. `num_envs` is ignored, as in Meta-World. Options
+    are those of `make_mt_envs` or `make_ml_envs`.
     """
     if envs_list is not None:
         return _multi_task(CustomMT(envs_list, seed), seed, **options)
@@ -199,8 +199,8 @@ def make_env(
 
     `seed` determines starts and task draws (None: random); `use_one_hot` appends the one-hot of `env_id` among
     `num_tasks`. `recurrent_info_in_obs` appends the last action, the last reward (divided by 10 if normalised) and
-    whether the episode ended. With `task_select`, `"random"` draws a task at each reset, and `"pseudorandom"` takes the
-    tasks in turn when `sample_tasks()` is called. Other options are those of `SuiteEnv`.
+    whether the episode ended. With `task_select="random"` a task is drawn at each reset. With `"pseudorandom"` each
+    call of `sample_tasks()` takes the next task of a shuffled list. Other options are those of `SuiteEnv`.
     """
     wrappers = mended().wrappers  # the package's other names do not need these wrappers
     single = recipe.make_class()(**options)

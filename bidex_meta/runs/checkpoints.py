@@ -96,7 +96,7 @@ class Checkpoints:
 
     @checked_arguments
     def save_best(self, policy: State, step: int, results: dict[str, float]) -> None:
-        """Write ``best.pt``: only a policy (entry ``learner.policy`` of a checkpoint) and its results."""
+        """Write ``best.pt``, which holds only a policy (entry ``learner.policy`` of a checkpoint) and its results."""
         self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": results})
 
     def found_of_best(self) -> dict[str, float] | None:

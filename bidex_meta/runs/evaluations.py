@@ -54,7 +54,7 @@ class Aggregate:
 
 
 class ClassSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The results of one class without its single episodes."""
+    """The results of one class without the individual episodes."""
 
     success: Finite
     success_interval: Interval | None = None
@@ -115,7 +115,10 @@ class SplitSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Conditions that an evaluation's numbers depend on; None means that an entry is not recorded, or the default."""
+    """Conditions that an evaluation's numbers depend on.
+
+    An entry that is None was not recorded, or had its default value.
+    """
 
     device: Text | None = None
     engine: Engine | None = None

@@ -1,4 +1,4 @@
-"""Metrics of a run over environment steps: one line of JSON per report, and one point of a logger per value."""
+"""Metrics of a run over environment steps: a report is a line of JSON, and a logger receives each of its values."""
 
 import json
 import math
@@ -37,7 +37,7 @@ class MetricsWriter:
 
     @checked_arguments
     def log(self, metrics: Mapping[str, Any], step: Whole) -> None:
-        """Write one line, with null for values that are not finite, and one point of the logger per value."""
+        """Write one line, with null for values that are not finite, and pass each value to the logger."""
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")

@@ -51,7 +51,7 @@ class _Content(TypedDict):
 class StoredRun:
     """A run of a study's file, created by :func:`read_study`; methods are those of :class:`RunFolder`."""
 
-    path: Path  # ``FILE:RUN``, which names it in messages and on the command line.
+    path: Path  # ``FILE:RUN``, which names the run in messages and on the command line.
     content: Json
 
     @property
@@ -71,7 +71,7 @@ class StoredRun:
 
     @property
     def videos_path(self) -> Path:
-        """Return a folder that does not exist."""
+        """Return a folder that does not exist, because studies contain no films."""
         return self.path / "videos"
 
     @property

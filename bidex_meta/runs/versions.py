@@ -18,7 +18,7 @@ _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymna
 
 @dataclass(frozen=True)
 class GitState:
-    """The commit of the source; ``dirty`` if files differed from it."""
+    """The commit of the source; ``dirty`` is True if files differed from it."""
 
     commit: Text | None = None
     dirty: bool = False
@@ -76,8 +76,8 @@ def package_versions() -> dict[str, str | None]:
 def git_state(folder: Path) -> Json | None:
     """Return the commit and whether files changed since; None if ``folder`` is not tracked by git.
 
-    An installed package inside somebody's project lies in *their* repository without being tracked: that commit
-    would not describe this package, so the function checks that the folder's files are tracked.
+    If this package is installed inside somebody's project, it lies in that project's repository without being tracked.
+    The project's commit would not describe this package, so the function checks that the folder's files are tracked.
     """
     if not _git(folder, "ls-files", "."):
         return None

@@ -20,7 +20,7 @@ class Launch:
     """Rank of this process and number of processes of the run, from torchrun's environment variables."""
 
     rank: int = 0  # only process 0 writes and prints
-    count: int = 1  # on all machines
+    count: int = 1  # number of processes on all machines
     local_rank: int = 0  # rank among the processes of the same machine
     local_count: int = 1  # number of processes on the same machine
 
@@ -48,7 +48,7 @@ BATCH_SIGNALS = tuple(signal.Signals[name] for name in ("SIGUSR1", "SIGUSR2") if
 
 
 def notices() -> tuple[signal.Signals, ...]:
-    """Return the signals other than SIGINT and SIGTERM that ask a process to end; signals that it ignores are left out.
+    """Return the signals other than SIGINT and SIGTERM that ask a process to end; ignored signals are left out.
 
     SIGHUP comes when the terminal closes (``nohup`` ignores it). The others are ``BATCH_SIGNALS``. Each signal may come
     several times: from the terminal and its shell, or from the batch system and the job that it runs.

@@ -20,7 +20,7 @@ JsonObject = dict[str, Any]
 MOST_TEXT = 64_000_000
 """Maximum size of a JSON or TOML file, bytes; far above the largest file of an evaluation."""
 _DATA_SETS = ("dataset", "demonstrations", "drawn_from")
-"""Entries that name data sets."""
+"""Names of entries whose values are names or paths of data sets."""
 _DEEPEST = 64
 _LARGEST = 2**63 - 1
 """Largest whole number in a file: our counts, steps and seeds are smaller, and Python is slow for thousands of

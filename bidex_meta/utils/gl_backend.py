@@ -35,13 +35,16 @@ def set_aside_what_is_missing() -> None:
 
 
 def has_screen() -> bool:
-    """Return whether windows can be opened here, as far as the environment shows."""
+    """Return whether windows can be opened here, as far as the environment variables show."""
     return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 @cache
 def prepare() -> None:
-    """Ensure that ``mujoco.Renderer`` works; raises BidexError if the backend in ``MUJOCO_GL``, or every one, fails."""
+    """Ensure that ``mujoco.Renderer`` works.
+
+    Raises BidexError if the backend in ``MUJOCO_GL`` fails, or, if the variable is not set, if every backend fails.
+    """
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "

@@ -82,8 +82,8 @@ def _cpu_quotas() -> Iterator[float]:
 def _groups(controller: str) -> Iterator[Path]:
     """Yield the folders of this process's control groups of a controller, and of their parent groups.
 
-    Inside a container the path of a group may be that on the host. Only the path's last group then exists, as the root
-    folder.
+    Inside a container, the path of a group may be its path on the host. Then only the last group of the path exists, as
+    the root folder.
     """
     root = _ROOT / "sys" / "fs" / "cgroup"
     for line in _text(_ROOT / "proc" / "self" / "cgroup").splitlines():

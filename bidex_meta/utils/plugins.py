@@ -11,7 +11,7 @@ from types import ModuleType
 from bidex_meta.errors import BidexError
 
 _files: dict[str, str] = {}
-"""Files of the imported users' classes, each with the flag and the name that the user gave, for messages."""
+"""Files from which users' classes were imported, each with the flag and the name that the user gave, for messages."""
 
 
 def is_outside(name: object) -> bool:

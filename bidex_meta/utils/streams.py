@@ -14,7 +14,8 @@ _WIDTHS = (40, 1000)  # range of columns in which tables and help texts can be l
 def open_missing() -> None:
     """Open the null device for each standard stream that this process was started without (``2>&-``).
 
-    Otherwise the next opened file would get its number, and a library's messages would be written into a checkpoint.
+    Otherwise the next opened file would get the stream's number, and a library's messages would be written into a
+    checkpoint.
     """
     for number in range(3):
         try:
