@@ -44,8 +44,8 @@ class Learner(Contract):
 
     With several processes each process has its own world, samples and ``generator``, and all have the same networks:
     statistics, gradients and ``env_steps`` cover all processes. Raises BidexError if the world is not in the mode
-    :meth:`autoreset_mode`, if it has discounts per class and the learner has a single discount, or if an option needs
-    the task's one-hot and the world does not show it.
+    that :meth:`autoreset_mode` returns, if the world has discounts per class and the learner has a single discount, or
+    if an option needs the task's one-hot and the world does not show it.
     """
 
     remedy: ClassVar[str]  # advice printed when a loss is no longer finite
@@ -97,7 +97,7 @@ class Learner(Contract):
         """Return everything that a checkpoint holds besides the policy, by name."""
 
     def _place(self) -> State:
-        """Return the attributes named in ``going_on``, and other plain values, for the checkpoint."""
+        """Return the attributes named in ``going_on`` for the checkpoint; subclasses may add other plain values."""
         return {name: vars(self)[name] for name in self.going_on}
 
     def _go_on_from(self, state: State) -> None:

@@ -56,7 +56,7 @@ def against(
     Returns:
         ``old`` and ``new`` (git commit, and whether files differ from it), the settings, and ``table`` with a row for
         the suite and for each class. A row has ``old`` and ``new`` (env-steps/s); ``ratio`` (median over pairs of
-        repeats; this code is faster if it is above 1); ``least`` and ``most`` (smallest and largest ratio of a pair);
+        repeats; above 1 if this code is faster); ``least`` and ``most`` (smallest and largest ratio of a pair);
         ``cpu`` (ratio of CPU seconds, which other work on the machine affects less); and ``old physics`` and ``new
         physics`` ("time step × substeps" of the engine batches).
 

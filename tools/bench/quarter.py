@@ -24,7 +24,7 @@ TRAININGS = {
 because they store whole trials."""
 _TAGS = ("Train/success_rate", "Train/success_first_episode", "Train/success_last_episode", "Train/mean_return")
 _LEAST = 20.0
-"""Minimum number of seconds left for which a step is still begun."""
+"""Seconds that must be left to begin a step; for a step with a shorter time limit, its limit must be left."""
 _STARTING = 60.0
 """Seconds that a training may take to start and to save, in addition to its training time."""
 _SAVING = 30.0

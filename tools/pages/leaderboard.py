@@ -95,7 +95,7 @@ def _percent(tables: Sequence) -> str:
 
 
 def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
-    """Return a row for each pair of entries; it claims a better one if the probability's interval excludes 1/2."""
+    """Return a row for each pair of entries; its claim names the better one if the interval excludes 1/2."""
     rows = []
     for first, second in combinations(ranked, 2):
         found = board.improvement(first.result, second.result)

@@ -36,7 +36,7 @@ class PlannerConfig:
     kept_elites: int = 8  # Number of elites that are tried again in the next round, and become parents of mutants.
     mutants: float = 0.5
     """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
-    mutated: float = 0.15  # Probability with which a mutant changes each action; see ``mutants``.
+    mutated: float = 0.15  # Probability that a mutant changes an action, unless it changes one part of the hands.
     horizon: int = 41  # Number of control steps that a plan looks ahead.
     knots: int = 9  # Number of knots of a plan; actions between knots are interpolated linearly.
     execute: int = 10

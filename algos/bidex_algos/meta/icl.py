@@ -286,7 +286,7 @@ class ICL(TrialLearner):
 
 
 class _Pupil:
-    """Plays a trial: the teachers act in some environments, the policy in the others; all steps are labelled.
+    """Plays a trial: teachers act in some environments, the policy acts in the others, and all steps are labelled.
 
     In a share ``still_share`` of the episodes the policy does not explore, as in an evaluation.
     """

@@ -102,7 +102,7 @@ PRESETS: dict[str, RL2Config] = {
         num_minibatches=16,  # with v2's 4 a trial of 3 million steps would have 12 Adam steps
         epochs=5,  # 80 Adam steps per trial, 7 times v2's: there are fewer trials in a budget, and the KL bounds each
         learning_rate=1e-3,  # 3e-4 times the root of the ratio of batches would be 2.4e-3; the KL adapts the rest
-        value_horizon=10.0,  # ten iterations suffice, because each has 256 times the returns of v2's
+        value_horizon=10.0,  # ten iterations suffice: each has 256 times the returns of an iteration of v2
     ),
 }  # fmt: skip
 

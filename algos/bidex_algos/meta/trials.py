@@ -188,9 +188,9 @@ def play(
 
 @dataclass
 class Batch:
-    """A trial of N environments, prepared for the update: T slots (a multiple of the chunk size C) of each environment.
+    """A trial of N environments, prepared for the update.
 
-    S chunks hold at least one step.
+    Each environment has T slots, which are divided into chunks of C slots. S chunks hold at least one step.
     """
 
     obs: Tensor  # raw observations (T, N, d)

@@ -100,7 +100,7 @@ LiftUnderarm; B.2.1 and B.2.4 describe the clipped value."""
 PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
-"""PAPER with the values of both tables that only apply to PPO."""
+"""PAPER and, in addition, the values of both tables that only apply to PPO."""
 
 LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # values that differ in both tables' column for LiftUnderarm
 

@@ -106,9 +106,9 @@ class ReturnScale:
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; target networks estimate the value of the next state.
 
-    With several processes each has a replay and draws ``batch_per_task`` transitions of each task, ordered by task
-    (``task_of_draw``). ``gamma_of_rows`` are the discounts of the environments, ``gamma_of_draw`` those of a draw's
-    transitions.
+    Each process has its own replay and draws ``batch_per_task`` transitions of each task, ordered by task
+    (``task_of_draw``). ``gamma_of_rows`` holds the discounts of the environments, and ``gamma_of_draw`` holds the
+    discounts of a draw's transitions.
     """
 
     config: OffPolicyConfig

@@ -66,10 +66,11 @@ class FloatRMSNorm(nn.RMSNorm):
 
 
 class UnitMLP(MLP):
-    """Batch norm, a layer, inverted blocks, RMS norm, output; replaces :class:`MLP` and takes its arguments.
+    """A batch norm, a linear layer, inverted blocks, an RMS norm and an output layer, one after another.
 
-    ``hidden`` lists one width several times: once for the first layer and once for each block. ``output_gain`` and
-    ``layer_norm`` have no effect. Batch norms use running statistics except within :func:`by_batch`.
+    The class replaces :class:`MLP` and takes its arguments. ``hidden`` lists one width several times: once for the
+    first layer and once for each block. ``output_gain`` and ``layer_norm`` have no effect. Batch norms use running
+    statistics except within :func:`by_batch`.
     """
 
     def __init__(
