@@ -51,10 +51,10 @@ def stability(
         engine: As in ``Benchmark.make_world``.
 
     Returns:
-        By class: number of unstable environment steps, warnings, speed of the fastest object (m/s), shares of sampled states
-        without a contact deeper than 5 and 15 mm, the 99.9 % quantile of depth (m), the share of states of the witness
-        without a contact deeper than 5 mm (None if there is no witness or the base is fixed), and whether all limits
-        hold.
+        By class: number of unstable environment steps, warnings, speed of the fastest object (m/s), shares of sampled
+        states without a contact deeper than 5 and 15 mm, the 99.9 % quantile of depth (m), the share of states of the
+        witness without a contact deeper than 5 mm (None if there is no witness or the base is fixed), and whether all
+        limits hold.
     """
     result = {}
     for name, moving in variants(suite, task):
