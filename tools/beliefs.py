@@ -22,8 +22,8 @@ from bidex_meta.suite import OTHERS
 from bidex_meta.world.contract import PrivilegedWorld
 from bidex_meta.worlds import open_worlds
 
-# For beliefs by known reward formulas: the number of candidate goals, whose rewards are computed in each step, and the
-# standard deviation of a reward, because the true goal lies between candidates.
+# These values are for beliefs from known reward formulas: the number of candidate goals, whose rewards are computed in
+# each step, and the standard deviation of a reward, which is not 0 because the true goal lies between candidates.
 _CANDIDATES = 128
 _EXACT = 0.02
 
@@ -31,7 +31,7 @@ _EXACT = 0.02
 def beliefs(
     run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
 ) -> None:
-    """Measure success per class of the actor of an icl run when it knows more about the goal, and of its teachers.
+    """Measure success per class of an icl run's actor with better beliefs about the goal, and of the run's teachers.
 
     The actor acts with a belief that knows the reward formulas, and with a belief that knows the goal.
 

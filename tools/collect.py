@@ -36,7 +36,7 @@ _TAG = re.compile(
 )
 _TRAINED = "Train/return/"
 _OF_A_RUN = ("task", "algo", "seed", "learner")
-"""Entries of a config in which a run of the same name must not differ."""
+"""Config entries that must be equal if a run replaces a stored run of the same name."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """Measures of a class that are stored for each shot; the evaluation after the last shot also has counts and lengths."""
 
@@ -103,7 +103,7 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> Jso
 
 
 def arm_of(path: Path, config: Json) -> str:
-    """Return the name of a run's folder without suite and seed; if only a date is left, return the learner's name."""
+    """Return the name of a run's folder without suite and seed, or the learner's name if only a date is left."""
     subject = Path(str(config["suite"] or short_name(config["task"]))).stem
     name = re.sub(r"[-_ ]*(s|seed)[-_]?\d+$", "", path.resolve().name, flags=re.IGNORECASE)
     if name.casefold().startswith(subject.casefold()):
@@ -132,7 +132,7 @@ def _parameters(folder: RunFolder) -> int | None:
 
 
 def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> None:
-    """Raise BidexError for a run whose results nobody could trust or reproduce."""
+    """Raise BidexError if a run's results cannot be trusted or reproduced."""
     if not rows:
         raise BidexError(f"{folder.metrics_path} is empty: the run has not trained. Name another run.")
     steps = rows[-1]["step"]
@@ -172,7 +172,7 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> No
 
 
 def _suite(name: str | None) -> Json | None:
-    """Return name and version of a suite; also the whole file if the suite is not a shipped one."""
+    """Return name and version of a suite, and the content of its file if the suite is not a shipped one."""
     if name is None:
         return None
     if not name.endswith(".toml"):
@@ -182,7 +182,7 @@ def _suite(name: str | None) -> Json | None:
 
 
 def _engine(config: Json) -> str:
-    """Return the engine that stepped the run; the device decides ``auto``, as in ``bidex_meta.engine.choice``."""
+    """Return the engine that stepped the run's world; ``auto`` depends on the device (``bidex_meta.engine.choice``)."""
     engine = config.get("engine", "auto")
     if engine != "auto":
         return engine

@@ -1,4 +1,4 @@
-"""``python -m tools.experts RUN...``: find the best policy that solves each class; its score is defined as 100."""
+"""``python -m tools.experts RUN...``: find the best policy that solves each class; the score of this policy is 100."""
 
 from collections.abc import Collection, Sequence
 from itertools import chain
@@ -15,7 +15,7 @@ from bidex_meta.runs.versions import collect_versions
 from bidex_meta.worlds import open_worlds
 
 _SOLVES = 0.5
-"""Least success over all tasks of a class with which a policy counts as an expert."""
+"""Smallest success over all tasks of a class for which a policy counts as an expert."""
 
 
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:

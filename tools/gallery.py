@@ -158,9 +158,9 @@ def _mask(task: TaskClass) -> str:
 def masked(task: TaskClass) -> tuple[list[str], list[str]]:
     """Return the components of a variation that only goal entries of the observation show.
 
-    The first list has those that affect the reward, the second those that only affect success. For each component, the
-    parts of a task that it changes are replaced by NaN: every value that becomes NaN depends on the component. The
-    place of a fixture is not returned, because other entries show that place.
+    The first list has the components that affect the reward, the second has the components that only affect success.
+    For each component, the parts of a task that it changes are replaced by NaN: every value that becomes NaN depends on
+    the component. The position of a fixture is not returned, because other entries show it.
     """
     scene, space = compile_scene(task), task.variation_space
     data = mujoco.MjData(scene.model)

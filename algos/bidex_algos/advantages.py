@@ -15,7 +15,7 @@ def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tens
 
 
 def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
-    """Return V (T, N) of the state that each transition led to, in a world that resets within the step.
+    """Return V (T, N) of the state that each transition led to, for worlds that reset within the step.
 
     ``last_values`` (N,) are the values of the states after the last step; ``final_values`` (T, N) are the values of the
     states in which episodes ``ended``.

@@ -13,7 +13,7 @@ from bidex_meta.training.distributed import all_sum, world_size
 from bidex_meta.training.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
-_CAGRAD_RADIUS = 0.4  # largest distance of cagrad's direction from the mean gradient, in lengths of that gradient
+_CAGRAD_RADIUS = 0.4  # largest distance of cagrad's direction from the mean gradient, relative to its length
 _FAMO_RATE = 0.025  # Adam's step size for famo's weights
 _FAMO_DECAY = 0.01  # Adam's weight decay, which draws famo's weights back to equal ones
 
@@ -25,7 +25,7 @@ class Balance(ABC):
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Write the gradient into the parameters, which have no gradient yet, and keep the graph.
+        """Write the gradient into the parameters, which have no gradient yet, and keep the losses' graph.
 
         ``losses`` (num_tasks,) is this process's part of each task's loss. ``least`` (num_tasks,) is this process's
         part of the smallest value that each loss can reach. Returns a number to be logged. It is already divided by the
@@ -44,7 +44,7 @@ class Balance(ABC):
 
 
 def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-    """Return gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the graph is kept."""
+    """Return gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the losses' graph is kept."""
     one_each = torch.eye(len(losses), dtype=losses.dtype, device=losses.device)
     gradients = torch.autograd.grad(losses, parameters, one_each, retain_graph=True, is_grads_batched=True)
     return torch.cat([g.flatten(1) for g in gradients], dim=1)
@@ -72,7 +72,7 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Turn the sum of all gradients towards the tasks whose losses it would lower least (CAGrad, Liu et al. 2021).
+    """Turn the summed gradient towards tasks whose losses a step along it lowers least (CAGrad, Liu et al. 2021).
 
     Let g_0 be the mean of the gradients. The result is the number of tasks times the vector d that maximises
     min_i <g_i, d> within a distance of ``radius`` |g_0| from g_0. The dual problem (equation 4 of the paper) minimises
@@ -102,8 +102,8 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     float64. ``even`` holds the weights e of the mean (n,), from which the method starts.
 
     This is an interior-point method. A logarithmic barrier with factor mu keeps the weights positive, and mu is halved
-    at each step. The same mu smooths the square root near w'G w = 0. Each step is a Newton step whose length is the
-    best of several. No number is read on the host, so the host never waits for a GPU.
+    at each step. The same mu smooths the square root near w'G w = 0. Each step is a Newton step that tries several
+    lengths and takes the best one. No number is read on the host, so the host never waits for a GPU.
     """
     weights = even
     mean = gram @ even

@@ -1,4 +1,4 @@
-"""The data set of a student: the newest observations of each environment, with the teachers' actions as labels.
+"""The data set from which a student learns: the newest observations of each environment, labelled by teachers.
 
 The data set is a ring buffer of vector steps on the device, in half precision; a vector step is one step of all
 environments. 1.5 M observations of MT20-v2 with their labels take 1.6 GB.
@@ -31,7 +31,7 @@ class Labelled:
 
     @property
     def filled(self) -> int:
-        """Return the number of vector steps that can be drawn from."""
+        """Return the number of stored vector steps."""
         return min(self.added, self.steps)
 
     def add(self, obs: Tensor, labels: Tensor) -> None:

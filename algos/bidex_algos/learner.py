@@ -43,14 +43,14 @@ class Learner(Contract):
     """Base of all learners of this package; ``policy`` acts in training, and ``agent`` acts in evaluations.
 
     With several processes each process has its own world, samples and ``generator``, and all have the same networks:
-    statistics, gradients and ``env_steps`` cover all processes. Raises BidexError for a world in another autoreset
-    mode, for a world with discounts per class if the learner has a single discount, or for a world without the task's
-    one-hot if an option needs it.
+    statistics, gradients and ``env_steps`` cover all processes. Raises BidexError if the world is not in the mode
+    that :meth:`autoreset_mode` returns, if the world has discounts per class and the learner has a single discount, or
+    if an option needs the task's one-hot and the world does not show it.
     """
 
     remedy: ClassVar[str]  # advice printed when a loss is no longer finite
-    config_type: ClassVar[type[LearnerConfig]]  # class of its config, a dataclass
-    unit_embeddings: ClassVar[bool] = False  # True if the vectors of ``task_embedding`` have length 1
+    config_type: ClassVar[type[LearnerConfig]]  # class of the learner's config, a dataclass
+    unit_embeddings: ClassVar[bool] = False  # True if the vectors of ``task_embedding`` have unit norm
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration continues; a checkpoint contains them."""
     policy_of: ClassVar[Callable[..., nn.Module]]
@@ -97,7 +97,7 @@ class Learner(Contract):
         """Return everything that a checkpoint holds besides the policy, by name."""
 
     def _place(self) -> State:
-        """Return the attributes named in ``going_on``, and other plain values, for the checkpoint."""
+        """Return the attributes named in ``going_on`` for the checkpoint; subclasses may add other plain values."""
         return {name: vars(self)[name] for name in self.going_on}
 
     def _go_on_from(self, state: State) -> None:
@@ -254,7 +254,7 @@ def _restore(part: Any, state: Any) -> None:
 
 
 def _network(weights: State) -> State:
-    """Drop the learned sizes of inner steps, because the acting network does not use them."""
+    """Leave out the learned sizes of inner steps, because a policy does not use them when it acts."""
     return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
 
 

@@ -28,7 +28,7 @@ class Transitions:
     rewards: Tensor  # rewards (B,)
     next_obs: Tensor  # observations after the step, in the same episode (B, d); not used if terminated
     terminated: Tensor  # whether the step ended the episode, bool (B,); a time limit does not count
-    steps: Tensor | int = 1  # number of steps from obs to next_obs, an int or (B,); rewards is their discounted sum
+    steps: Tensor | int = 1  # number of steps from obs to next_obs, an int or (B,); rewards holds their discounted sum
 
 
 class Replay:
@@ -75,7 +75,7 @@ class Replay:
 
     @property
     def filled(self) -> int:
-        """Return the number of vector steps that can be drawn from."""
+        """Return the number of stored vector steps from which :meth:`draw` chooses."""
         return min(self.added, self.steps)
 
     @property

@@ -30,7 +30,7 @@ KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _MEASUR
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure and print; ``--json`` may stand anywhere. An error is one line and ends the process."""
+    """Measure and print; ``--json`` may stand at any position. An error is printed as one line and ends the process."""
     flags = [word for word in arguments if word != "--json"]
     try:
         result = tyro.extras.subcommand_cli_from_dict(KINDS, args=flags, prog="python -m tools.bench")

@@ -1,8 +1,7 @@
 """Compare the speed of this code's worlds with another commit's, side by side in one run.
 
-Speeds on a shared machine drift by more than a change gains, so numbers of two runs say little. Here each side has a
-process with the same world. The processes take turns, one repeat each, and the result is the ratio of a pair of
-repeats.
+Speeds on a shared machine drift by more than a change gains, so speeds from two separate runs say little. Here each
+commit has a process with the same world. The processes alternate, one repeat each. Each pair of repeats gives a ratio.
 """
 
 import contextlib
@@ -45,23 +44,24 @@ def against(
 
     Args:
         other: A commit of the git checkout that this code runs from, or a folder with a checkout.
-        suite: A suite that both sides know, each by its own file.
+        suite: A suite that exists in both checkouts; each side uses its own definition.
         num_envs: Number of environments of the suite's world; the world of a single class has a quarter of them.
         steps: Number of control steps of each repeat. One more repeat comes first, to warm up.
         repeats: Number of pairs of repeats; medians are reported.
         classes: Also measure each class of the suite on its own, as it is in the suite.
-        threads: Engine threads; None takes all CPUs.
+        threads: Engine threads; None: one per CPU.
         seed: Seed of worlds and actions.
         out: JSON file to write the result to; None: only print it.
 
     Returns:
-        ``old`` and ``new`` (git commit, and whether anything was changed since), the settings, and ``table``: for the
-        suite and each class ``old`` and ``new`` (env-steps/s), their ``ratio`` (above 1: this code is faster), the
-        ``least`` and ``most`` of the pairs, the ratio of ``cpu`` seconds per step, which depends less on other work on
-        the machine, and each side's ``physics``, "time step × substeps" of its engine batches.
+        ``old`` and ``new`` (git commit, and whether files differ from it), the settings, and ``table`` with a row for
+        the suite and for each class. A row has ``old`` and ``new`` (env-steps/s); ``ratio`` (median over pairs of
+        repeats; above 1 if this code is faster); ``least`` and ``most`` (smallest and largest ratio of a pair);
+        ``cpu`` (ratio of CPU seconds, which other work on the machine affects less); and ``old physics`` and ``new
+        physics`` ("time step × substeps" of the engine batches).
 
     Raises:
-        BidexError: Either side's code refuses something.
+        BidexError: A worker reports an error.
         CalledProcessError: git does not know the commit.
     """
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or usable_cores(), "steps": steps}
@@ -138,7 +138,7 @@ def _told(batches: list[tuple[float, int]]) -> str:
 
 
 class _Worker:
-    """A process that steps the worlds of one checkout and is called over pipes; the process ends with the block."""
+    """A process that steps the worlds of one checkout and is called over pipes; it ends with the ``with`` block."""
 
     def __init__(self, checkout: Path) -> None:
         self._checkout = checkout

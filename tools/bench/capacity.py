@@ -23,7 +23,7 @@ def capacity(
     threads: int | None = None,
     seed: int = 0,
 ) -> Json:
-    """Count the contacts and constraint rows of a simulation under the rough actions of ``stability``.
+    """Count the contacts and constraint rows of each class under the rough actions of ``stability``.
 
     C MuJoCo counts contacts and constraint rows after every step of every environment. mujoco_warp counts candidate
     pairs of the broadphase and pairs of the convex collider in a sample of 32 environments per step.
@@ -33,11 +33,11 @@ def capacity(
         task: Measure this class; with neither suite nor task every class is measured.
         steps: Number of environment steps per class.
         num_envs: Number of environments.
-        threads: Engine threads; None takes all CPUs.
+        threads: Engine threads; None: one per CPU.
         seed: Seed of world and actions.
 
     Returns:
-        By class: quantiles of contacts, constraint rows, candidate pairs and convex pairs of a simulation.
+        Quantiles over environments and steps, by class: contacts, constraint rows, candidate pairs and convex pairs.
     """
     result = {}
     for name, moving in variants(suite, task):

@@ -32,12 +32,12 @@ def cones(
 
     Args:
         suite: Measure the classes of this suite.
-        task: Measure this class instead.
-        steps: Control steps.
-        every: Control steps from one measurement to the next.
-        num_envs: Environments.
-        tolerance: Smallest change that counts, relative to the larger of the two parts (Frobenius norm).
-        threads: Engine threads; None takes all CPUs.
+        task: Measure this class instead of a suite.
+        steps: Number of control steps.
+        every: Number of control steps from one measurement to the next.
+        num_envs: Number of environments.
+        tolerance: Smallest change of a part that counts, relative to the larger of old and new part (Frobenius norm).
+        threads: Engine threads; None: one per CPU.
         seed: Seed of world and actions.
 
     Returns:
@@ -65,7 +65,7 @@ class _Counts:
         self._sums: Counter[str] = Counter()
 
     def watch(self) -> None:
-        """Play a control step, and count in each iteration of its solver."""
+        """Play a control step, and add each iteration of its solver to the counts."""
         from mujoco_warp._src import solver
 
         plain = solver._solver_iteration
@@ -106,9 +106,12 @@ class _Counts:
 
         ``active`` (not satisfied), ``cone`` (in the cone zone), ``zone changes`` and ``part changes`` are shares of
         contacts. ``row changes`` is the share of all constraint rows that enter or leave the quadratic zone. ``work of
-        cones`` is the share of the Hessian's added products that contacts in the cone zone cause. ``still`` is the
-        share of a world's iterations without a contact in the cone zone and without a change. All shares count only
-        worlds that still iterate. ``iterations`` are those of a world in a substep, ``loops`` of the slowest world.
+        cones`` is the share of the products added to the Hessian that come from contacts in the cone zone. ``still`` is
+        the share of a world's iterations without a contact in the cone zone and without a change. All shares count
+        only worlds that have not converged.
+
+        Three entries are means instead. ``contacts`` is per world and iteration. ``iterations`` counts a world's
+        iterations per substep; ``loops`` counts those of the slowest world.
         """
         sums = self._sums
 
@@ -179,7 +182,7 @@ class _Contacts:
 
 
 def _parts(zone: np.ndarray, weight: np.ndarray, x: np.ndarray, z: np.ndarray, mu: np.ndarray) -> np.ndarray:
-    """Return the second derivatives of the contacts' costs by their residuals, shape (k, 6, 6)."""
+    """Return the second derivatives of k contacts' costs with respect to their residuals, (k, 6, 6)."""
     part = np.zeros((len(zone), 6, 6))
     quadratic = zone == _QUADRATIC
     part[quadratic] = weight[quadratic, :, None] * np.eye(6)

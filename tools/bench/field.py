@@ -40,10 +40,11 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
         seed: Seed of environments and actions.
 
     Returns:
-        ``cpus`` that the process may use, what was ``skipped`` and how to install it, and ``table``: rows, actions, a
-        model's degrees of freedom (least-most over the classes), seconds of physics in a step, ``env_steps_per_s``, the
-        same per CPU second (which depends less on other work on the core), seconds of physics simulated in a second,
-        and the ratio of env-steps/s to Meta-World's own vector environment.
+        ``cpus`` (number that the process may use), ``skipped`` (libraries that are missing and how to install them) and
+        ``table``. A row has the number of environments (``rows``), the number of actions, the smallest and largest
+        number of degrees of freedom of a model, simulated seconds per step, ``env_steps_per_s``, environment steps per
+        CPU second (which other work on the core affects less), simulated seconds per second, and ``ratio``: the speed
+        relative to Meta-World's own vector environment.
     """
     rng = np.random.default_rng(seed)
     skipped = {}
@@ -63,9 +64,9 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
 
 
 Entry = tuple[str, VectorEnv, float, list[int]]
-"""Name, environment, seconds of physics in a step, degrees of freedom of its models."""
+"""Name, environment, simulated seconds per step, and degrees of freedom of each model of the environment."""
 Speed = tuple[float, float]
-"""Environment steps per second of the clock, and of the process's CPU time."""
+"""Environment steps per second of wall time, and per second of the process's CPU time."""
 
 
 def _metaworld(seed: int) -> Iterator[Entry]:
@@ -94,9 +95,9 @@ def _robot_hands(skipped: dict[str, str]) -> Iterator[Entry]:
 def _mend(utils: Any) -> None:
     """Patch gymnasium-robotics 1.4.2 to run on MuJoCo 3.12 and later.
 
-    gymnasium-robotics tests if a joint's type, a NumPy number, is in a tuple of MuJoCo's names of joint types. Since
-    MuJoCo 3.12 these names no longer equal NumPy numbers, so that no hand could be made. The patch replaces the names
-    by plain numbers in the library's module.
+    gymnasium-robotics tests if a joint's type, a NumPy number, is in a tuple of members of MuJoCo's enum of types.
+    Since MuJoCo 3.12 these members no longer equal NumPy numbers, so no hand can be made. The patch replaces the
+    members by plain numbers in the library's module.
     """
     mujoco = utils.mujoco
     plain = SimpleNamespace(**{name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()})

@@ -19,8 +19,8 @@ _SIZES = (1024, 8192, 32768, 131072)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
 """Classes with a thrown egg, a jointed object and a movable fixture."""
 RECORDED = 32
-"""Number of steps after which a world on CUDA replays all of its work: starts are drawn at every eighth step, and the
-first draws are not replayed."""
+"""Number of steps after which a world on CUDA replays all of its work as CUDA graphs: initial states are drawn at every
+eighth step, and work is recorded only after its first runs."""
 
 
 def gpu(
@@ -36,24 +36,25 @@ def gpu(
     deterministic: bool = False,
     switches: str = "",
 ) -> Json:
-    """Measure the speed of a suite and of single classes over the number of environments.
+    """Measure the speed of a suite and of single classes for several numbers of environments.
 
     Args:
         suite: Suite to step.
         tasks: Classes to step on their own.
         sizes: Numbers of environments.
-        steps: Number of control steps of each measurement, after the same number (at least 32) to warm up.
+        steps: Number of control steps of each measurement. The same number of steps, at least 32, warms up before.
         device: Device of the worlds.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
         out: File to which each row is written as it is measured; rows that are in the file are not measured again.
-        learning: Measure training with MT-PPO too.
+        learning: Also measure training with MT-PPO.
         deterministic: As in ``Benchmark.make_world``.
         switches: As in ``Benchmark.make_world``.
 
     Returns:
-        By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step, of its physics, together and group by group, and of learning.
+        ``rows`` by suite or class and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device
+        memory) and ``stages``: milliseconds per step of the whole step, of the physics (of all groups together and of
+        each group) and of learning.
     """
     setting = {"device": device, "engine": engine, "steps": steps, "machine": machine_of(device)}
     physics = {"deterministic": deterministic, "switches": switches}
@@ -77,7 +78,7 @@ def machine_of(device: str) -> str:
 
 
 def known_rows(out: Path | None, setting: Json) -> Json:
-    """Return the rows that a file of results has already; raise BidexError if they were measured differently."""
+    """Return the rows of an earlier file of results; raise BidexError if they were measured with other settings."""
     if out is None or not out.exists():
         return {}
     stored = json.loads(out.read_text())
@@ -121,7 +122,7 @@ def training_speed(world: World, preset: str) -> int:
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
-    """Return the milliseconds of a step, its physics, the rest (``torch``), and each group with the others at rest.
+    """Return milliseconds of a step, of its physics, of the rest (``torch``), and of each group that runs by itself.
 
     ``launching`` is the host's part of the physics. ``overlap`` is 0 if groups run one after the other, and 1 if all
     groups together take no longer than the slowest group.
@@ -151,14 +152,14 @@ def random_steps(world: World, steps: int) -> float:
 
 
 def now(device: torch.device) -> float:
-    """Return the clock's seconds after the device has finished all its work."""
+    """Wait until the device has finished all its work, and return the time in seconds."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
-    """Return the mean milliseconds of a run of ``work`` until all is done, and until the host has launched it."""
+    """Return the mean milliseconds of a call of ``work``: until the device is done, and until the call returns."""
     start = now(made.device)
     for _ in range(steps):
         work()
@@ -167,7 +168,7 @@ def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[fl
 
 
 def _memory(device: str) -> int:
-    """Return the bytes in use: on a GPU those of all processes, else those of this process."""
+    """Return the bytes in use: on a GPU the bytes of all processes, otherwise the bytes of this process."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)
         torch.cuda.empty_cache()

@@ -20,25 +20,26 @@ def launches(
     threads: int | None = None,
     seed: int = 0,
 ) -> Json:
-    """List the kernels of a substep by the memory that they pass over, on Warp's CPU device from real states.
+    """List the kernels of a substep by the size of the arrays that they access, on Warp's CPU device from real states.
 
-    C MuJoCo plays the class as in ``cones``. The memory of a kernel is the size of its array arguments, whose first
-    dimension is the world: the room that is reserved, not what is in use. A world that has converged reads almost
-    nothing, so that kernels of Newton's iterations count once for each iteration of a world, not of the slowest one.
+    C MuJoCo plays the class as in ``cones``. The memory of a kernel is the size of its array arguments whose first
+    dimension is the world. It is the allocated size, of which only a part may be in use. A world that has converged
+    reads almost nothing. Kernels in Newton's iterations are therefore counted only for worlds that still iterate.
 
     Args:
-        task: Class.
-        num_envs: Environments.
-        steps: Control steps.
-        every: Control steps from one measurement to the next.
-        most: Kernels that are listed.
+        task: Class to play.
+        num_envs: Number of environments.
+        steps: Number of control steps.
+        every: Number of control steps from one measurement to the next.
+        most: Largest number of kernels in the table.
         switches: As in ``Benchmark.make_world``.
-        threads: Engine threads of C MuJoCo; None takes all CPUs.
+        threads: Engine threads of C MuJoCo; None: one per CPU.
         seed: Seed of world and actions.
 
     Returns:
-        Kernels per substep and kB per world and substep, and a row per kernel: ``launches`` of a substep, ``passes`` of
-        a world (less in Newton's iterations), kB that a world reads and writes in all its passes.
+        Number of kernels per substep, kB per world and substep, and a row per kernel: ``launches`` per substep,
+        ``passes`` (launches per world, which are fewer in Newton's iterations), and the kB that a world reads and
+        writes per substep.
     """
     probe = Probe(task, num_envs, seed, threads, switches=switches)
     watched = _Launches(num_envs)
@@ -52,7 +53,7 @@ def launches(
 
 
 class _Launches:
-    """Launches by kernel, with the bytes per world of their arguments."""
+    """Counts the launches of each kernel, and the bytes per world of their arguments."""
 
     def __init__(self, num_envs: int) -> None:
         self._num = num_envs
@@ -61,7 +62,10 @@ class _Launches:
 
     @contextmanager
     def counting(self):
-        """Count all launches in this context; within Newton's iterations by the share of worlds that still iterate."""
+        """Count all launches in this context; passes in Newton's iterations are weighted by the share of active worlds.
+
+        A world is active until its solver has converged.
+        """
         from mujoco_warp._src import solver
 
         from bidex_meta.engine import newton
@@ -102,7 +106,7 @@ class _Launches:
         row["written"] += self._share * self._bytes(outputs)
 
     def _bytes(self, arguments: Sequence) -> float:
-        """Return the bytes of a world in its arrays; arrays of the model, which all worlds share, do not count."""
+        """Return the bytes per world of the arrays; arrays of the model, which all worlds share, are not counted."""
         arrays = [each for each in arguments if isinstance(each, wp.array) and each.size]
         mine = [array for array in arrays if array.shape[0] and array.shape[0] % self._num == 0]
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in mine) / self._num
@@ -122,6 +126,6 @@ class _Launches:
 
 
 def _name(kernel: wp.Kernel) -> str:
-    """Return the function that holds a kernel, if the kernel has no name of its own, else the kernel's name."""
+    """Return the name of the function in which a kernel is defined, or the kernel's own name if there is none."""
     holder, _, own = kernel.func.__qualname__.replace(".<locals>", "").rpartition(".")
     return holder or own

@@ -23,14 +23,14 @@ def pictures(
     """Measure pictures per second, and steps per second with a picture of each environment.
 
     Args:
-        suites: Suites to draw. A goal that is shown costs a second picture.
-        edges: Edges of square pictures, pixels.
-        num_envs: Environments, all of which are drawn.
-        steps: Pictures of each environment, and control steps, after one of each.
-        device: Where the worlds live.
+        suites: Suites to draw. If a suite shows its goals, each environment is drawn twice.
+        edges: Edge lengths of the square pictures, pixels.
+        num_envs: Number of environments, all of which are drawn.
+        steps: Number of measured pictures per environment, and of measured control steps; one of each is a warm-up.
+        device: Device of the worlds.
         engine: As in ``Benchmark.make_world``; ``c`` draws with MuJoCo.
         seed: Seed of worlds and actions.
-        out: File that takes the results.
+        out: File to which each row is written as it is measured; rows that are in the file are not measured again.
 
     Returns:
         ``setting``, and ``rows`` by suite and edge.

@@ -23,13 +23,13 @@ _NOISE = 0.1
 
 
 class Probe:
-    """A class that is played by its script (with noise), or by rough actions if it has none; and a Warp engine."""
+    """A world of one class, played by the class's script (with noise) or by rough actions, and a Warp engine."""
 
     def __init__(
         self, name: str, num_envs: int, seed: int = 0, threads: int | None = None, moving: bool = True,
         switches: str = ""
     ) -> None:  # fmt: skip
-        """Make and reset both; ``switches`` are those of the Warp engine."""
+        """Make the world and the engine, and reset the world; ``switches`` apply to the Warp engine."""
         from bidex_meta.engine.warp import WarpEngine  # takes seconds to import
 
         self.world: World = make_task_world(
@@ -71,7 +71,7 @@ class Probe:
 def _actor(
     world: World, scripted: bool, seed: int
 ) -> tuple[Callable[[], torch.Tensor], Callable[[torch.Tensor], None]]:
-    """Return what gives the next actions, and what begins episodes of a mask."""
+    """Return a function that returns the next actions, and a function that begins episodes in the rows of a mask."""
     if scripted:
         script = Scripted(world, noise=_NOISE, seed=seed)
         return lambda: script.eval_action(torch.empty(0)), script.reset

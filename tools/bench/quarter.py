@@ -1,4 +1,4 @@
-"""Measure and train on a GPU within a quarter of an hour; a second start goes on where the first one stopped."""
+"""Measure and train on a GPU within a quarter of an hour; a second call continues where the first one stopped."""
 
 import json
 import os
@@ -20,23 +20,24 @@ TRAININGS = {
     "goal-shown": ("MT1-v2", "mtppo", "v2", 1.0),
     "blind": ("ML1-v2", "mtppo", "v2", 1.0),
 }
-"""Suite, learner, preset and share of the environments of each short training; a meta-learner keeps whole trials."""
+"""Suite, learner, preset and share of ``num_envs`` of each short training. Meta-learners use half of the environments,
+because they store whole trials."""
 _TAGS = ("Train/success_rate", "Train/success_first_episode", "Train/success_last_episode", "Train/mean_return")
 _LEAST = 20.0
-"""Seconds below which a step is not begun."""
+"""Seconds that must be left to begin a step; for a step with a shorter time limit, its limit must be left."""
 _STARTING = 60.0
-"""Seconds that a training may take to start and to save, beside its minutes."""
+"""Seconds that a training may take to start and to save, in addition to its training time."""
 _SAVING = 30.0
-"""Seconds between asking a step to end and ending it."""
+"""Seconds between asking a step's process to end and killing it."""
 
 
 @dataclass(frozen=True)
 class _Step:
     name: str
     words: list[str]
-    """Its command, without the interpreter."""
+    """Command of the step, without the interpreter."""
     limit: float
-    """Seconds after which it is ended."""
+    """Time limit of the step, seconds."""
 
 
 def quarter(
@@ -50,24 +51,26 @@ def quarter(
     minutes: float = 13.0,
     slack: float = 1.0,
 ) -> Json:
-    """Do what needs a GPU, in order: kernels, tests, switches, pictures, short trainings, a training for the rest.
+    """Measure and train what needs a GPU, in steps that fit into a given time.
 
-    Each step is a process with its own time limit. A step that fails or is cut does not stop the next one; another
-    start repeats it, continues trainings, and skips the steps that are done.
+    The steps are: compile kernels, run tests, measure switches and pictures, run short trainings, and use the remaining
+    time for a longer training. Each step is a process with its own time limit. The next step begins even if a step
+    fails or reaches its limit. Another call repeats such steps, continues their trainings, and skips completed steps.
 
     Args:
         out: Folder for ``quarter.json`` (all results), logs and run folders.
         device: Where everything runs; on ``cpu`` the worlds of the measurements use Warp's CPU device.
         suite: Multi-task suite whose world is measured and on which the last training trains.
         sizes: Numbers of environments of the measurements.
-        num_envs: Environments of trainings.
-        seconds: Training time of each short training.
-        rest: Training time of the last training, seconds; None: until ``minutes`` are up.
-        minutes: Time of this start.
+        num_envs: Number of environments of the trainings.
+        seconds: Training time of each short training, seconds.
+        rest: Training time of the last training, seconds; None: until ``minutes`` have passed.
+        minutes: Time limit of this call.
         slack: Factor of the steps' time limits, for a dry run on a busy machine.
 
     Returns:
-        ``steps`` (state and seconds by name), ``switches``, ``pictures``, ``training`` by name, and ``versions``.
+        ``steps`` (state, seconds and last line of output by name), results of ``switches``, ``pictures`` and
+        ``training`` (by name), and ``versions``.
     """
     out.mkdir(parents=True, exist_ok=True)
     end = time.monotonic() + 60.0 * minutes
@@ -96,7 +99,7 @@ def _steps(
     rest: float | None,
     end: float,
 ) -> Iterator[_Step]:
-    """Yield the steps; what the last training may take is only known when its turn comes."""
+    """Yield the steps; the time for the last training is computed when the previous steps have run."""
     bench = ["-m", "tools.bench"]
     world = ["--device", device, "--suite", suite]
     tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
@@ -126,7 +129,7 @@ def _training(folder: Path, suite: str, flags: list[str], seconds: float) -> _St
 
 
 def _run(step: _Step, limit: float, log: Path) -> Json:
-    """Run a step until its limit, then ask it to save and end; return its state, seconds and last line."""
+    """Run a step and end it at its limit; return its state, its seconds and the last line of its output."""
     begin = time.monotonic()
     with log.open("w") as output:
         process = subprocess.Popen(
@@ -145,7 +148,7 @@ def _run(step: _Step, limit: float, log: Path) -> Json:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and its children: first as Ctrl-C does, so that a training saves."""
+    """End a process and its children: interrupt them, so that a training saves, and later kill them."""
     for number in (signal.SIGINT, signal.SIGKILL):
         try:
             os.killpg(process.pid, number)
@@ -157,7 +160,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _results(out: Path) -> Json:
-    """Return what the steps have written so far."""
+    """Collect the results that the steps have written so far."""
     found: Json = {"training": {}}
     for name in ("switches", "pictures"):
         file = out / f"{name}.json"

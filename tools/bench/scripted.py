@@ -21,15 +21,15 @@ def scripted(
     """Compare success of the scripts of version 2 with and without switches, on C MuJoCo from the same starts.
 
     Args:
-        switches: Texts as ``WorldConfig.switches`` takes them, each one compared with none.
+        switches: Values of ``WorldConfig.switches``; each is compared with no switches.
         tasks: Classes, without ``-v2``.
-        episodes: Episodes of each of the 50 tasks of a class.
-        threads: Engine threads; None takes all CPUs.
+        episodes: Number of episodes of each of the 50 tasks of a class.
+        threads: Engine threads; None: one per CPU.
         seed: Seed of tasks and starts.
 
     Returns:
-        A row per class with the success rate in percent, by switches; and the largest difference that chance makes in
-        one class in 95 of 100 cases if the success is the same (``chance``, percentage points).
+        A row per class with the success rate in percent for each value of ``switches``, and ``chance`` (percentage
+        points): if a switch changes nothing, the measured difference stays below this in 95 of 100 cases.
     """
     table = []
     for task in tasks:

@@ -14,12 +14,12 @@ from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world import World
 
 MAX_OBJECT_SPEED = 20.0
-"""No object may move faster, m/s."""
+"""Upper bound of the speed of objects, m/s."""
 SHALLOW, DEEP = 0.005, 0.015
 """Depths of contacts, metres: few states may exceed the first one, and hardly any may exceed the second one."""
 LEAST_SHALLOW, LEAST_NOT_DEEP, LEAST_SHALLOW_AT_WORK = 0.985, 0.998, 0.999
-"""Minimum shares of states within the first and within the second depth under rough actions, and minimum share of
-states within the first depth under a witness."""
+"""Minimum shares of states without a contact deeper than SHALLOW and DEEP under rough actions, and of states without a
+contact deeper than SHALLOW while a witness is played."""
 _SAMPLES_PER_STEP = 8
 
 
@@ -45,19 +45,20 @@ def stability(
             neither suite nor task every class is tested.
         steps: Number of environment steps per class.
         num_envs: Number of environments.
-        threads: Engine threads; None takes all CPUs.
+        threads: Engine threads; None: one per CPU.
         seed: Seed of world and actions.
         device: Device of the world.
         engine: As in ``Benchmark.make_world``.
 
     Returns:
-        By class: unstable rows, warnings, fastest object (m/s), shares of sampled states without a contact deeper than
-        5 and 15 mm, the 99.9 % quantile of depth (m), the share within 5 mm under the witness (None without one, and
-        with a fixed base), and whether all bars hold.
+        By class: number of unstable environment steps, warnings, speed of the fastest object (m/s), shares of sampled
+        states without a contact deeper than 5 and 15 mm, the 99.9 % quantile of depth (m), the share of states of the
+        witness without a contact deeper than 5 mm (None if there is no witness or the base is fixed), and whether all
+        limits hold.
     """
     result = {}
     for name, moving in variants(suite, task):
-        # Rows that end are reset here, so that the step that ended them is measured too.
+        # Environments whose episode ends are reset here, so that the last step of the episode is measured too.
         where = {"device": device, "engine": engine, "threads": threads}
         made = make_task_world(name, num_envs, seed=seed, autoreset_mode="DISABLED", moving_base=moving, **where)
         rough = _stability(made, steps, seed)
@@ -130,7 +131,10 @@ def witness_share(name: str, threads: int | None = None) -> float | None:
 
 
 def rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw uniform actions in the first half of the rows, and held extremes in the second; update both buffers."""
+    """Return rough actions: uniform in the first half of the rows, and held at -1 or 1 in the second half.
+
+    The held actions (``held``) and the steps for which they are still held (``left``) are updated in place.
+    """
     num, size = held.shape
     half = num // 2
     expired = left <= 0

@@ -1,4 +1,4 @@
-"""The worker of ``tools.bench.against``: step the worlds of the checkout that is first on the import path.
+"""The worker of ``tools.bench.against``, which steps the worlds of the checkout that is first on the import path.
 
 The worker is started by its file name and imports another commit's ``bidex_meta``, so the worker may use only names
 that commit e0e28c4 has too. A command is a line of JSON on stdin, the answer a line of JSON on stdout.
@@ -30,7 +30,7 @@ class Stepper:
     def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[list[float]]:
         """Make and reset the world of a suite, or of one of the suite's classes.
 
-        Returns time step (seconds) and substeps of each engine batch; empty if the code stores them elsewhere.
+        Returns time step (seconds) and substeps of each engine batch, or [] if the checkout stores them elsewhere.
         """
         from bidex_meta import Benchmark
 
@@ -49,13 +49,13 @@ class Stepper:
             return []
 
     def step(self, steps: int, seed: int) -> dict[str, float]:
-        """Step all rows under uniform actions, once more than is measured; return ``wall`` and ``cpu`` seconds."""
+        """Step all environments under uniform actions; return ``wall`` and ``cpu`` seconds without the first step."""
         import torch
 
         generator = torch.Generator().manual_seed(seed)
         shape = steps + 1, self._world.num_envs, *self._world.single_action_space.shape
         first, *actions = 2.0 * torch.rand(shape, generator=generator) - 1.0
-        self._world.step(first)  # the other side's turn has left the caches cold
+        self._world.step(first)  # not measured: the other worker has run in between, so the caches are cold
         wall, cpu = time.perf_counter(), time.process_time()
         for action in actions:
             self._world.step(action)

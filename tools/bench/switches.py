@@ -1,4 +1,4 @@
-"""Measure options of the physics against none, in turns on one device."""
+"""Compare the speed of options of the physics with the speed without options, on one device."""
 
 import multiprocessing
 import statistics
@@ -24,9 +24,9 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "incremental": {"switches": "incremental"},
     "pyramids": {"switches": "pyramids"},
 }
-"""Arguments of ``Benchmark.make_world`` by the name of a switch; another switch is another line."""
+"""Arguments of ``Benchmark.make_world`` by name of the switch; add a line to measure another switch."""
 _REPLAYED = 50
-"""Steps of which two plays are compared; enough for contacts."""
+"""Largest number of steps that are played twice and compared; 50 steps contain contacts."""
 
 
 def switches(
@@ -39,22 +39,22 @@ def switches(
     seed: int = 0,
     out: Path | None = None,
 ) -> Json:
-    """Compare the speed of a suite's world with each of ``SWITCHES``; all worlds of a size exist and take turns.
+    """Compare the speed of a suite's world with each of ``SWITCHES``; all worlds of a size are stepped alternately.
 
     Args:
         suite: Suite to step.
         sizes: Numbers of environments.
-        steps: Control steps of each repeat.
-        repeats: Turns; medians are reported.
-        device: Where the worlds live.
+        steps: Number of control steps of each repeat.
+        repeats: Number of repeats for each world; medians are reported.
+        device: Device of the worlds.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
-        out: File that takes each size as it is measured; what is in it is not measured again.
+        out: File to which each size is written when it is measured; sizes in the file are not measured again.
 
     Returns:
-        By size and switch: ``env_steps_per_s``; ``ratio``, the median over turns of the speed relative to none;
-        ``training_steps_per_s`` with MT-PPO's preset ``v2``; and whether two plays of one seed are equal bit for bit
-        (``repeats``). A switch that cannot be measured has an ``error`` instead.
+        ``rows`` by size and switch: ``env_steps_per_s``; ``ratio``, the median speed relative to the world without
+        switches; ``training_steps_per_s`` with MT-PPO's preset ``v2``; and ``repeats``, which is true if two episodes
+        with equal seeds are equal bit for bit. A switch that cannot be measured has an ``error`` instead.
     """
     setting = {"suite": suite, "device": device, "engine": engine, "steps": steps, "turns": repeats}
     setting["machine"] = machine_of(device)
@@ -91,7 +91,7 @@ def _in_turns(worlds: dict[str, World], steps: int, repeats: int) -> Json:
     for turn in range(repeats):
         order = list(worlds)
         if turn % 2:
-            order.reverse()  # otherwise a switch would always find the device as the same neighbour leaves it
+            order.reverse()  # otherwise each switch would always run after the same other switch
         for name in order:
             seconds[name].append(random_steps(worlds[name], steps))
     row: Json = {}
@@ -104,7 +104,7 @@ def _in_turns(worlds: dict[str, World], steps: int, repeats: int) -> Json:
 
 
 def _repeats(world: World, steps: int, seed: int) -> bool:
-    """Return whether two plays of the same actions end in equal observations."""
+    """Return whether the same actions, played twice from the same seed, end in equal observations."""
     ends = []
     for _ in range(2):
         world.reset(seed=seed)
@@ -118,12 +118,12 @@ def kernels(suite: str = "MT20-v2", device: str = "cuda:0", engine: str = "warp"
 
     Args:
         suite: Suite whose classes are built one by one.
-        device: Where the kernels will run.
+        device: Device for which the kernels are compiled.
         engine: As in ``Benchmark.make_world``.
-        processes: Processes that compile at once; None: all cores.
+        processes: Number of processes that compile in parallel; None: one per core.
 
     Returns:
-        ``built`` worlds and ``seconds``.
+        Number of worlds to build (``jobs``), number of worlds that were ``built``, and ``seconds``.
     """
     begin = time.perf_counter()
     jobs = list(product(Benchmark(suite).train_classes, SWITCHES, [device], [engine]))

@@ -12,7 +12,8 @@ from tools.pages.studies import Study
 from tools.pages.tables import table
 
 CONTROL = "control"
-"""Name of the arm with which others are compared. It has the same starting policy and adaptation, no meta-training."""
+"""Name of the arm with which the other arms are compared. Its runs adapt the same initial policy without
+meta-training."""
 _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "return", "gain [95 %]", "over control [95 %]")
 
 
@@ -20,8 +21,8 @@ def gains_table(study: Study) -> Iterator[str]:
     """Yield one row per run, class by class; a gain whose interval excludes zero is bold.
 
     A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
-    the difference from the gain of the control's run with the same seed. Its interval adds the half widths of both
-    gains as independent errors (the root of the sum of squares). The split is that of the study, by default ``test``.
+    the gain minus the gain of the control's run with the same seed. The half width of its interval is the root of the
+    sum of both gains' squared half widths (independent errors). The split is the study's split, by default ``test``.
     Raises BidexError if a run has no meta-test of the split, or if an arm has several runs with the same seed.
     """
     split = study.split or "test"

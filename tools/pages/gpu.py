@@ -11,7 +11,7 @@ _MISSING = "not measured yet"
 
 
 def gpu_table(show: str, data: Path) -> list[str]:
-    """Return the table ``switches``, ``pictures`` or ``training`` of ``gpu-quarter.json`` beside the folder of data."""
+    """Return the table ``switches``, ``pictures`` or ``training`` from ``gpu-quarter.json`` next to ``data``."""
     file = data.parent / "gpu-quarter.json"
     found: Json = {}
     if file.is_file():

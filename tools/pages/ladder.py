@@ -46,9 +46,9 @@ class Line:
 
     given: str
     shares: list[list[float]] = field(default_factory=list)
-    """Mean success over classes after 0, 1, ... exploring episodes, for each seed; for PPO a single number."""
+    """Mean success over classes after 0, 1, ... exploring episodes, for each seed. PPO has a single number per seed."""
     hidden: list[float] = field(default_factory=list)
-    """Success after all exploring episodes in an episode with hidden rewards, for each seed that has such episodes."""
+    """Success in an episode with hidden rewards after all exploring episodes, for each seed that has such episodes."""
     steps: list[int] = field(default_factory=list)
     minutes: list[float] = field(default_factory=list)
 
@@ -100,7 +100,7 @@ def suites_table(*studies: Study) -> Iterator[str]:
 
 
 def _classes(file: Path) -> list[Json]:
-    """Return the rows of a file of ``bidex-meta validity``; none if there is no such file."""
+    """Return the rows of a file of ``bidex-meta validity``, or an empty list if there is no such file."""
     if not file.is_file():
         return []
     return list(json.loads(file.read_text())["classes"].values())
@@ -167,8 +167,8 @@ def _named(run: StoredRun) -> tuple[str, Line]:
 def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
     """Return the results by class after 0, 1, ... exploring episodes.
 
-    PPO has a single entry: the results on unseen tasks, if there are any. If PPO's suite lists its tasks, the
-    evaluation is on the same goals with other starts.
+    PPO has a single entry: the results on unseen tasks if PPO was evaluated on them, otherwise the results on its own
+    tasks. If PPO's suite lists its tasks, the evaluation has the same goals but other initial states.
     """
     if isinstance(evaluation, MetaTestEvaluation):
         return [shot.classes for shot in evaluation.splits[split].by_shot]
@@ -201,7 +201,7 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
 def _pairs(lines: dict[str, Line]) -> Iterator[list[str]]:
     """Yield a row for each pair of reward-only meta-learners with enough seeds.
 
-    Two learners are separated if no seed of one reaches a seed of the other.
+    The first learner is separated from the second if its worst seed is better than the second learner's best seed.
     """
     judged = [name for name, line in lines.items() if len(line.shares) >= _SEEDS_AT_LEAST]
     learners = [name for name in judged if lines[name].given == _OWN and name != BLIND]
@@ -218,7 +218,7 @@ def _better(one: list[np.ndarray], other: list[np.ndarray]) -> float:
 
 
 def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]]) -> str:
-    """Return a sentence that says whether the suite is good by the ladder's rule, and why not."""
+    """Return a sentence that says whether the suite meets the ladder's rule for good suites, and if not, why."""
     if SHOWN not in lines or BLIND not in lines:
         return "We do not yet say whether this suite is good, because blind or goal-shown PPO is missing."
     if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:

@@ -20,7 +20,7 @@ _LAST = ["runs", "steps", "tuning", "hours", "trained on", "commit"]
 
 
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
-    """Yield for each track and suite a table of entries, best first, and a table of pairs; "" stands for all suites."""
+    """Yield, for each track of ``suite`` ("": of each suite), a table of entries, best first, and a table of pairs."""
     entries = list(board.read_entries(data.parent / "leaderboard").values())
     for track in get_args(Track):
         of_track = [entry for entry in entries if entry.track == track and suite in ("", entry.suite)]
@@ -95,7 +95,7 @@ def _percent(tables: Sequence) -> str:
 
 
 def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
-    """Return a row for each pair of entries; one entry is claimed to be better if the interval excludes one half."""
+    """Return a row for each pair of entries; its claim names the better one if the interval excludes 1/2."""
     rows = []
     for first, second in combinations(ranked, 2):
         found = board.improvement(first.result, second.result)

@@ -1,8 +1,8 @@
 """Table of offline learners' scores: a row per kind of data, a column per learner.
 
 The score is the paper's (appendix A.3): 100 (R - R_random) / (R_expert - R_random), with returns from the study's own
-evaluations. The expert is the study's online run on the same class. If there is no such run, as for a suite, scores are
-taken from the evaluations.
+evaluations. The expert is the study's online run on the same class. If there is no such run (suites have none), the
+table shows the scores that the evaluations contain.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from tools.pages.studies import Study, classes_of_random, refuse_differing
 from tools.pages.tables import mean_and_range, table
 
 KINDS = ("random", "replay", "medium", "medium-expert", "expert")
-"""Order of the rows, as in the paper's table; others follow by name."""
+"""Order of the rows, as in the paper's table; other kinds of data follow in alphabetical order."""
 LEARNERS = ("bc", "bcq", "td3bc", "iql")
 """Order of the columns."""
 

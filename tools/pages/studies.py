@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
-"""Config entries in which seeds of an arm may differ."""
+"""Config entries in which the runs of an arm may differ."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Study:
 
     @cached_property
     def arms(self) -> list[Arm]:
-        """Return the arms of the study, the best first.
+        """Return the arms of the study, best first.
 
         Raises BidexError if runs of an arm differ in more than the seed, or do not cover the same classes.
         """
@@ -186,9 +186,9 @@ def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
-    """Raise BidexError if runs of an arm differ in a config entry that both have, except in those of ``_FREE``.
+    """Raise BidexError if two runs of an arm differ in a config entry that both have and that is not in ``_FREE``.
 
-    Configs of different versions may have more or fewer entries.
+    Entries that only one of the configs has are ignored, because the runs may be from different versions.
     """
     for run in runs[1:]:
         same = next(known for known in runs if known.config().task == run.config().task)

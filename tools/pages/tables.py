@@ -57,9 +57,9 @@ def random_rows(study: Study) -> dict[str, list[ClassSummary]]:
 
 
 def arms_table(study: Study) -> Iterator[str]:
-    """Yield a table with a row per arm, and one for uniform actions.
+    """Yield a table with a row per arm, and a row for uniform actions.
 
-    Success is the interquartile mean, but the mean over classes if arms were also evaluated on other tasks.
+    Success is the interquartile mean. If an arm was also evaluated on other tasks, all success rates are means instead.
     """
     classes = study.classes if len(study.classes) <= _FEW else []
     means_only = any(arm.others is not None for arm in study.arms)
@@ -87,14 +87,14 @@ def arms_table(study: Study) -> Iterator[str]:
 
 
 def _over_seeds(success: np.ndarray | None) -> str:
-    """Format success (seeds, classes) as the mean over all, and the range over seeds."""
+    """Format success (seeds, classes) as the mean over seeds and classes, and the range over seeds."""
     return "–" if success is None else mean_and_range(100.0 * success.mean(axis=1), ".1f", " %")
 
 
 def classes_table(study: Study) -> Iterator[str]:
     """Yield a table of success and return per class, as mean over seeds (least to most).
 
-    Few classes are columns, more than ``_MANY`` are rows.
+    The classes are columns, or rows if there are more than ``_MANY``.
     """
     if len(study.classes) > _MANY:
         return _classes_as_rows(study)
@@ -111,9 +111,9 @@ def classes_table(study: Study) -> Iterator[str]:
 
 
 def _classes_as_rows(study: Study) -> Iterator[str]:
-    """Yield a table with a row per class and one for the mean.
+    """Yield a table with a row per class and a row for the mean.
 
-    For each arm there are columns of success on own and other tasks, return and score.
+    Each arm has columns for success on the tasks that it was trained on, success on other tasks, return and score.
     """
     columns: dict[str, list[str]] = {"class": [*study.classes, "mean"]}
     for arm in study.arms:

@@ -41,7 +41,7 @@ def validity_table(suite: str, data: Path) -> list[str]:
 
 
 def share_cell(row: Json, figure: str) -> str:
-    """Return a figure of a class as a percentage, "" if it was not measured; the chance level follows ``named``."""
+    """Format a class's ``figure`` as a percentage, with the chance level if it is ``named``; "" if not measured."""
     cell = _percent(row.get(figure))
     if figure == "named" and cell:
         cell += f" ({100 * row['chance']:.0f} %)"

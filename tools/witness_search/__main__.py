@@ -25,8 +25,8 @@ class Search:
 
     task: str  # Task class to solve.
     file: Path | None = None
-    """Store the episode here, even if it does not hold. None: store it in witnesses/TASK.npz, but only if it holds. An
-    episode holds if it solves the task from its start and from eight of ten shifted starts."""
+    """An episode holds if it solves the task from its start and from eight of ten shifted starts. Store the episode in
+    this file, even if it does not hold. None: store it in witnesses/TASK.npz, but only if it holds."""
     threads: int | None = None  # Threads of the physics; None: one per core.
 
     def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
@@ -83,7 +83,7 @@ class Improvement(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Steady(Improvement):
-    """Make an episode succeed from more shifted starts, with softer blows, by small changes."""
+    """Make small changes to an episode, so that it succeeds from more shifted starts and with softer contacts."""
 
     def run(self) -> None:
         """Change the episode for the given number of rounds."""

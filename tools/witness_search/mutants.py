@@ -11,14 +11,14 @@ find a way, small changes improve it."""
 
 
 def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: torch.Generator) -> Tensor:
-    """Return ``count`` elites with some of their knots changed, (count, K, a).
+    """Return ``count`` mutants (count, K, a): ``elites`` (E, K, a) with some of their knots changed.
 
-    Half of the mutants take the left hand's actions from another elite, because good actions of one hand seldom depend
-    on the other hand. Half of the mutants change a few actions anywhere; the other half change one part of the hands,
-    so that a grip can be carried somewhere, or a base stays while its fingers close. Half of the mutants change a
-    random half of their knots, each independently; the other half change every knot from some time on by the same
-    amount. ``elites`` is (E, K, a), ``std`` the standard deviation of the coarsest changes, ``mutated`` the share of
-    actions that change in mutants that do not change one part of the hands.
+    Three properties of a mutant are drawn independently, each with probability 1/2. (1) It takes the left hand's
+    actions from another elite, because good actions of one hand seldom depend on the other hand. (2) It changes each
+    action with probability ``mutated``; otherwise it changes all actions of one part of the hands, so that a grip can
+    be carried somewhere, or a base stays while its fingers close. (3) It changes a random half of the knots, each
+    independently; otherwise it changes all knots from a random time on by the same amount. ``std`` is the standard
+    deviation of the coarsest changes.
     """
 
     def uniform(*shape: int) -> Tensor:

@@ -36,14 +36,15 @@ class PlannerConfig:
     kept_elites: int = 8  # Number of elites that are tried again in the next round, and become parents of mutants.
     mutants: float = 0.5
     """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
-    mutated: float = 0.15  # Share of actions that change in mutants that do not change one part of the hands.
+    mutated: float = 0.15  # Probability that a mutant changes an action, unless it changes one part of the hands.
     horizon: int = 41  # Number of control steps that a plan looks ahead.
     knots: int = 9  # Number of knots of a plan; actions between knots are interpolated linearly.
     execute: int = 10
     """Number of control steps that are played before the next plan. If they end at a knot, the rest of the plan does
     not change."""
     std: float = 0.5
-    """Standard deviation of the knots in a first round; a sequence uses a share of it, from all to a twentieth."""
+    """Standard deviation of the knots in the first round of a plan. It is scaled by a random factor for each sequence,
+    between 0.05 and 1."""
     min_std: float = 0.12  # Lower bound of the standard deviation.
     gamma: float = 0.97  # Discount factor per control step.
     effort: float = 0.05
@@ -71,7 +72,7 @@ class Plan:
 
 
 class Planner:
-    """The search for one class; see the module. Raises BidexError if the number of copies does not divide samples."""
+    """The search for one class, as the module describes it; raises BidexError if copies does not divide samples."""
 
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
         if config.samples % config.copies:
@@ -127,7 +128,7 @@ class Planner:
         return Plan(played, np.array(rewards), first, max(rivals, default=None))
 
     def _plan(self, states: list[State], mean: Tensor, elites: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the new mean of the knots (K, a), the best sequences, best first, (E, K, a), and unsuccessful ones."""
+        """Return the new mean of the knots (K, a), the best sequences (E, K, a), and the best unsuccessful ones."""
         cfg = self.config
         knots, order, won = elites, torch.arange(len(elites)), torch.zeros(len(elites), dtype=torch.bool)
         std = torch.full_like(mean, cfg.std)
@@ -147,7 +148,7 @@ class Planner:
         return mean, elites, knots[order[~won[order]]][:RIVALS]
 
     def _try(self, states: list[State], knots: Tensor) -> tuple[Tensor, Tensor]:
-        """Play sequences, equal shares of them from each state; return their scores (samples,) and successes.
+        """Play an equal number of sequences from each state; return scores and successes of sequences, (samples,) each.
 
         The score is the discounted sum of reward minus effort.
         """

@@ -2,8 +2,8 @@
 
 The planner considers only reward: an episode that solves its task may fail when its start is moved by 0.1 mm, or may
 drive a finger deep into an egg during a catch. Here whole episodes are changed and played from several shifted starts.
-A change is kept if more of the starts succeed, for longer, at a higher return, with fewer deep contacts. The shifted
-starts are not the starts of the replay.
+Changes are ranked by the number of starts that succeed, the duration of success, the return, and the number of deep
+contacts. The shifted starts are not the starts that the replay uses.
 """
 
 from itertools import product
@@ -21,9 +21,9 @@ _STD, _MUTATED = 0.15, 0.15
 _SPACING = 5
 """Control steps between knots of a change."""
 _SHALLOW = 0.004
-"""Depth of contacts up to which a state is not deep, metres: a millimetre less than in ``tools.bench stability``."""
+"""Depth of contacts beyond which a state is deep, metres; a millimetre less than in ``tools.bench stability``."""
 _BLOW = 3.0
-"""Cost of one deep state per start; each start that succeeds is worth 1."""
+"""Cost of one deep state per start, in a score in which each start that succeeds is worth 1."""
 
 
 def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:

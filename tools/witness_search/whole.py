@@ -1,8 +1,8 @@
 """The cross-entropy method over whole episodes, starting from an earlier episode.
 
 It solves tasks on which a receding horizon gives up too early. In TwoCatchUnderarm one caught egg earns more reward
-than two eggs in the air, so a plan of forty steps does not throw the other egg. Here a whole episode is scored, by its
-return and by the least of the reward's terms, which a single egg does not raise.
+than two eggs in the air, so a plan of forty steps does not throw the other egg. Here a whole episode is scored by its
+return and by the smallest of the reward's terms. A single caught egg does not raise the smallest term.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ _SPACING = 3
 """Control steps between knots."""
 _STD, _LEAST_STD = 0.4, 0.12
 _SUCCESS, _LASTING = 5.0, 0.2
-"""Worth of an episode's success, and of each step in which it is successful, in units of return."""
+"""Bonuses, in units of return, for an episode that succeeds and for each of its successful steps."""
 
 
 def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:

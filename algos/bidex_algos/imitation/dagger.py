@@ -159,7 +159,7 @@ class DAgger(Learner):
         return super().state_dict() | {"data": self.lessons.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the data set had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world's or data set's size differs."""
         super().load_state_dict(state)
         self.lessons.data.load_state_dict(state["data"])
         if self.obs is not None and self.lessons.teachers.follow:

@@ -190,7 +190,7 @@ class MetaLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
-        """Return DISABLED for whole episodes, which wait for each other, and SAME_STEP for slices of episodes."""
+        """Return SAME_STEP for slices of episodes, and DISABLED for whole episodes, which begin together."""
         if config.slice_steps is None:
             return "DISABLED"
         return "SAME_STEP"
@@ -247,7 +247,10 @@ class MetaLearner(Learner):
         self.steps_with_tasks = 0
 
     def _chosen_tasks(self) -> dict[str, np.ndarray]:
-        """Return the tasks of the next meta-batch by class, each (tasks_per_class or fewer, size of a variation)."""
+        """Return, by class, the tasks of the next meta-batch: arrays (tasks, size of a variation).
+
+        A class has ``tasks_per_class`` tasks, or fewer if its pool is smaller.
+        """
         count = self.config.tasks_per_class
         if self.endless:
             world: Any = self.world  # an EndlessWorld
@@ -279,8 +282,8 @@ class MetaLearner(Learner):
                 obs = self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned = torch.zeros(len(running), device=self.device)
-        # A slice is a success if the suite's rule holds at the end of the slice or an episode, and the goal was met in
-        # it.
+        # A slice is a success if two conditions hold. The suite's rule holds at the end of the slice or at the end of
+        # an episode in the slice, and the goal was met in at least one of the slice's steps.
         success = torch.zeros_like(running)
         ended_well = torch.zeros_like(running)
         met = torch.zeros_like(running)

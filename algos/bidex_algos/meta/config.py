@@ -19,7 +19,7 @@ class MetaConfig(LearnerConfig):
 
     hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
     activation: Activation = "tanh"  # Non-linearity of the hidden layers.
-    init_std: Positive = 0.8  # Initial standard deviation of the actions; adapted too if adapted is all.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions; adaptation changes it if adapted is all.
     std_range: tuple[Positive, Positive] = (0.1, 1.5)  # Bounds of the standard deviation of the actions.
     tasks_per_class: Count = 3
     """Tasks of each class in a meta-batch, drawn again for each meta-batch; fewer if a class has fewer. The class's
@@ -57,7 +57,7 @@ class MetaConfig(LearnerConfig):
 
 
 class OuterConfig(MetaConfig):
-    """Options shared by the outer steps. Each learner's config repeats them as fields, in its own order of flags."""
+    """Options of all outer steps. Each learner's config declares them again, to define the order of its flags."""
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
     max_grad_norm: Positive  # Meta-gradients are clipped to this norm.

@@ -44,7 +44,7 @@ class ICLConfig(LearnerConfig):
     hidden: Widths = (256, 128)  # Widths of the layers of the reward model that encode the observation.
     activation: Activation = "elu"  # Non-linearity of the hidden layers.
     candidates: Count = 512  # Number of candidate goals; the belief gives each candidate a probability.
-    trust: Fraction = 0.05  # Factor of a step's log-likelihood, because errors in successive steps are correlated.
+    trust: Fraction = 0.05  # Factor of each log-likelihood, small because the errors of successive steps correlate.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
@@ -72,14 +72,14 @@ class ICLConfig(LearnerConfig):
 
 PRESETS: dict[str, ICLConfig] = {
     "laptop": ICLConfig(),
-    # For 4,096 to 8,192 environments on a GPU. These values follow from the rules below, by the ladder's runs with 64
-    # environments (results/sweeps/ladder-rung0.toml), and were never tried.
+    # This preset is for 4,096 to 8,192 environments on a GPU. The values were never tried. They follow by the rules
+    # below from preset laptop and from the ladder's runs with 64 environments (results/sweeps/ladder-rung0.toml).
     "gpu": ICLConfig(
-        batch_size=16384,  # 16 times laptop's; each of 64 times as many steps is seen a quarter as often
-        updates_per_iteration=200,  # the ladder's: as many Adam steps per trial
-        learning_rate=2e-3,  # twice laptop's; the root of the ratio of batches would be 4
-        teacher_steps=6_000_000,  # two trials of 4,096 environments, as 100,000 are of the ladder's 64
-        trials=16384,  # four of each of 4,096 environments: 12 GB; at least one is kept
+        batch_size=16384,  # 16 times laptop's, for 64 times the steps, so each step is seen a quarter as often
+        updates_per_iteration=200,  # the same number of Adam steps per trial as in the ladder's runs
+        learning_rate=2e-3,  # twice laptop's; with the square root of the batch size it would be 4 times laptop's
+        teacher_steps=6_000_000,  # two trials of 4,096 environments; the ladder's 100,000 are two trials of 64
+        trials=16384,  # four trials of each of 4,096 environments take 12 GB; at least one is kept
     ),
 }  # fmt: skip
 
@@ -279,16 +279,16 @@ class ICL(TrialLearner):
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the data set had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world's or data set's size differs."""
         super().load_state_dict(state)
         if self.data is not None:
             self.data.load_state_dict(state["data"])
 
 
 class _Pupil:
-    """Plays a trial: the teachers act in some environments, the policy in the others; all steps are labelled.
+    """Plays a trial: teachers act in some environments, the policy acts in the others, and all steps are labelled.
 
-    In a ``still_share`` of the episodes the policy does not explore, as in an evaluation.
+    In a share ``still_share`` of the episodes the policy does not explore, as in an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):

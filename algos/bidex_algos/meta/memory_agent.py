@@ -33,7 +33,7 @@ class MemoryAgent:
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin an episode in the rows of ``env_mask`` (N,): mark it in the memory and discard the evaluation copy."""
+        """Begin episodes in the rows of ``env_mask`` (N,): mark them in the memory and discard evaluation copies."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
@@ -54,7 +54,7 @@ class MemoryAgent:
             return
         valid = timestep.valid
         ended = timestep.terminated | timestep.truncated
-        # Meta-World's evaluation does not pass valid rows, because all are valid.
+        # Meta-World's evaluation does not pass the mask of valid rows, because all rows are valid.
         if valid is None:
             known = torch.ones_like(ended)
         else:

@@ -58,18 +58,18 @@ class PEARLConfig(MTSACConfig):
 PRESETS: dict[str, PEARLConfig] = {
     "laptop": PEARLConfig(),
     "v2": PEARLConfig(gamma=0.99),
-    # v2 with 4,096 environments and more on a GPU. These values follow from the rules below and were never tried.
+    # This is v2 for at least 4,096 environments on a GPU. The values follow from the rules below and were never tried.
     "gpu": PEARLConfig(
         gamma=0.99,
-        replay_steps=2442,  # FlashSAC's preset gpu: 10 million transitions; a trial has at most 750 vector steps
-        replay_memory=42.0,  # GB: room for these steps of 8,192 environments of 422 entries
-        warmup_steps=25,  # FlashSAC's: 100,000 transitions
-        updates_per_step=2,  # FlashSAC's
+        replay_steps=2442,  # as in FlashSAC's preset gpu: 10 million transitions; a trial has up to 750 vector steps
+        replay_memory=42.0,  # GB; enough for these steps of 8,192 environments with 422 entries per observation
+        warmup_steps=25,  # as in FlashSAC: 100,000 transitions
+        updates_per_step=2,  # as in FlashSAC
         batch_size=4096,  # 4 times v2's, for 64 times as many new transitions per update
-        tasks_per_update=64,  # as many times v2's, so that each task keeps its share of a batch
-        context=256,  # as many times v2's: a trial's estimate of its evidence has half the noise
-        learning_rate=6e-4,  # v2's times the root of 4
-        critic_learning_rate=2e-3,  # v2's times the root of 4
+        tasks_per_update=64,  # 4 times v2's, so that the share of each task in a batch stays the same
+        context=256,  # 4 times v2's, which halves the noise of the estimated evidence of a trial
+        learning_rate=6e-4,  # twice v2's: it grows with the square root of the batch size
+        critic_learning_rate=2e-3,  # twice v2's
     ),
 }  # fmt: skip
 
@@ -220,9 +220,9 @@ class PEARL(MTSAC):
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Return the environments' task numbers over all classes, (N,); raise BidexError if a task has no environment.
+    """Return the task number of each environment, (N,), counted over all classes.
 
-    Worlds that draw new tasks in each episode are refused too.
+    Raises BidexError if a task has no environment, or if the world draws new tasks in each episode.
     """
     if getattr(world, "endless", False):
         raise BidexError(

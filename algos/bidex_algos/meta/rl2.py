@@ -1,8 +1,8 @@
 """RL²: meta-learning with a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
 
 An iteration plays one trial in every environment: a few episodes of one task with one memory. The learner makes
-``epochs`` passes over the trial in mini-batches of chunks, which are runs of ``chunk`` steps. The next trial starts
-with an empty memory. The first trial is only used to measure statistics.
+``epochs`` passes over the trial in mini-batches of chunks, which are sequences of ``chunk`` steps. The next trial
+starts with an empty memory. The first trial is only used to measure statistics.
 """
 
 import math
@@ -38,7 +38,7 @@ class RL2Config(PPOConfig):
     activation: Activation = "elu"  # Non-linearity of the layers before the memory.
     memory: Count = 128  # Size of an environment's memory (the state of a GRU); actor and critic have one each.
     value_heads: bool = True  # Give the critic one output per task class instead of one for all.
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
@@ -61,7 +61,7 @@ class RL2Config(PPOConfig):
     def trial_steps(self) -> int:
         """Return the maximum number of steps of a trial.
 
-        If trials play whole episodes, this is an estimate until the learner has its world.
+        If a trial consists of whole episodes, this is an estimate until the learner knows the world's time limits.
         """
         return self.episodes_per_trial * (self.max_adapt_steps or USUAL_STEPS)
 
@@ -94,15 +94,15 @@ PRESETS: dict[str, RL2Config] = {
     "v2": RL2Config(
         gamma=0.99, init_std=0.3, reward_unit=0.3, chunk=125, hidden=(128, 128), num_minibatches=4, epochs=3,
     ),
-    # v2 with 4,096 to 8,192 environments per class on a GPU. These values follow from the rules below and were never
-    # tried. The discount, the noise, the unit of rewards and the chunk do not depend on the number of environments.
+    # This is v2 for 4,096 to 8,192 environments per class on a GPU. The values follow from the rules below and were
+    # never tried. Discount, noise, unit of rewards and chunk do not depend on the number of environments.
     "gpu": RL2Config(
         gamma=0.99, init_std=0.3, reward_unit=0.3, chunk=125,
-        hidden=(256, 128),  # laptop's: v2 is narrower only because an update on a CPU takes long
-        num_minibatches=16,  # 192,000 steps each; with v2's 4 a trial of 3 million steps would be 12 Adam steps
+        hidden=(256, 128),  # as in laptop; v2 is narrower only because an update on a CPU takes long
+        num_minibatches=16,  # with v2's 4 a trial of 3 million steps would have 12 Adam steps
         epochs=5,  # 80 Adam steps per trial, 7 times v2's: there are fewer trials in a budget, and the KL bounds each
         learning_rate=1e-3,  # 3e-4 times the root of the ratio of batches would be 2.4e-3; the KL adapts the rest
-        value_horizon=10.0,  # iterations: one has 256 times as many returns as v2's, so ten of them suffice
+        value_horizon=10.0,  # ten iterations suffice: each has 256 times the returns of an iteration of v2
     ),
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""One stage of adaptation: the transitions of all environments, and the batch, grouped by task, made from them."""
+"""The transitions of one stage of adaptation, and the batch, grouped by task, that is made from these transitions."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -101,7 +101,7 @@ class Stage:
     rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 if not valid
     terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode terminated
     ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
-    # Bool (N,), False if the environment was waiting or its physics broke: such a transition teaches nothing.
+    # Bool (N,), False if the environment waited for the others or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
     elapsed: list[Tensor] = field(default_factory=list)  # number of earlier steps in the same episode (N,)
 
@@ -120,7 +120,7 @@ class Stage:
 
 @torch.no_grad()
 def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig) -> TaskBatch:
-    """Make the batch on which tasks adapt; ``log_std`` (M, a) is that of the sampling policies.
+    """Make the batch on which tasks adapt; ``log_std`` (M, a) belongs to the sampling policies.
 
     The return of a step sums rewards only up to the end of the stage, because a baseline fitted to these returns knows
     nothing beyond that point.
@@ -154,7 +154,7 @@ class Outcome(NamedTuple):
 
     earned: Tensor  # undiscounted, unscaled return of each environment (N,)
     success: Tensor  # whether each environment succeeded, bool (N,)
-    steps: Tensor  # number of environment steps, int64 (); steps of waiting environments do not count
+    steps: Tensor  # number of environment steps, int64 (); steps in which an environment waits do not count
 
 
 def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The data set of a student with a memory: trials, the teachers' labels, and the hidden values of the tasks.
+"""The data set from which a student with a memory learns: trials, teachers' labels, and hidden values of the tasks.
 
 The data set is a ring buffer of trials of all environments on the device, in half precision. 1,024 trials of ML1-v2,
 with three episodes of 225 steps, take 0.9 GB.
@@ -32,9 +32,9 @@ class Steps(NamedTuple):
 class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
-    ``labels`` (S, N, a), ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,), the trials in which teachers
-    act, are filled while ``trials`` is played; then ``keep`` stores everything. The first of g goals is the task's own.
-    Rewards are also computed for the other goals, in hindsight.
+    Four tensors are filled while ``trials`` is played, and :meth:`keep` then stores them: ``labels`` (S, N, a),
+    ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,), which marks trials in which teachers act. The first
+    of g goals is the task's own. The rewards that the other goals would have given are computed in hindsight.
     """
 
     def __init__(self, trials: Trials, kept: int, goals: int, size: int):
@@ -61,7 +61,7 @@ class TaughtTrials:
 
     @property
     def filled(self) -> int:
-        """Return the number of trials of each environment that can be drawn from."""
+        """Return the number of stored trials of each environment."""
         return min(self.added, self.kept)
 
     def keep(self) -> None:
@@ -78,8 +78,8 @@ class TaughtTrials:
     def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
         """Return one step of each of the trials ``trial`` (B,) of the environments ``row`` (B,).
 
-        Numbers of trials are below ``filled``. ``share`` (B,), in [0, 1), is the position of the step in its trial,
-        relative to the trial's length.
+        The entries of ``trial`` are below ``filled``. ``share`` (B,), in [0, 1), is the position of the step in its
+        trial, relative to the trial's length.
         """
         slot = (share * self._ring["lengths"][trial, row]).long()
         ring = self._ring

@@ -28,7 +28,10 @@ def of_episodes(firsts: EpisodeStatistics, lasts: EpisodeStatistics) -> dict[str
 
 
 class TrialLearner(Learner):
-    """Base class; in an iteration every environment plays one trial: a few episodes of one task with one memory."""
+    """Base of learners that play, in each iteration, one trial in every environment.
+
+    A trial is a few episodes of one task with one memory.
+    """
 
     world: PooledWorld
     policy: RecurrentPolicy
@@ -60,7 +63,7 @@ class TrialLearner(Learner):
     def _play(self, trials: Trials, player: Player, blind_share: float = 0.0) -> None:
         """Play the next trial in all environments and record it in ``trials``.
 
-        In a ``blind_share`` of the episodes the policy is not shown rewards.
+        In a share ``blind_share`` of the episodes the policy does not see rewards.
         """
         counts = [[self.episodes] for _ in range(trials.episodes)]
         counts[0].append(self.firsts)

@@ -96,14 +96,15 @@ class Player(Protocol):
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return unclamped actions (N, a) for raw observations (N, d), and the memory's next state (N, memory).
 
-        ``slot`` (N,) is the slot that records the step; the next step overwrites the slot of a waiting row.
+        ``slot`` (N,) is the slot that records the step. For an environment that waits because its episode has ended,
+        the next step overwrites this slot.
         """
         ...
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Record the step's rewards (N,).
 
-        A row is not ``valid``, and its reward is 0, if its physics broke or if it is waiting for the next episode.
+        An environment is not ``valid``, and its reward is 0, if its physics broke or if it waits for the next episode.
         """
 
 
@@ -134,8 +135,8 @@ def play(
 ) -> None:  # fmt: skip
     """Fill ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
 
-    In a ``blind_share`` of the episodes the policy does not see rewards. ``statistics`` has one list of counters for
-    each episode of a trial; the counters are updated when that episode ends.
+    In a share ``blind_share`` of the episodes the policy does not see rewards. ``statistics`` has one list of counters
+    for each episode of a trial; the counters are updated when that episode ends.
     """
     rows = torch.arange(world.num_envs, device=world.device)
     device = world.device
@@ -160,7 +161,7 @@ def play(
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
-            # A waiting row writes into its next slot, which therefore holds the observation after its last step.
+            # An environment that waits writes into its next slot, which thus holds the observation after its last step.
             at = trials.lengths
             trials.obs[at, rows] = obs
             trials.actions[at, rows] = action
@@ -187,7 +188,10 @@ def play(
 
 @dataclass
 class Batch:
-    """A trial prepared for the update: T slots (a multiple of the chunk size C) of N rows, and its S filled chunks."""
+    """A trial of N environments, prepared for the update.
+
+    Each environment has T slots, which are divided into chunks of C slots. S chunks hold at least one step.
+    """
 
     obs: Tensor  # raw observations (T, N, d)
     actions: Tensor  # sampled actions (T, N, a)
@@ -225,7 +229,7 @@ def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
 
 
 class Discounting(Protocol):
-    """The options by which a trial is cut and its rewards are discounted."""
+    """The options that define how a trial is cut into chunks and how its rewards are discounted."""
 
     @property
     def chunk(self) -> int | None:

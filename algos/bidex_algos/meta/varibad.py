@@ -25,7 +25,7 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive
 from bidex_meta.world.contract import PooledWorld
 
 _TIMES = 16
-"""Number of times in a trial at which a mini-batch decodes the belief."""
+"""Number of steps of each trial whose beliefs a mini-batch decodes."""
 _STEPS = 64
 """Number of steps whose rewards are predicted from each of these beliefs."""
 _BATCHES = 4
@@ -92,7 +92,7 @@ class BeliefActor(RecurrentNet):
         return mean, log_std.clamp(-6.0, 2.0), state
 
     def pays(self, x: Tensor, latent: Tensor) -> Tensor:
-        """Decode latent samples (K, B, latent) to normalised rewards (K, M, B) for reaching inputs (M, B, inputs)."""
+        """Decode latent samples (K, B, latent) to normalised rewards (K, M, B) of the inputs ``x`` (M, B, inputs)."""
         both = self.activation(self.state(x[..., : self.seen]) + self.task(latent)[:, None])
         return self.paid(both).squeeze(-1)
 
@@ -175,7 +175,7 @@ class VariBAD(RL2):
         return self.net.actor(known), critic.values(known)
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """Take one step of encoder and decoder; return :meth:`_bound`, summed over all processes (2,)."""
+        """Take one step of encoder and decoder; return the result of :meth:`_bound`, summed over all processes (2,)."""
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()

@@ -34,7 +34,7 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 
 
 def keep_partition(config: Networks) -> None:
-    """Replace the path of a partition file by its content, for checkpoints; raise BidexError if it is no partition."""
+    """Replace the path of a partition file by its content, for checkpoints; raise BidexError for a wrong partition."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
     object.__setattr__(config, "agents", partition_line(vars(config)["agents"]))
@@ -100,7 +100,7 @@ LiftUnderarm; B.2.1 and B.2.4 describe the clipped value."""
 PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
-"""PAPER with the values of both tables that only apply to PPO."""
+"""PAPER and, in addition, the values of both tables that only apply to PPO."""
 
 LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # values that differ in both tables' column for LiftUnderarm
 
@@ -122,7 +122,7 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
 
 @dataclass
 class AgentBatch:
-    """B samples of one agent with a_i actions, cut out of the batch once, so that mini-batches only select rows."""
+    """B samples of one agent with a_i actions, extracted from the batch once; mini-batches only select rows of it."""
 
     seen: Tensor  # input of the agent's network (B, d_i)
     task: Tensor  # the tasks' one-hot (B, heads); (B, 0) if the agent has one head
@@ -145,7 +145,7 @@ class TeamPolicy(GaussianPolicy):
 
 
 class MultiAgent(OnPolicy):
-    """Agents (``views``) that share a reward; each has its own observations, policy and part of the KL."""
+    """Agents (``views``) that share a reward; each has its own observations and policy and an equal part of the KL."""
 
     config: MultiAgentConfig
     policy: TeamPolicy

@@ -41,7 +41,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(OwnAdams, Sequential):
-    """HAPPO, PPO with agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HAPPO, PPO that updates agents one after another (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name = "happo"
     remedy = "lower learning_rate"

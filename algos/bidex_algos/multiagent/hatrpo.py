@@ -39,7 +39,7 @@ TASK_PRESETS = {
 
 
 class HATRPO(Sequential):
-    """HATRPO, TRPO with agents updated in turn (Kuba et al. 2022, arXiv 2109.11251)."""
+    """HATRPO, TRPO that updates agents one after another (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name = "hatrpo"
     remedy = "lower max_kl or critic_learning_rate"

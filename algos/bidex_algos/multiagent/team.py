@@ -157,12 +157,12 @@ class TeamActor(Team):
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:
-        """Return the parameters of a network and its standard deviations."""
+        """Return the parameters of the network with index ``net``, and its log standard deviations."""
         return [*self.nets[net].parameters(), self.log_stds[net]]
 
     @torch.no_grad()
     def clamp_std(self, low: float, high: float) -> None:
-        """Clamp all standard deviations to bounds."""
+        """Clamp all standard deviations to [``low``, ``high``]."""
         for log_std in self.log_stds:
             log_std.clamp_(math.log(low), math.log(high))
 

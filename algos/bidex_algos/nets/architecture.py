@@ -49,7 +49,7 @@ class Networks(Protocol):
 
 @dataclass(frozen=True)
 class NetworkConfig(LearnerConfig):
-    """Networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
+    """Options of the networks of actor and critics; raises BidexError if the layers do not fit the architecture."""
 
     architecture: Architecture = "shared"
     """shared: one trunk for all tasks. multi_head: the same trunk with policy_heads and value_heads. towers: tasks

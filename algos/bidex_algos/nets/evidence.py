@@ -35,8 +35,8 @@ def spread(count: int, size: int) -> Tensor:
 class BeliefNet(nn.Module):
     """A reward model and an actor, which both read a goal; ``hidden`` are the model's layers for an observation.
 
-    The observation does not show the class. If there is more than one of ``classes``, a third network predicts it. In
-    the model each class has its own weights for the goal. In the actor each class has its own layers after the first.
+    The observation does not show the class, so a third network predicts it if ``classes`` is above 1. In the model each
+    class has its own weights for the goal. In the actor each class has its own layers after the first.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class BeliefNet(nn.Module):
         width = hidden[-1]
         self.classes = classes
         self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
-        # One layer holds all classes; the columns of each class have length 1.
+        # One layer holds all classes; the columns of each class have unit norm.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)
         self.activation = ACTIVATIONS[activation]()
         self.paid = MLP(width, (max(1, width // 2),), 2, 0.01, generator, activation)
@@ -95,11 +95,11 @@ class BeliefNet(nn.Module):
 
 
 class Belief(Protocol):
-    """Infers the goal, n numbers in [-1, 1], from rewards: a belief over a fixed list of candidates."""
+    """Infers the goal, n numbers in [-1, 1], from rewards, as a belief over a fixed list of candidates."""
 
     @property
     def candidates(self) -> Tensor:
-        """Return the goals (C, n) over which belief is distributed."""
+        """Return the candidate goals (C, n)."""
         ...
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:

@@ -49,8 +49,8 @@ a module that maps (..., entries) to (..., ``size``) and has the attribute ``siz
 class Inputs:
     """Describes how networks read an observation, before weights exist; raises ``BidexError`` for a missing group.
 
-    Groups enter unchanged, through an encoder, or, if ``hidden``, not at all. Groups in ``unscaled`` are not
-    normalised.
+    A network reads a group unchanged, or through its encoder in ``encoders``; it does not read groups in ``hidden``.
+    Groups in ``unscaled`` are not normalised.
     """
 
     groups: tuple[ObservationGroup, ...]
@@ -134,7 +134,7 @@ class GroupEncoder(nn.Module):
 class TaskEmbedding(nn.Module):
     """Maps the one-hot of a task (..., tasks) to a learned vector of the task (..., size).
 
-    The entries of the vectors are initially drawn from N(0, 1). If ``unit``, the vectors are scaled to length 1.
+    The entries of the vectors are initially drawn from N(0, 1). If ``unit``, the vectors are scaled to unit norm.
     """
 
     def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):

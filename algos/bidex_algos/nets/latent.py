@@ -38,7 +38,7 @@ class LatentPolicy(SquashedPolicy):
     def compressed(self, reward: Tensor) -> Tensor:
         """Compress rewards (...) to inputs (..., 1) of the normaliser ``rewards``.
 
-        Rewards are compressed because those of unknown classes differ by orders of magnitude.
+        Rewards are compressed because rewards of unknown classes differ by orders of magnitude.
         """
         return torch.asinh(reward / self.reward_unit)[..., None]
 

@@ -56,7 +56,7 @@ class StackedLinear(nn.Module):
 class TaskWeights(nn.Module):
     """``count`` (K) mixture weights for each task, selected by the task's one-hot.
 
-    Initially the weights of a task are a random vector of length 1, so that a mixture is as large as its parts.
+    Initially the weights of a task are a random vector of unit norm, so that a mixture is as large as its parts.
     """
 
     def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
@@ -112,7 +112,7 @@ class Moore(Headed):
     experts. Heads per task are the paper's multi-head variant.
 
     Our additions: the mixture is multiplied by the root of its width, so that its entries are as large as the entries
-    of another layer, and passes through the config's non-linearity; w starts as a random direction of length 1.
+    of another layer, and passes through the config's non-linearity; w is initially a random vector of unit norm.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class PaCo(nn.Module):
     A layer is linear in its parameters, so the composed layer's output is the mixture of the K layers' outputs; the
     non-linearity follows. The task's one-hot selects w_k and is not fed to the layers.
 
-    Our changes: actor and each critic have their own w, which starts as a random direction of length 1. Biases of the
+    Our changes: actor and each critic have their own w, which is initially a random vector of unit norm. Biases of the
     output are not composed, because the actor's biases hold its initial standard deviation. We omit the paper's masking
     and restart of tasks whose loss explodes.
     """
@@ -185,7 +185,7 @@ class PaCo(nn.Module):
 class SoftModules(Headed):
     """Soft modularisation: layers of modules, with soft routes between them for each task (Yang et al. 2020).
 
-    Let f(s) and h(k) be embeddings of state s and task k, and e their product, entry by entry. The logits of the routes
+    Let f(s) and h(k) be embeddings of state s and task k, and e their elementwise product. The logits of the routes
     are p^1 = D^1 relu(e) and p^l+1 = D^l+1 relu(U^l p^l * e), and the input of module i is g_i = sum_j softmax_j(p_ij)
     relu(W_j g_j). The first entry of ``hidden`` is the width of f(s); each further entry is the width of a layer of
     modules. Our changes: the head weights the modules of the last layer, while the paper adds them up; f is one layer;
@@ -238,9 +238,9 @@ class SoftModules(Headed):
 
 
 class Towers(Headed):
-    """``shared`` common layers, followed by separate layers of each task; with 0 each task has its own network.
+    """Layers that all tasks share (``shared`` of them), followed by separate layers for each task.
 
-    The task's one-hot selects the layers and is not fed to them.
+    If ``shared`` is 0, each task has its own network. The task's one-hot selects the layers and is not fed to them.
     """
 
     def __init__(

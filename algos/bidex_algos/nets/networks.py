@@ -18,11 +18,11 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh
 Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
 Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; without any, a map is linear
 MakeNetwork = Callable[..., Any]
-"""Makes a network from the arguments of :class:`MLP`; its ``output_bias`` are the biases of the output (outputs,)."""
+"""Makes a network from the arguments of :class:`MLP`; its ``output_bias`` (outputs,) holds the biases of the output."""
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
-    """Return whether hidden layers run in bfloat16; auto: yes on CUDA, or on a CPU with AMX tiles or AVX-512's BF16."""
+    """Return whether hidden layers run in bfloat16; ``auto``: on CUDA, and on CPUs with AMX tiles or AVX-512's BF16."""
     if setting != "auto":
         return setting == "on"
     if device.type == "cuda":

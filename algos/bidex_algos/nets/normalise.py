@@ -14,7 +14,7 @@ _FOREVER = 1e18  # a count so large that further observations have no weight
 
 
 class RunningStats(nn.Module):
-    """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element, in float64.
+    """Mean and variance of each element of a stream, in float64, merged batch by batch (Chan et al.).
 
     If ``max_count`` bounds the count, older batches fade.
     """
@@ -62,8 +62,8 @@ class RunningStats(nn.Module):
 class ObservationNormaliser(nn.Module):
     """Scales observations to zero mean and unit variance and clips them, except columns of ``inputs.unscaled``.
 
-    Statistics of the ``measured`` columns change only in :meth:`update` (never while ``settled``), so that the sampling
-    policy and the update see the same rollout. If not ``enabled``, the module is the identity.
+    Statistics of the other columns (``measured``) change only in :meth:`update`, so that the sampling policy and the
+    update see the same rollout. They do not change while ``settled``. If not ``enabled``, the module is the identity.
     """
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
@@ -103,7 +103,7 @@ class ObservationNormaliser(nn.Module):
 
     @torch.no_grad()
     def keep(self) -> None:
-        """Freeze the statistics of columns that have varied, because the network's weights were made for them."""
+        """Freeze the statistics of columns that have varied, because the network was trained with these statistics."""
         varied = (self.stats.count > 0) & (self.stats.var > _FLOOR**2)  # variances begin at 1
         self.stats.count[varied] = _FOREVER
 
@@ -129,7 +129,10 @@ def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) ->
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Normalises an observation by the statistics of its task, one of ``tasks``, which the group ``task_id`` shows."""
+    """Normalises an observation by the statistics of its task, which the group ``task_id`` shows.
+
+    ``tasks`` is the number of tasks.
+    """
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)

@@ -60,7 +60,7 @@ class PointNet(nn.Module):
         return (self.shared[:-1](chosen) * last.weight).sum(dim=2) + last.bias
 
     def _parts(self, points: Tensor) -> tuple[Tensor, ...]:
-        """Split the clouds on a CPU so that the results for each part fit its cache."""
+        """Split the clouds into parts; on a CPU the results for each part fit into the cache."""
         if points.device.type != "cpu":
             return (points,)
         return points.split(max(1, _CACHED // (points.shape[1] * (self.size - 3))))

@@ -114,7 +114,7 @@ def gaussian_policy(
     config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
     make: type[GaussianActor] = GaussianActor
 ) -> GaussianPolicy:  # fmt: skip
-    """Make a policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
+    """Make a policy with the networks of a learner's config and weights from ``init``, a CPU generator."""
     if config.policy_heads:
         heads = shape.num_id_columns
     else:

@@ -115,7 +115,7 @@ class BCQPolicy(nn.Module):
         self.register_buffer("codes", bounded(torch.randn(config.candidates, self.model.codes, generator=generator)))
 
     def propose(self, actor: nn.Module, obs: Tensor, codes: Tensor) -> Tensor:
-        """Return actions (B, a) of codes (B, z), changed by ``actor``, for normalised observations (B, d)."""
+        """Decode codes (B, z) to actions (B, a), changed by ``actor``, for normalised observations (B, d)."""
         return self.changed(actor, obs, self.model.decode(obs, codes))
 
     def changed(self, actor: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:

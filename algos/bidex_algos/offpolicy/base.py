@@ -106,9 +106,9 @@ class ReturnScale:
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; target networks estimate the value of the next state.
 
-    With several processes each has a replay and draws ``batch_per_task`` transitions of each task, ordered by task
-    (``task_of_draw``). ``gamma_of_rows`` are the discounts of the environments, ``gamma_of_draw`` those of a draw's
-    transitions.
+    Each process has its own replay and draws ``batch_per_task`` transitions of each task, ordered by task
+    (``task_of_draw``). ``gamma_of_rows`` holds the discounts of the environments, and ``gamma_of_draw`` holds the
+    discounts of a draw's transitions.
     """
 
     config: OffPolicyConfig
@@ -263,7 +263,8 @@ class OffPolicy(Learner):
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
         """Take one step of the named optimisers on ``loss``, summed over processes.
 
-        Returns ``numbers`` (n,), summed over processes. Only gradients of the parameters ``clipped`` are clipped.
+        Returns ``numbers`` (n,), summed over processes. ``parameters`` are given by the name of their optimiser; only
+        gradients for the optimiser named ``clipped`` are clipped.
         """
         weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
@@ -291,6 +292,6 @@ class OffPolicy(Learner):
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if the world or the replay had another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if the world's or replay's size differs."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)

@@ -2,8 +2,8 @@
 
 Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), with Z' the mean of both critics'
 distributions. The critics are wide residual networks. Rewards are divided by their task's largest return (equation 2 of
-the paper). The networks read the task as a learned vector of length 1. Everything else is described in ``mtsac.py`` and
-``categorical.py``; see ``docs/learners/brc.md``.
+the paper). The networks read the task as a learned vector of unit norm. Everything else is described in ``mtsac.py``
+and ``categorical.py``; see ``docs/learners/brc.md``.
 """
 
 import math
@@ -62,7 +62,7 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
     critic_hidden: Layers = (256, 256, 256)
     """Width of the critics' layers, once for the first layer and once for each residual block of two layers."""
-    hidden: Layers = (256, 256)  # Width of the actor's layers, listed in the same way.
+    hidden: Layers = (256, 256)  # Width of the actor's layers, listed as in critic_hidden.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     task_embedding: Whole = 32
     """Size of a learned vector that each network reads instead of the task's one-hot; 0: networks read the one-hot."""

@@ -1,7 +1,7 @@
 """FlashSAC: SAC with bounded networks and few updates with large batches (Kim et al. 2026, arXiv 2604.04539).
 
 Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), where Z' comes from the critic with the lower
-mean. The rows of a layer's weights have length 1, and batch norms bound the layer's outputs. A critic processes (s, a)
+mean. The rows of a layer's weights have unit norm, and batch norms bound the layer's outputs. A critic processes (s, a)
 and (s', a') in one batch. Each environment repeats its noise for some steps. Everything else is described in
 ``mtsac.py`` and ``categorical.py``; for differences from the paper see ``docs/learners/flashsac.md``.
 """
@@ -66,10 +66,11 @@ class FloatRMSNorm(nn.RMSNorm):
 
 
 class UnitMLP(MLP):
-    """Batch norm, a layer, inverted blocks, RMS norm, output; replaces :class:`MLP` and takes its arguments.
+    """A batch norm, a linear layer, inverted blocks, an RMS norm and an output layer, one after another.
 
-    ``hidden`` lists one width several times: once for the first layer and once for each block. ``output_gain`` and
-    ``layer_norm`` have no effect. Batch norms use running statistics except within :func:`by_batch`.
+    The class replaces :class:`MLP` and takes its arguments. ``hidden`` lists one width several times: once for the
+    first layer and once for each block. ``output_gain`` and ``layer_norm`` have no effect. Batch norms use running
+    statistics except within :func:`by_batch`.
     """
 
     def __init__(
@@ -90,9 +91,9 @@ class UnitMLP(MLP):
 
     @torch.no_grad()
     def to_sphere(self) -> None:
-        """Scale each row of a layer's weights to length 1, and the weights of each norm to length sqrt(n).
+        """Scale each row of a linear layer's weights to norm 1, and weights of normalisation layers to norm sqrt(n).
 
-        The weights of a norm of width n are its scales and shifts, taken as one vector.
+        The weights of a normalisation layer for n features are its scales and shifts, taken as one vector.
         """
         for layer in (*self.body.modules(), self.head):
             if isinstance(layer, nn.Linear):
@@ -123,7 +124,7 @@ class FlashSACConfig(CategoricalConfig, MTSACConfig):
     critic_hidden: Layers = (128, 128, 128)
     """Width of the critics' layers, once for the first layer and once for each block; inside a block layers are four
     times as wide."""
-    hidden: Layers = (64, 64, 64)  # Width of the actor's layers, listed in the same way.
+    hidden: Layers = (64, 64, 64)  # Width of the actor's layers, listed as in critic_hidden.
     value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     updates_per_step: Count = 2  # Updates of the critics after each vector step.
     policy_delay: Count = 2  # Updates of the critics for each update of the actor and the temperatures.
@@ -183,7 +184,7 @@ class FlashSAC(Categorical, MTSAC):
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         critics = super()._make_critics(inputs, heads)
-        # With weights of length 1, the network could not overcome the biases of a narrow initial distribution, which
+        # With weights of unit norm, the network could not overcome the biases of a narrow initial distribution, which
         # reach 50.
         for net in _of(critics):
             nn.init.zeros_(net.head.bias)

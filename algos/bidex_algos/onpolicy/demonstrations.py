@@ -34,7 +34,7 @@ class Demonstrations:
         self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
 
     def weight(self, env_steps: int) -> float:
-        """Return the weight of the term after ``env_steps``: it is halved every ``HALF_LIFE``."""
+        """Return the weight of the term after ``env_steps`` steps; it is halved every ``HALF_LIFE`` steps."""
         return WEIGHT * 0.5 ** (env_steps / HALF_LIFE)
 
     def draw(self) -> tuple[Tensor, Tensor]:
@@ -76,7 +76,7 @@ class Demonstrations:
             adam.step()
 
     def check(self, learner: str, stored: dict[str, float] | None) -> None:
-        """Raise BidexError if ``stored``, the fingerprint in a checkpoint (None: no fingerprint), is of other data."""
+        """Raise BidexError if a checkpoint has a fingerprint, ``stored``, that is not the fingerprint of these data."""
         if stored is not None and stored != self.fingerprint:
             raise BidexError(
                 f"{learner}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "

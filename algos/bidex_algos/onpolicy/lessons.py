@@ -35,7 +35,7 @@ class Lessons:
     The squared error of each entry of an action is divided by the variance of this entry among the labels of the class;
     all classes have equal weight. The newest ``samples`` labels of each process are kept, and at least ``least_steps``
     labels of each environment. An update uses ``batch_size`` labels, split evenly over the classes with a teacher. The
-    defaults are those for PPO.
+    default values are for PPO.
     """
 
     def __init__(

@@ -49,7 +49,7 @@ class OnPolicyConfig(LearnerConfig):
     value_heads: bool = True  # Give the critic one output per task instead of one for all.
     point_widths: Widths = (32, 64)
     """Widths of the layers that all points of a point cloud share (PointNet), if the world shows a point cloud."""
-    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    init_std: Positive = 0.8  # Initial standard deviation of the actions.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
     rollout_steps: Count = 8  # Steps in every environment between two updates.
     gamma: Fraction = 0.93  # Discount factor per step.
@@ -75,7 +75,7 @@ class MTPPOConfig(OnPolicyConfig):
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
     epochs: Count = 4  # Passes over the rollout per update.
     clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
-    learning_rate: Positive = 3e-4  # Adam's step size at the start.
+    learning_rate: Positive = 3e-4  # Adam's initial step size.
     desired_kl: Positive = 0.03
     """Desired KL of the sampling policy from the current policy. The step size is divided by 1.5 if the KL is above
     twice this value, and multiplied by 1.5 if the KL is below half of it."""
@@ -90,7 +90,7 @@ class MTPPOConfig(OnPolicyConfig):
     teacher_updates: Whole = 20
     """With --teacher: DAgger updates per PPO update while a taught class never succeeds, fewer later; 0: none."""
     critic_first: Whole = 0
-    """Environment steps at the start in which only the critic learns. Use this for a policy that begins with a skill
+    """Number of first environment steps in which only the critic learns. Use this for a policy that begins with a skill
     (cloned, or from --start-from), because updates with an untrained critic would spoil the skill."""
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ class MTTRPOConfig(OnPolicyConfig):
     max_kl: Positive = 0.1  # Upper bound of the mean KL between the sampling and the new policy in an update.
     damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal; shortens steps along poorly known directions.
     cg_iterations: Count = 10  # Conjugate-gradient iterations.
-    fisher_stride: Count = 4  # One in this number of samples enters the Fisher matrix; it needs fewer than gradients.
+    fisher_stride: Count = 4  # Every fisher_stride-th sample enters the Fisher matrix, which needs few.
     backtracks: Count = 10  # Points that the line search tries.
     backtrack_factor: Fraction = 0.8  # Factor by which the line search shortens the step at each try.
     accept_ratio: Fraction = 0.1

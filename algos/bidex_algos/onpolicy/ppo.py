@@ -20,9 +20,9 @@ class PPOConfig(LearnerConfig):
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
     epochs: Count = 4  # Passes over the collected data per update.
     clip: Positive = 0.2  # Distance of the likelihood ratio from 1 at which the objective is clipped.
-    learning_rate: Positive = 3e-4  # Adam's step size at the start.
+    learning_rate: Positive = 3e-4  # Adam's initial step size.
     adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 if the KL is above twice desired_kl; multiply it by 1.5 if below half of it."""
+    """Divide the step size by 1.5 if the KL exceeds twice desired_kl; multiply it by 1.5 if the KL is below half."""
     desired_kl: Positive = 0.03  # Desired KL of the sampling policy from the current policy, for adaptive step sizes.
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
     critic_learning_rate: Positive | None = 1e-3  # Fixed step size for the critic; None: the same as the actor's.
@@ -91,7 +91,7 @@ def policy_loss(
 
 
 def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
-    """Return the factor of a step size: 1 / 1.5 above twice the desired KL, 1.5 below half of it, and 1 in between."""
+    """Return the factor of a step size: 1 / 1.5 if the KL is above twice ``desired_kl``, 1.5 if below half, else 1."""
     return torch.where(kl < 0.5 * desired_kl, 1.5, torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0))
 
 
@@ -112,9 +112,10 @@ class _Adam(torch.optim.Adam):
 
 
 class AdaptiveAdam:
-    """Adam whose step size is divided by 1.5 above twice the desired KL and multiplied by 1.5 below half of it.
+    """Adam whose step size is multiplied by :func:`factor_of` of the last step's KL before each step.
 
-    The step size is a tensor, so the host does not wait for the device. If ``desired_kl`` is None, it is constant.
+    The step size is a tensor, so the host does not wait for the device. If ``desired_kl`` is None, the step size is
+    constant.
     """
 
     def __init__(
