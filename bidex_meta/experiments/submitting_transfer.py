@@ -1,7 +1,8 @@
 """Leaderboard entries of transfers: how much a run's policy helps to learn the held-out classes of its suite."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -50,7 +51,12 @@ class _Transfer:
     @property
     def played(self) -> list[SubmittedRun]:
         """Return the runs that started from the run's policy, class by class."""
-        return [run for runs in self.transferred.values() for run in runs]
+        return _in_order(self.transferred)
+
+
+def _in_order(runs: Mapping[str, Sequence[SubmittedRun]]) -> list[SubmittedRun]:
+    """Return the runs of all classes, class by class."""
+    return list(chain.from_iterable(runs.values()))
 
 
 def submit_transfer(
@@ -123,7 +129,7 @@ def _read(folder: RunFolder, transfer: Path) -> _Transfer:
         folders.setdefault((name, own), {})[config.seed] = member
     seeds = sorted(folders.get((next(iter(classes)), True), {}))
     kinds = []
-    for key in ((name, own) for name in classes for own in (True, False)):
+    for key in product(classes, (True, False)):
         of_seeds = folders.get(key, {})
         if not seeds or sorted(of_seeds) != seeds or not all(member.evaluated for member in of_seeds.values()):
             raise BidexError(
@@ -164,7 +170,7 @@ def _played(found: _Transfer, episodes: int, device: str) -> Json:
         "format": FORMAT, "suite": new.short_name, "track": TRANSFER, "algorithm": stored.algo,
         "train_tasks": stored.tasks_per_class, "steps": [found.run.steps], "seed": seed, "episodes": episodes,
         "new": {"trials": 1, "rollouts": 0, "shots": shots}, "conditions": asdict(conditions(open_worlds(config))),
-        "start": found.run.weights, "scratch": [run.weights for runs in found.scratch.values() for run in runs],
+        "start": found.run.weights, "scratch": [run.weights for run in _in_order(found.scratch)],
         "seeds": found.seeds, "budget": TRANSFER_STEPS, "stated": stated([found.run]), "receipt": receipt(found.played),
     }  # fmt: skip
 

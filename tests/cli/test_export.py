@@ -58,6 +58,7 @@ def test_a_file_does_what_torch_does_for_any_number_of_rows(number: int, folder:
     obs = torch.randn(5, 16)
     obs[:, 13:] = torch.eye(3)[[0, 2, 1, 1, 0]]
     (actions,) = onnxruntime.InferenceSession(content).run(None, {"observations": obs.numpy()})
+    made.low_precision = False  # on a CPU with AVX-512 BF16 the policy itself computes in bfloat16
     wanted = made.eval_action(obs)  # type: ignore[operator]
     assert wanted.std() > 0.05
     torch.testing.assert_close(torch.from_numpy(actions), wanted, atol=1e-5, rtol=0.0)
@@ -89,7 +90,7 @@ def test_a_policy_whose_file_would_differ_is_refused() -> None:
         def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
             return obs[:, :4] if torch.compiler.is_exporting() else 1e-4 + obs[:, :4]
 
-    with pytest.raises(BidexError, match=r"differ by 0\.0001 from"):
+    with pytest.raises(BidexError, match=r"differ from torch's by 0\.0001"):
         exported(Drawn(), SHAPE.state_dict(), {})
 
 

@@ -177,7 +177,7 @@ def test_a_submitted_agent_is_not_verified_and_says_how_it_was_trained(result: P
     title, _, head, _, row, *_ = leaderboard_table("ML4", result.parent / "data")
     assert title == "**ML4, adaptation, reward only**" and "after 2" in head
     assert row.startswith("| 1 | scout (not verified) |") and "| 3 × 1 |" in row
-    assert "There is" in refused(*words, "--track", "privileged")
+    assert "exists already" in refused(*words, "--track", "privileged")
     assert "got both" in refused(*words, result.parent, "--track", "privileged")
     assert not list(leaderboard_table("ML1", result.parent / "data"))
 

@@ -382,7 +382,7 @@ def test_a_submission_is_played_by_the_seed_of_its_weights_and_ranked(
     assert entry.seed == evaluation_seed(entry.receipt.weights) and sorted(task_seeds) == [0, 1, *[entry.seed] * 2]
     lines = list(leaderboard_table("MT4", tmp_path / "data"))
     assert lines[0] == "**MT4, multi-task**" and lines[4].startswith("| 1 | mtppo | ")
-    assert "There is" in refused("submit", *runs, "--out", out, *TUNED)
+    assert "exists already" in refused("submit", *runs, "--out", out, *TUNED)
     assert "Two of the runs have the same seed" in refused(
         "submit", runs[0], runs[0], "--name", "x", "--out", out, *TUNED
     )

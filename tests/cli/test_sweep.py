@@ -191,7 +191,7 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
         assert main(["sweep", str(file)]) == 2
         assert "Another sweep works in" in capsys.readouterr().err
     assert main(["sweep", str(file)]) == 0
-    with pytest.raises(BidexError, match="num_envs is 8 there, not 16"):
+    with pytest.raises(BidexError, match="num_envs is 8, not 16"):
         state(SweepPlan.read(file).runs[0], replace(CONFIG, num_envs=16))
     more = state(SweepPlan.read(file).runs[0], replace(CONFIG, steps=12))
     assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"

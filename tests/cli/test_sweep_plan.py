@@ -104,8 +104,8 @@ def test_an_arm_may_leave_seeds_out(runs) -> None:
         (('algos = ["ppo"]', ""), "expected algos"),
         (('tasks = ["HandOver"]', ""), "expected suites or tasks"),
         (('"tiny"', '"../up"'), "name: expected"),
-        (("steps = 6", "seed = 6"), "overrides.seed: the file's"),
-        (("steps = 6", "threads = 6"), "overrides.threads: the file's"),
+        (("steps = 6", "seed = 6"), "overrides.seed: other entries of the file"),
+        (("steps = 6", "threads = 6"), "overrides.threads: other entries of the file"),
         (("[0, 1]", "[0, 1]\ngrid = { num_envs = 3 }"), "grid.num_envs: expected a list of values"),
         (("[0, 1]", '[0, 1]\narms = [{ name = "x" }]'), r"arms\[.*algo: expected it to be there"),
         (

@@ -92,7 +92,7 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     refused("names no commit")
     (bad / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT}}))
     (bad / "metrics.jsonl").write_text("")
-    refused("holds nothing")
+    refused("is empty")
     collect(good, into=into)
     collect(good, into=into)  # once more is no harm
     change(good, seed=5)
