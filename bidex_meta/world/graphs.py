@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 Result = TypeVar("Result")
-"""Nested containers of tensors that a stretch of work returns. The work may also read and rebind the state."""
+"""Nested containers of tensors that a stretch of work returns. The work may also read and rebind the world's state."""
 
 Together = Callable[[Sequence[Callable[[], None]]], None]
 """A function that runs jobs that do not depend on each other, such as ``SideBySide.run``."""

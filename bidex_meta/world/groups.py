@@ -36,7 +36,7 @@ class Slot:
     """Variations, shape (n, variation_space.size), float64."""
     reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
     gamma: BelowOne | None = None
-    """Discount factor per step that learners must use for this slot; None: the learner's own."""
+    """Discount factor per step that learners must use for this slot; None means that learners use their own."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class Randomiser:
         self._keys.copy_(keys)
 
     def begin(self, mask: Tensor, number: Tensor) -> None:
-        """Draw for new episodes in the environments of a mask (n,), and change the environments' models.
+        """Draw factors and delays for new episodes in the environments of a mask (n,), and change their models.
 
         ``number`` (n,) is the number of each environment's episode.
         """
@@ -180,7 +180,7 @@ class _Models:
 def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
     """Return the standard deviation of the noise in each slot's observations, (slots, columns), float32.
 
-    Goals and actions have no noise, nor have the columns that a point cloud replaces (``hidden``, one list per slot).
+    Goals, actions and the columns that a point cloud replaces have no noise. ``hidden`` lists these columns per slot.
     """
     table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
     for row, layout, zero in zip(table, layouts, hidden, strict=True):

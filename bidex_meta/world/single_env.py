@@ -1,4 +1,4 @@
-"""Single environments of a suite's task classes, used as Meta-World's: `env = cls()`, then `env.set_task(task)`.
+"""Single environments of a suite's task classes, used like Meta-World's: `env = cls()`, then `env.set_task(task)`.
 
 They serve code that was written for Meta-World; `Benchmark.make_world` makes all environments of a suite at once.
 """
@@ -95,7 +95,7 @@ copyreg.pickle(_Remade, _reduced)
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     """A task class as an environment that plays the task it is given; its subclasses are listed in `train_classes`.
 
-    Classes and environments pickle and copy: a copy has the same task and continues bit for bit.
+    Classes and environments can be pickled and copied: a copy has the same task and continues bit for bit.
 
     Observations are those of the suite's worlds without the one-hot: they are padded to the suite's widest class, and
     goal entries are zero if the suite hides goals. If the suite shows point clouds, a cloud follows and replaces the
