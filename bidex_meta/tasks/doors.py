@@ -44,9 +44,10 @@ class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
     Leaf and handle at +y belong to the right hand. A task freezes the door's position along y and one start angle for
-    both leaves; an episode draws nothing. The goal block holds the pose of the door's base, which is also the object's
-    pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left leaf (hinge
-    2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is from its angle.
+    both leaves; an episode makes no further draws. The goal block holds the pose of the door's base, which is also the
+    object's pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left
+    leaf (hinge 2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is
+    from its angle.
 
     The opening classes measure success along y: a single leaf that is open by 1.26 rad already brings the handles 0.5 m
     apart. The Inward classes have the same door upside down, so that it swings towards the hands. Their handle points
