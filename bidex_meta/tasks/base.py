@@ -109,10 +109,9 @@ class TaskClass(ABC):
         needs: Sizes for the fixed buffers of mujoco_warp: the maximum numbers of contacts and constraint rows in 30,208
             states under rough actions. ``python -m tools.bench capacity --task NAME --steps 30000`` measures them. A
             class that was not measured has the largest numbers of all classes.
-        camera_target: Point at the centre of pictures, world, metres; ``camera_distance``: distance of the camera from
-        it. camera_angle: Azimuth and elevation of the camera, degrees, chosen so that hands, objects and goal are
-        visible. depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks
-        down
+        camera_target: Point at the centre of pictures, world, metres; ``camera_distance``: the camera's distance to it.
+        camera_angle: Azimuth and elevation of the camera, degrees, chosen so that hands, objects and goal are visible.
+        depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
             at ``camera_target`` from the front.
     """
 
