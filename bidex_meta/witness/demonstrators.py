@@ -55,13 +55,13 @@ class OpenLoopReplay:
 
 
 class Scripted:
-    """Plays the scripts of a world's classes; each script acts on the present state of its environment.
+    """Plays the scripts of a world's classes; each script reads the present state of its environment.
 
     ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots whose scripts play (None: all); other slots
-    get zero actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise``
-    (a standard deviation) or another policy's actions. When a script has ended, its last action is repeated. With
-    ``misled`` each script is given the next task of the pool instead of its own task, as if it had to guess the goal.
-    Raises BidexError for a class without a script.
+    get zero actions. A script begins with its environment's episode. Because it reads the state, it corrects for
+    ``noise`` on the actions (a standard deviation) or for the actions of another policy. When a script has ended, its
+    last action is repeated. With ``misled`` each script is given the next task of the pool instead of its own task, as
+    if it had to guess the goal. Raises BidexError for a class without a script.
     """
 
     def __init__(
