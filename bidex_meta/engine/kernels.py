@@ -171,7 +171,7 @@ class Guard:
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Mark and disarm worlds in which a number that no substep checks was broken by hand.
+        """Mark and disarm worlds with a bad number, written from outside, in fields that no substep checks.
 
         This runs before each control step.
         """

@@ -21,7 +21,7 @@ _IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
 
 @dataclass
 class Lean:
-    """Copies of the model for the parts of a control step; the copies share its arrays.
+    """Copies of the model for the parts of a control step; the copies share the model's arrays.
 
     Attributes:
         whole: The complete model.
