@@ -181,7 +181,7 @@ _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 
 
 class PourWater(ReachTask):
-    """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
+    """Pour water from a kettle, held by the right hand, into a bucket, held by the left hand.
 
     The table is 0.5 x 1 m and 40 cm high. Observation: Table 40 (428). Reward: equation 19. The kettle's point is its
     handle, and the bucket's point is its origin.
@@ -189,10 +189,10 @@ class PourWater(ReachTask):
     The spout's goal is on the bucket's axis, 1 cm below the rim if the bucket stands on the table. The goal moves with
     the bucket, but sinks by 5 cm for each cm by which the bucket's floor is lifted, to at most 20 cm below its height
     on the table. If the goal were fixed to the bucket, spout and goal would also meet if the bucket were lifted and
-    tipped under an upright kettle. With the sinking goal, the spout only gets near it if the kettle is tilted over the
-    rim. At less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away,
-    and from 60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start,
-    tilted by 40 degrees towards the spout.
+    tipped under an upright kettle. The spout only gets near the sinking goal if the kettle is tilted over the rim. At
+    less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away, and from
+    60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start, tilted by
+    40 degrees towards the spout.
 
     A task shifts and turns the bucket, and the kettle with the water. The water consists of drops of 5 mm radius
     without friction, which no observation shows. With twelve drops, the default, physics takes 1.4 times as long as in

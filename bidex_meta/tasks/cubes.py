@@ -304,7 +304,7 @@ class ReOrientation(TaskClass):
             cube.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        """Return ``goal1``, ``goal2``: poses (n, 7); ``goal1_inverse``, ``goal2_inverse``: inverse rotations (n, 4)."""
         frozen = {}
         for i, centre in enumerate(((0.0, -0.76, 0.56), (0.0, -0.39, 0.56)), start=1):
             position = constant(centre, variation).expand(len(variation), 3)
@@ -350,7 +350,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals; with wide variation as rods along x (red), y (green) and z (blue), which show turns."""
+        """Return the goals. With wide variation a goal is three rods along its x (red), y (green) and z (blue)."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]
@@ -367,9 +367,10 @@ def _axes(goal: Tensor) -> list[Ghost]:
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
-    """Rotate each cube whose orientation is near its goal's by 180 degrees about the world's x, in place.
+    """Rotate cubes, in place, by 180 degrees about the world's x if they start too near their goal's orientation.
 
-    "Near" means within 0.5 rad. ``cube`` (n, 7) are poses, ``goal_inverse`` (n, 4) inverses of the goals' orientations.
+    "Too near" means within 0.5 rad. ``cube`` holds poses (n, 7); ``goal_inverse`` holds the inverses of the goals'
+    orientations (n, 4).
     """
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < 0.5

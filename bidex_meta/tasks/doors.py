@@ -32,7 +32,7 @@ _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)),
 _HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
 """Points that the hands must reach, in the leaves' frames, metres; x is negative for an Inward door."""
 _POLE = (0.025, 0.025, 0.65)
-"""Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
+"""Semi-axes of the goal in pictures, metres: a pole at the handle, visible above a leaf in front of it."""
 _LEAST_SHARE = 0.1
 """Distance of each handle from the door's middle along y that success requires, metres. If only one leaf of an Inward
 door opens, the handles are 0.497 m apart, and more than 0.5 m if the leaf is pushed against its stop, which yields."""

@@ -202,9 +202,9 @@ class BatchedWorld(VectorEnv, ABC):
         """
 
     def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
-        """Count new episodes in the environments of a mask.
+        """Reset the counters for new episodes in the environments of a mask.
 
-        The episodes play the tasks ``task_index``. With ``stagger`` a ``share`` of the time limit has already passed.
+        The episodes play the tasks ``task_index``. With ``stagger`` a ``share`` of their time limits counts as elapsed.
         """
         self.episodes.number = self.episodes.number + mask
         self.task_index = torch.where(mask, task_index, self.task_index)
@@ -309,7 +309,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment: its entry if there is one per environment, else the whole value."""
+        """Return an attribute once per environment: the environment's entry if there is one, else the whole value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:

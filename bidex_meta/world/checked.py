@@ -118,9 +118,9 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """Return the slots with the pools of a saved state, checked against the world's own state and slots.
+    """Return the slots with the task pools of a saved state.
 
-    ``task_id`` (n,): slot of each environment.
+    The state is first checked against the world's ``own`` state and slots. ``task_id`` (n,): slot of each environment.
 
     Raises BidexError if the state belongs to another world or is damaged.
     """
@@ -208,7 +208,8 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
     """Call a class's methods once, for a few rows of its first task and sensors that all read 0.
 
     ``sensors`` has the engine's precision and device; ``observed`` says whether ``observe`` is called too. Raises
-    BidexError if a method returns something else than expected; the message names class, method and both values.
+    BidexError if a method returns anything but what is expected; the message names class, method, what was expected and
+    what was returned.
     """
     task = scene.task
     name = type(task).__name__

@@ -73,7 +73,7 @@ class ObservationGroup:
     """Entries of an observation that have the same kind in every environment of a world."""
 
     name: str
-    """``right_hand``, ``left_hand``, ``object`` (all other entries of a class), ``goal`` (zeros if a suite hides it),
+    """``right_hand``, ``left_hand``, ``object`` (a class's entries in no other group), ``goal`` (zeros if hidden),
     ``padding``, ``task_id`` (one-hot), ``task`` for entries whose kind differs by slot (in MT4 these are padding in
     three classes and the second egg in one), or ``last_step`` (in worlds of trials: the last action, the last reward,
     and 1 if an episode ended). Worlds that know no such kinds have one group ``state``. The groups depend on the
@@ -158,7 +158,7 @@ class VectorWorld(Protocol):
 
 @runtime_checkable
 class TaskWorld(VectorWorld, Protocol):
-    """A world whose environments play known tasks of their slot's pool: for evaluation and meta-learning."""
+    """A world whose environments play known tasks of their slot's pool, as evaluation and meta-learning need."""
 
     slot_env_ids: list[slice]
     """Contiguous environments of each slot, as slices."""

@@ -56,7 +56,7 @@ class Group:
     engine: Engine
     members: tuple[Member, ...]
     env_ids: Tensor
-    """Environment of each simulation, shape (num,), int64."""
+    """Index in the world of each simulation's environment, shape (num,), int64."""
     span: slice | None
     """The group's environments as a slice if they are contiguous, else None."""
 

@@ -1,7 +1,7 @@
 """The dependence of a scene's model on the factors of a randomisation.
 
 Every number that depends on a factor is multiplied by a power of the factor. This includes the numbers that
-``mj_setConst`` would compute, because a call of it would take as long as a step.
+``mj_setConst`` would compute, because calling it would take as long as a step.
 """
 
 from collections.abc import Iterator, Sequence

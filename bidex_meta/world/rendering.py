@@ -199,7 +199,7 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
 
 
 def ghosts(world: "PartedWorld", env_id: int) -> list[DrawnGhost]:
-    """Return the goals of an environment's task in its present state, or nothing if the world hides them.
+    """Return the goals of an environment's task in the present state; the list is empty if the world hides goals.
 
     Every picture, film and view calls this function, so that none shows what observations hide.
     """

@@ -54,7 +54,7 @@ class EnvRecipe:
     """True if the hands' bases move, False if they are fixed, None for the class's default."""
     options: tuple[tuple[str, float | str], ...]
     padded_size: int
-    """Entries of an observation, without a point cloud."""
+    """Number of entries of an observation, without a point cloud."""
     hides_goal: bool
     reward_scale: float
     class_name: str | None = None

@@ -468,7 +468,7 @@ class World(BatchedWorld):
         return self.slots[slot].task_class.instruction(variation, self.hides_goals)
 
     def instructions(self) -> list[str]:
-        """Return for each environment a sentence that says what its task asks for."""
+        """Return for each environment a sentence that describes its task."""
         pools = self.pools
         places = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
         return [self.instruction(slot, pools[slot][index]) for slot, index in places]
@@ -512,7 +512,7 @@ def _with_entries(slot: Slot, env_ids: slice) -> Slot:
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text. For an object's file this is only its name, because folders may move."""
+    """Return an option of a class as text. For an object's file this is only the file name, because folders may move."""
     if isinstance(value, str):
         return Path(value).stem
     return str(value)
