@@ -185,7 +185,7 @@ class EggTask(TaskClass):
                 self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``goal_inverse``, ...: inverse rotations (n, 4)."""
+        """Return ``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``goal_inverse``, ...: inverse rotation (n, 4)."""
         frozen = {}
         for k, i in enumerate(self.numbers):
             frozen |= frozen_goal(goal_pose(variation[:, 3 * k : 3 * k + 3], variation[:, -2:]), f"goal{i}")

@@ -76,7 +76,7 @@ class HandController:
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
 
     def orientation(self, sensor: str) -> Tensor:
-        """Return a sensor's quaternion, (x, y, z, w), (4,)."""
+        """Return the orientation (x, y, z, w) that a sensor measures, (4,)."""
         value = self.where(sensor)
         return xyzw(value / value.norm())
 

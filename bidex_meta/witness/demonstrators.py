@@ -18,10 +18,11 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class OpenLoopReplay:
-    """Plays the witness of each environment's class without observations; classes without a witness get zero actions.
+    """Plays the witness of each environment's class and ignores observations.
 
-    ``task_names`` are the classes of the world's slots, and ``task_id`` is the slot of each environment. ``actions`` is
-    the size of the world's actions, which may be padded. ``noise`` is the standard deviation of noise on actions.
+    Classes without a witness get zero actions. ``task_names`` are the classes of the world's slots, and ``task_id`` is
+    the slot of each environment. ``actions`` is the size of the world's actions, which may be padded. ``noise`` is the
+    standard deviation of noise on actions.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class _Class:
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
-        """Play the script of an environment; nothing is read before its first action is requested."""
+        """Play the script of an environment; the state is first read when the first action is requested."""
         place = self._member.env_ids.start + row
         tasks = self._world.num_slot_tasks[self._member.slot]
         given = (self._world.task_index[place : place + 1] + self._ahead) % tasks

@@ -166,7 +166,10 @@ class Replay:
 
     @property
     def found(self) -> bool:
-        """Return whether the actions are a witness: they must solve the start and eight of ten shifted starts."""
+        """Return whether the actions count as a witness.
+
+        They must succeed from the start and from at least eight of ten shifted starts.
+        """
         return self.first_success is not None and self.succeeded >= 8
 
 

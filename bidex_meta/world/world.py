@@ -512,7 +512,7 @@ def _with_entries(slot: Slot, env_ids: slice) -> Slot:
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text. For an object's file this is only the file name, because folders may move."""
+    """Return an option of a class as text, for an object's file only the file name, because folders may move."""
     if isinstance(value, str):
         return Path(value).stem
     return str(value)

@@ -43,7 +43,7 @@ _CLOSING = 0.015  # distance by which the target leads a hand that does not pres
 
 
 def ramp(value: float, first: float, last: float) -> float:
-    """Return 0 up to ``first``, 1 from ``last`` on, linear between."""
+    """Return 0 for values up to ``first``, 1 from ``last`` on, and interpolate linearly between."""
     return min(1.0, max(0.0, (value - first) / (last - first)))
 
 

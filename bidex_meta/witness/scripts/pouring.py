@@ -125,7 +125,7 @@ def _beside(way: Tensor, sign: float) -> float:
 def _next(way: Tensor, sign: float, half: float) -> Tensor:
     """Return the hand's next waypoint on its way over the bucket, to the bucket's side and down.
 
-    The waypoint (3,) and ``way`` are offsets from the bucket, in metres.
+    The waypoint (3,) and the hand's present position ``way`` are offsets from the bucket, in metres.
     """
     x, y, z = way.tolist()
     over = z - _UP

@@ -115,7 +115,7 @@ def push(hands: HandController) -> Actions:
     goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Move the fists to leaves opened towards the hands by ``angles``, or ``back`` metres off these leaves."""
+        """Move the fists to leaves opened towards the hands by ``angles``, or to points ``back`` metres off them."""
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
         yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 

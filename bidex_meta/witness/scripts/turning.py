@@ -56,5 +56,5 @@ def _knuckles(hands: HandController, side: str, what: str) -> float:
 
 
 def _falls(value: float, low: float, high: float) -> float:
-    """Return 1 up to ``low``, 0 from ``high`` on, linear between."""
+    """Return 1 for values up to ``low``, 0 from ``high`` on, and interpolate linearly between."""
     return min(1.0, max(0.0, (high - value) / (high - low)))
