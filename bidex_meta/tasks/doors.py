@@ -92,9 +92,10 @@ class _Door(ReachTask):
         return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); the leaves' angles, rad.
+        """Return the pose of the door and the angles of its leaves, rad.
 
-        ``angle`` (n, 1) is the start angle of both leaves. With wide variation ``leaves`` (n, 2) are the target angles.
+        ``goal``: pose of the door's base (n, 7); ``goal_inverse``: inverse of the base's rotation (n, 4); ``angle``:
+        start angle of both leaves (n, 1). With wide variation ``leaves`` (n, 2) are the target angles.
         """
         position = constant(_BASE, variation).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]

@@ -1,4 +1,4 @@
-"""Common parts of the throwing and catching classes: eggs, goal poses, the exponential reward of equations 1 to 5."""
+"""Common parts of the throwing classes: eggs, goal poses and the exponential reward of equations 1 to 5."""
 
 from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
@@ -185,7 +185,10 @@ class EggTask(TaskClass):
                 self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``goal_inverse``, ...: inverse rotation (n, 4)."""
+        """Return ``goal``, or ``goal1`` and ``goal2``: the poses of the goals (n, 7).
+
+        Further entries, with the suffix ``_inverse``, are the inverses of the goals' rotations (n, 4).
+        """
         frozen = {}
         for k, i in enumerate(self.numbers):
             frozen |= frozen_goal(goal_pose(variation[:, 3 * k : 3 * k + 3], variation[:, -2:]), f"goal{i}")

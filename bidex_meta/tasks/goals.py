@@ -37,7 +37,7 @@ def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
 
 
 def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Tensor:
-    """Return the quaternion of a body (from its sensor) times the inverse of its goal's, (x, y, z, w), shape (n, 4)."""
+    """Return a body's quaternion, from ``sensor``, times the inverse quaternion of its goal, (x, y, z, w), (n, 4)."""
     inverse = state.frozen[f"{goal}_inverse"]
     return state.once(("difference", sensor, goal), lambda: multiply(state.quaternion(sensor), inverse))
 

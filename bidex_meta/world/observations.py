@@ -125,7 +125,7 @@ class Observer:
 
 
 def _indices(scene: Scene, name: str) -> Tensor:
-    """Return the indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
+    """Return the indices of a sensor in ``sensordata``; those of a quaternion are in the order (x, y, z, w)."""
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
     if name.endswith("quaternion"):

@@ -108,7 +108,7 @@ class HeldObject:
         return x, y, z, w
 
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
-        """Lift the object off its palm, open the fingers that would penetrate it and lay the thumb flat.
+        """Lift the object off the palm, open the fingers that would penetrate it and lay the thumb flat.
 
         The object's poses (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in
         place.
