@@ -16,7 +16,7 @@ from bidex_meta.world.part import Part
 from bidex_meta.world.random import derived, normal, uniform
 
 _OBSERVATION, _ACTION, _PUSH = range(3)
-"""Streams of numbers within an episode."""
+"""Streams of random numbers within an episode, for noise in observations, noise in actions, and pushes."""
 _DELAY = "action_delay"
 
 
@@ -24,9 +24,10 @@ class Randomiser:
     """Draws factors, delays, noise and pushes for the environments of a world, and applies them."""
 
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
-        """``deviation`` (n, columns) is the standard deviation of the noise in the first columns of observations.
+        """Prepare the draws of all environments and the models of all parts.
 
-        Raises BidexError if the size of a mesh object is to vary.
+        ``deviation`` (n, columns) is the standard deviation of the noise in the first columns of observations. Raises
+        BidexError if the size of a mesh object is to vary.
         """
         self._rule = rule
         self._parts = parts

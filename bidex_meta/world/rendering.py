@@ -28,7 +28,7 @@ _MOST_RENDERERS = 32
 MOST_PIXELS = 1080
 """Edge of the largest square picture."""
 _SMALL = 320
-"""Pictures up to this width, in pixels, are drawn as tiles: faster, without reflections and with coarser shadows."""
+"""Pictures up to this width, pixels, are drawn without reflections and with coarser shadows, which is faster."""
 GHOST_ALPHA = 0.35
 """Opacity of goals."""
 

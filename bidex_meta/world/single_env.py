@@ -70,7 +70,7 @@ class EnvRecipe:
 
     @property
     def env_name(self) -> str:
-        """Return the name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
+        """Return the name by which tasks refer to the class; with the rules of version 2 it ends in ``-v2``."""
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
@@ -112,7 +112,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
     recipe: ClassVar[EnvRecipe]
     task_class: ClassVar[TaskClass]
-    """The class: scene, variations, observation, reward, success."""
+    """The task class, which defines scene, variations, observation, reward and success."""
 
     @checked_arguments
     def __init__(
@@ -157,7 +157,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @property
     def task_name(self) -> str:
-        """Return the task class's name with its version, as the class's tasks have it."""
+        """Return the name by which tasks refer to the class; with the rules of version 2 it ends in ``-v2``."""
         return self.recipe.env_name
 
     @property
