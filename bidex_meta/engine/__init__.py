@@ -1,1 +1,1 @@
-"""Physics engines behind one protocol. Tasks import only ``Capacity`` from this package, learners import nothing."""
+"""Physics engines behind one protocol. Tasks import only ``Capacity`` from here; learners import nothing from here."""

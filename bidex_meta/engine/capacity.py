@@ -11,7 +11,7 @@ from bidex_meta.utils.validation import Whole
 @checked_arguments
 @dataclass(frozen=True)
 class Capacity:
-    """Buffer sizes per world, or the largest part of the buffers that was in use."""
+    """Sizes of the buffers per world, or the peak use of each buffer."""
 
     contacts: (
         Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world

@@ -15,10 +15,10 @@ def choose_engine(
     device: str | torch.device, engine: str = "auto", threads: int | None = None, deterministic: bool = False,
     switches: str = ""
 ) -> tuple[torch.device, EngineMaker]:  # fmt: skip
-    """Return the device and its engine maker; ``threads`` are the threads of C MuJoCo, None takes all CPUs.
+    """Return the device and its engine maker; ``threads`` is the number of C MuJoCo's threads, by default one per CPU.
 
     ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" selects
-    C MuJoCo on the CPU and mujoco_warp on a GPU. ``switches`` is as ``Switches.of`` reads it. Raises BidexError for an
+    C MuJoCo on the CPU and mujoco_warp on a GPU. ``Switches.of`` explains ``switches``. Raises BidexError for an
     unknown engine or switch, a missing device, C MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:

@@ -25,11 +25,12 @@ _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", 
 
 
 class CpuEngine(Engine):
-    """Simulations of models of equal structure, in double precision. See ``Engine`` for the views.
+    """Simulations of models of equal structure, in double precision. See ``Engine`` for the tensors of the state.
 
-    A velocity stage after each step refreshes the sensors. The stage costs about a tenth of the speed but makes
-    positions and velocities those of the new state; a persistent batch takes its next step from there. Without
-    ``refresh`` the stage is left out, as in ``mj_step``: derived values are then from before the last substep.
+    After each step MuJoCo's position and velocity stages refresh the sensors. This costs about a tenth of the speed,
+    but measured positions and velocities are then those of the new state, and a persistent batch need not repeat these
+    stages in its next step. Without ``refresh`` they are left out, as in ``mj_step``: derived values are then from
+    before the last substep.
 
     ``unstable`` reports a row with a number out of bounds. The row is put at rest at the model's reference pose: before
     a step by ``_quarantine``, and within a step by MuJoCo's autoreset. Otherwise all geoms of a row with NaN would
@@ -43,7 +44,10 @@ class CpuEngine(Engine):
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Build the batch; ``rows`` gives each simulation's model. ``threads`` (None: all CPUs) change no result."""
+        """Build the batch; ``rows`` gives the index of each simulation's model.
+
+        The number of ``threads``, by default one per CPU, does not affect results.
+        """
         self.num = len(rows)
         if refresh:
             self._after_step = mujoco.mjtStage.mjSTAGE_VEL
@@ -106,7 +110,10 @@ class CpuEngine(Engine):
             self._failed[torch.as_tensor(error.ids)] = True
 
     def _quarantine(self) -> None:
-        """Put rows into a safe state if a number, written by hand or left by the last step, is out of bounds."""
+        """Put rows into a safe state if one of their numbers is out of bounds.
+
+        The world may have written such a number, or the last step may have left it.
+        """
         # This avoids most operations over all rows: a row whose norm is within the smallest bound is within all bounds.
         size = torch.linalg.vector_norm(self._numbers, dim=1)
         turns = self._numbers.index_select(1, self._quaternions).unflatten(1, (-1, 4))

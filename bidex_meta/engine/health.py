@@ -32,7 +32,7 @@ def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
 
 
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the saved state of either engine, shaped as the fields (``views``) of the receiving engine.
+    """Return the saved state of either engine, shaped like ``views``, the fields of the receiving engine.
 
     Raises BidexError for a state of another model or another number of rows, or with numbers that are not finite.
     """

@@ -1,4 +1,4 @@
-"""The Warp engine's own kernels, one thread per world or per number of a world: health, starts, gravity.
+"""The Warp engine's own kernels for health, starts and gravity; a thread handles a world, or one of its numbers.
 
 Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
 """
@@ -171,7 +171,7 @@ class Guard:
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Mark and disarm worlds in which a number that no substep checks was broken by hand.
+        """Mark and disarm worlds with a bad number, written from outside, in fields that no substep checks.
 
         This runs before each control step.
         """
@@ -186,6 +186,9 @@ class Guard:
         self._launch(disarm, (d.nworld, max(width, fixtures)), [self.failed, *self._fixtures], outputs)
 
     def watch(self, m: mjw.Model, d: mjw.Data) -> None:
-        """Mark worlds with a bad number (mj_checkPos, Vel, Acc); put marked worlds at rest at the reference pose."""
+        """Mark worlds with a bad number, as mj_checkPos, mj_checkVel and mj_checkAcc do.
+
+        Marked worlds are put at rest at the reference pose.
+        """
         self._launch(watch, d.qpos.shape, [d.qpos, d.qvel, d.qacc, LARGEST, float(mujoco.mjMAXVAL)], [self.failed])
         self._launch(quarantine, d.qpos.shape, [self.failed, m.qpos0], [d.qpos, d.qvel, d.qacc_warmstart])

@@ -21,14 +21,14 @@ _IMPLICIT = (mjw.IntegratorType.IMPLICIT, mjw.IntegratorType.IMPLICITFAST)
 
 @dataclass
 class Lean:
-    """Copies of the model for the parts of a control step; the copies share its arrays.
+    """Copies of the model for the parts of a control step; the copies share the model's arrays.
 
     Attributes:
         whole: The complete model.
-        early: For the forward dynamics of all substeps but the last.
-        last: For the forward dynamics of the last substep, which gives the force sensors.
-        integration: For the implicit integration of all substeps, if any.
-        refresh: For positions, velocities and their sensors after the last substep.
+        early: Copy for the forward dynamics of all substeps but the last.
+        last: Copy for the forward dynamics of the last substep, which gives the force sensors.
+        integration: Copy for the implicit integration of all substeps, if any.
+        refresh: Copy for positions, velocities and their sensors after the last substep.
         solver: The solver of the fully implicit integrator, if the model uses it.
     """
 
@@ -57,7 +57,7 @@ class Lean:
 
 
 def lean(m: mjw.Model) -> Lean:
-    """Make lean copies of a model; the model's arrays must not gain a feature later that they lack now."""
+    """Make lean copies of a model; features that the model's arrays lack now must not be added later."""
     implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
     none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
     early = "early"

@@ -1,4 +1,4 @@
-"""The implicit integrator's linear system, one warp of threads per world (mujoco_warp: one thread).
+"""Solver of the implicit integrator's linear system, with one warp of threads per world (mujoco_warp has one thread).
 
 The matrix has an entry for two degrees of freedom if they are the same or if one is the ancestor of the other
 (mujoco_warp's D structure). Elimination begins with the last degree of freedom and therefore needs no further entries.
@@ -32,7 +32,7 @@ def _solve(
     lanes: int, rows: Indices, diagonal: Indices, columns: Indices, first_update: Indices, updates: wp.array2d[int],
     first_of_level: Indices, by_level: Indices, right: Numbers, lu: Numbers, x: Numbers
 ):  # fmt: skip
-    """Factorise ``lu`` in place and solve for ``x``; shapes (num, nD), (num, nv)."""
+    """Factorise ``lu``, shape (num, nD), in place and solve for ``x``, shape (num, nv)."""
     world, lane = wp.tid()
     nv = diagonal.shape[0]
     for back in range(nv):

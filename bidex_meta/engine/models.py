@@ -1,4 +1,4 @@
-"""Comparison of compiled models: may they share one batch, and are their trajectories comparable?"""
+"""Comparison of compiled models: whether they may share a batch, and whether their trajectories are comparable."""
 
 import hashlib
 import inspect
@@ -28,7 +28,7 @@ def model_identity(model: mujoco.MjModel) -> str:
 
 
 def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
-    """Return one digest (12 hexadecimal digits) of several models and their names, from each ``model_identity``."""
+    """Return one digest, 12 hexadecimal digits, of the names and the ``model_identity`` of several models."""
     texts = [f"{name} {model_identity(models[name])}" for name in sorted(models)]
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 

@@ -145,7 +145,7 @@ def _with_cones(
     columns: Columns, jacobian: Matrices, weight: Numbers, zone: Indices, residual: Numbers, base: Matrices,
     hessian: Matrices
 ) -> int:  # fmt: skip
-    """Write the upper triangle of ``base`` plus the contacts in the cone zone, and return the number of these."""
+    """Write the upper triangle of ``base`` plus the contacts in the cone zone; return the number of these contacts."""
     n = base.shape[1]
     for i in range(n):
         for j in range(i + lane, n, lanes):
@@ -206,7 +206,7 @@ def _begin(
     jacobian: Matrices, weight: Numbers, zone: Indices, residual: Numbers, base: Matrices, hessian: Matrices,
     rows_changed: Counts, changed: Counts, cones: Counts
 ):  # fmt: skip
-    """Complete the first Hessian of all worlds, and begin to count changes."""
+    """Complete the first Hessian of all worlds, and start the count of changes."""
     world, lane = wp.tid()
     if done[world]:
         return
@@ -297,7 +297,7 @@ def _finish(
     improvement: Scalars, alpha: Scalars, cones: Counts, steps: Counts, overflow: Counts, solving: Counts, done: Flags,
     same_direction: Flags, rows_changed: Counts, changed: Counts
 ):  # fmt: skip
-    """Mark worlds that have converged or have no step left; in the others begin to count changes anew."""
+    """Mark worlds that have converged or have no step left; in the others restart the count of changes."""
     world = wp.tid()
     if done[world]:
         return

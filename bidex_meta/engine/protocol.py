@@ -11,7 +11,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError
 
 CAMERA = "picture"
-"""Name of the camera by which an engine's renderer draws."""
+"""Name of the camera whose view an engine's renderer draws."""
 GHOST_GROUP = 4
 """Group of geoms that an engine's renderer draws translucent."""
 
@@ -27,7 +27,8 @@ class Renderer(Protocol):
 class Engine(Protocol):
     """A batch of simulations of equal structure.
 
-    The views are created once and stay; the world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
+    The tensors of the state are views that stay the same from step to step; the world writes ``qpos``, ``qvel``,
+    ``ctrl`` and ``xfrc_applied`` in place.
     A broken row costs no more time than other rows, whatever the world writes: each step first looks for broken rows
     (``health.py``). A broken row continues from the model's reference pose until its reset.
     """
@@ -71,7 +72,7 @@ class Engine(Protocol):
         ...
 
     def warnings(self) -> Tensor:
-        """Return the number of kinds of warnings of each simulation since its last reset. Shape (num,), int64."""
+        """Return how many kinds of warnings each simulation has had since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
@@ -107,8 +108,8 @@ class Engine(Protocol):
     def renderer(self, model: mujoco.MjModel, num: int, edge: int, alpha: float) -> Renderer:
         """Return a renderer of ``num`` environments of a model, for square pictures of ``edge`` pixels.
 
-        The model has the camera ``CAMERA``. Geoms of ``GHOST_GROUP`` have the opacity ``alpha``. Only if the engine
-        ``has_renderer``.
+        The model has the camera ``CAMERA``. Geoms of ``GHOST_GROUP`` have the opacity ``alpha``. Raises
+        BidexError unless the engine ``has_renderer``.
         """
         raise BidexError(f"Expected an engine that draws (mujoco_warp), got {type(self).__name__}.")
 
@@ -118,4 +119,4 @@ class Engine(Protocol):
 
 
 EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int], Capacity], Engine]
-"""Makes an engine from models of equal structure, the model index of each simulation, and the room for contacts."""
+"""Makes an engine from models of equal structure, the model index of each simulation, and the buffer sizes."""

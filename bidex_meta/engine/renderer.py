@@ -13,10 +13,10 @@ from bidex_meta.engine.protocol import CAMERA, GHOST_GROUP, Renderer
 
 
 class BatchRenderer(Renderer):
-    """Draws ``num`` environments of a model by its camera ``CAMERA``, on the engine's device.
+    """Draws ``num`` environments of a model, seen by the model's camera ``CAMERA``, on the engine's device.
 
     Geoms of ``GHOST_GROUP`` are translucent: mujoco_warp draws opaque geoms only, so their pixels are mixed from a
-    picture with and a picture without them. ``on_device`` is the context in which Warp's work is launched.
+    picture with these geoms and a picture without them. ``on_device`` is the context in which Warp's work is launched.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class BatchRenderer(Renderer):
             self._mocap = [wp.to_torch(array) for array in (self._d.mocap_pos, self._d.mocap_quat)]
 
     def draw(self, placement: Tensor) -> Tensor:
-        """Draw; see ``Renderer``. Nothing waits for the device."""
+        """Draw pictures; see ``Renderer``. Nothing waits for the device."""
         positions = self._qpos.shape[1]
         self._qpos.copy_(placement[:, :positions])
         if self._mocap:

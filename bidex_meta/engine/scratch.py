@@ -29,7 +29,7 @@ class Scratch:
         return sum(len(memory) for memory in self._memory.values())
 
     def allocate(self, size_in_bytes: int) -> int:
-        """Return a pointer to memory that nobody else uses."""
+        """Return a pointer to memory that no other array uses."""
         if self._free[size_in_bytes]:
             return self._free[size_in_bytes].pop()
         if self._device.is_capturing:  # only Warp's own allocators may allocate now

@@ -29,7 +29,7 @@ class Switches:
 
     @staticmethod
     def of(text: str) -> "Switches":
-        """Return the switches that a text names, separated by commas; raise BidexError for others or bad numbers."""
+        """Return the switches in a text, separated by commas; raise BidexError for unknown switches or bad numbers."""
         if not isinstance(text, str):
             raise BidexError(f"switches: expected text such as 'pyramids,impratio=3', got {shortened(text)}.")
         kinds = {field.name: field.default for field in fields(Switches)}
@@ -45,7 +45,7 @@ class Switches:
 
     @property
     def changes_contacts(self) -> bool:
-        """Return whether friction differs, so that the tasks of version 1 would no longer be what they were."""
+        """Return whether the switches change friction, which the tasks of version 1 do not allow."""
         return self.pyramids or self.impratio is not None
 
     def models(self, models: Sequence[mujoco.MjModel]) -> list[mujoco.MjModel]:
@@ -61,7 +61,7 @@ class Switches:
         return changed
 
     def room(self, model: mujoco.MjModel, room: Capacity) -> Capacity:
-        """Return the room for a model's contacts: a pyramid has up to 2 (n - 1) rows where a cone has n."""
+        """Return the buffer sizes for a model's contacts: a pyramid has up to 2 (n - 1) rows instead of a cone's n."""
         if not self.pyramids or model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
             return room
         most = max(3, int(model.geom_condim.max(initial=0)), int(model.pair_dim.max(initial=0)))

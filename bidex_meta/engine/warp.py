@@ -1,7 +1,8 @@
 """MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
 
-Deliberate differences from C: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
-freedom), a solver tolerance of 1e-6 (its minimum), contact buffers of fixed size. Tests use the Warp CPU device.
+It differs from C MuJoCo on purpose in four ways: single precision, sparse constraint Jacobians (mujoco_warp refuses
+dense ones above 60 degrees of freedom), a solver tolerance of 1e-6 (its minimum), and contact buffers of fixed size.
+Tests use the Warp CPU device.
 """
 # ruff: noqa: D102 (``Engine`` says what the methods do)
 
@@ -43,14 +44,14 @@ _SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SEN
 
 
 class WarpEngine(Engine):
-    """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
+    """Simulations of models of equal structure, in single precision. See ``Engine`` for the tensors of the state.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
     place, and call ``recapture`` after any other change of the model. On CUDA graphs run on the engine's own stream,
     between the work that torch's current stream got before the call and the work it gets afterwards.
 
-    ``unstable`` reports a world with a bad number. The world stands at the model's reference pose until its reset: left
-    running, its NaNs would pass every broadphase test and take the room that other worlds' contacts need.
+    ``unstable`` reports a world with a bad number. The world stands at the model's reference pose until its reset.
+    Otherwise its NaNs would pass every broadphase test and fill the buffers that other worlds' contacts need.
     """
 
     masked = True
@@ -147,7 +148,7 @@ class WarpEngine(Engine):
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
-        """Return which worlds broke: all of them if the shared contact pool is full, since any may have lost some."""
+        """Return which worlds broke: all worlds if the shared contact pool is full, as any may have lost contacts."""
         lost = (self._overflow & _LOST) != 0
         return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
 
@@ -220,7 +221,7 @@ class WarpEngine(Engine):
         return 0.0
 
     def demand(self) -> tuple[int, int]:
-        """Return the candidate pairs and the convex collider's contacts in the present state, over all worlds."""
+        """Return how many candidate pairs and contacts of the convex collider all worlds have at present."""
         self._play("position", lambda: mjw.fwd_position(self._m, self._d, factorize=False))
         d = self._d
         candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
@@ -281,7 +282,7 @@ class WarpEngine(Engine):
         return lambda: wp.capture_launch(graph, stream=self._stream)
 
     def _from_scratch(self) -> AbstractContextManager[object]:
-        """Make Warp allocate from the engine's scratch memory on CUDA, the only device with a choice."""
+        """Make Warp allocate from the engine's scratch memory; on the CPU Warp's allocator cannot be replaced."""
         if self._device.is_cuda:
             return wp.ScopedAllocator(self._device, self._scratch)
         return nullcontext()
@@ -329,7 +330,7 @@ def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _is_slow(model: mujoco.MjModel) -> bool:
-    """Return whether a group's kernels make the longest chain: many substeps, or one thread per matrix.
+    """Return whether a group of this model is slow: it has many substeps, or kernels with one thread per matrix.
 
     Launching these groups first cuts a step of MT20's 8,192 rows from 42.3 to 38.6 ms.
     """

@@ -65,7 +65,7 @@ def hand() -> Hand:
 
 
 SIDES = ("right", "left")
-"""The hands, in the order that every table has. Both hands use the same right-hand model."""
+"""The hands, in the order that every table has. Both hands use the same model of a right hand."""
 
 RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
 """Contact bits. Geoms of one hand never collide by bits, but only in the 18 listed pairs. Fixtures do not collide with
@@ -90,8 +90,8 @@ def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
 def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool, touch: bool = False) -> None:
     """Add both hands with the start poses of their mounts; names get the prefixes ``right/`` and ``left/``.
 
-    Moving bases are free joints at the centre of mass (damped by ``damp_bases``); others are welded. With ``touch`` the
-    bodies of ``TOUCHED`` get sensors, e.g. ``right/palm_touch``.
+    Moving bases are free joints at the centre of mass (damped by ``damp_bases``); fixed bases are welded. With
+    ``touch`` the bodies of ``TOUCHED`` get sensors, e.g. ``right/palm_touch``.
     """
     for side, pose, bit in zip(SIDES, (right, left), (RIGHT, LEFT), strict=True):
         part = hand_spec()

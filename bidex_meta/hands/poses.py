@@ -8,15 +8,15 @@ from bidex_meta.utils.maths import quaternion_from_rpy, quaternion_product
 from bidex_meta.utils.validation import Finite
 
 MOUNT_QUATERNION = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
-"""Orientation (w, x, y, z) of the mount for an unrotated actor: fingers to world -y, palm up, thumb to -x."""
+"""Orientation (w, x, y, z) of the mount if the actor is not rotated: fingers to world -y, palm up, thumb to -x."""
 
 PALM_UP_AWAY = (0.0, 0.0, 0.0)
-"""Pose A of docs/figures.md, roll pitch yaw: fingers to -y, palm up."""
+"""Pose A of docs/figures.md, as roll, pitch and yaw: fingers to -y, palm up."""
 PALM_UP_BACK = (0.0, 0.0, math.pi)
 """Pose B: fingers to +y, palm up; faces a hand in pose A."""
 
 PALM_LEFT_AHEAD = (math.pi, 0.5 * math.pi, 0.5 * math.pi)
-"""Pose C: fingers to -x, palm to -y, thumb up: a right hand that faces a left one (the original's 1.57 made exact)."""
+"""Pose C: fingers to -x, palm to -y, thumb up: a right hand facing a left hand. The original has 1.57 for pi / 2."""
 PALM_RIGHT_AHEAD = (math.pi, -0.5 * math.pi, 0.5 * math.pi)
 """Pose D: fingers to -x, palm to +y, thumb down."""
 PALM_DOWN_AHEAD = (math.pi, 0.0, 0.5 * math.pi)

@@ -1,4 +1,4 @@
-"""Joint angles at the start of an episode, and space for an object on the hand (docs/figures.md, start noise)."""
+"""Joint angles at the start of an episode, and room for an object on the hand (docs/figures.md, start noise)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from bidex_meta.hands.poses import HandPose
 from bidex_meta.utils.maths import conjugate, constant, dot, norm, rotate, xyzw
 
 _WRIST = (0.0, 0.01, 0.256)
-"""Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (docs/figures.md,
-hand frames)."""
+"""Wrist origin in the mount frame, metres; the palm lies 0.034 m further along the z axis that the wrist has
+turned (docs/figures.md, hand frames)."""
 _PALM_OFFSET = 0.034
 _PALM_HALF_THICKNESS = 0.0111
 _ROOTS = ((0.033, 0.095), (0.011, 0.099), (-0.011, 0.095), (-0.034, 0.088))
@@ -33,11 +33,12 @@ _THUMB_RADIUS = 0.013
 _THUMB_ABOVE_PALM = _THUMB_RADIUS + 0.009 - _PALM_HALF_THICKNESS
 _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
-"""Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
+"""Lengths and radii of the fingers' proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
 _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Positions on a link's centre line, from its joint on, at which its distance to a box is measured."""
 _SLACK = 0.002
-"""Overlap left at a start, metres, so that contacts carry the object from the first step; 5 mm is allowed."""
+"""Overlap of object and hand that remains at a start, metres, so that contacts carry the object from the first step;
+5 mm is allowed."""
 _MAX_CROSSING = 0.1
 """Largest difference between the side angles of neighbouring fingers at which their tips stay apart, rad. The roots are
 22 mm apart, the tips are 94 mm away from the roots and have radii of 7 mm, and 3 mm of overlap is allowed."""
@@ -65,9 +66,10 @@ def _indices(device: torch.device) -> _Indices:
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
-    """Return joint angles (n, 24), rad: clip(scale * range * u, limits), distal joints coupled, neighbours uncrossed.
+    """Return noisy joint angles (n, 24), rad: clip(scale * range * u, limits).
 
-    The draws u are in [-1, 1], shape (n, 24); the scale is a share of each joint's range.
+    The draws u are in [-1, 1], shape (n, 24); the scale is a share of each joint's range. Distal joints then follow the
+    middle joints, and side angles are reduced where neighbouring fingers would cross.
     """
     low, high = (constant(tuple(x.tolist()), draws) for x in (hand().low, hand().high))
     where = _indices(draws.device)
@@ -84,8 +86,9 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
     ``joints`` (n, 24) are the joint angles, rad; ``position`` and ``axis`` (n, 3) are the egg's centre and the unit
     vector along its long axis, in the mount frame; ``radius`` and ``half`` are its short and long semi-axes. Returns
-    the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres. Distances to the
-    palm's plane and to the fingers' capsules are bounded by the spheroid's support towards them.
+    the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths are in metres. The distances
+    of the egg from the palm's plane and from the fingers' capsules are lower bounds, computed from the extent (support)
+    of the spheroid in their direction.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
@@ -104,7 +107,7 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
     """Do the same as ``make_room`` for the convex hull of some balls; also lay the thumb flat and out of the way.
 
     ``position`` (n, 3) is the object's origin in the mount frame. ``points`` (n, k, 3) are the balls' centres relative
-    to the origin, turned with the object. ``radii`` (k,) are the balls' radii, 0 for corners. Lengths in metres.
+    to the origin, turned with the object. ``radii`` (k,) are the balls' radii, 0 for corners. Lengths are in metres.
     """
     joints = joints.clone()
     joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0

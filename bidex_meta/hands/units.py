@@ -1,4 +1,4 @@
-"""Fingers and palms as agents (appendix A.2): a partition of the hands' units is one line of text. Imports no torch.
+"""Partitions of the units of hands (fingers and palms) into agents (appendix A.2). This module imports no torch.
 
 A partition is ``single``, ``hands``, ``fingers`` (twelve agents), ``thrower=right/palm+right/thumb;helper=...``, or the
 path of a TOML file with a table ``[agents]``: ``thrower = ["right/palm", "right/thumb"]``.
@@ -19,7 +19,7 @@ UNITS: dict[str, str] = {"palm": "WR", "first": "FF", "middle": "MF", "ring": "R
 """The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base if it
 moves."""
 NAMED = ("single", "hands", "fingers")
-"""Names of partitions that need no list of units."""
+"""Names of partitions whose units need not be listed."""
 
 Agents = str | Path | Mapping[str, Sequence[str]]
 """A partition: a name of :data:`NAMED`, a line, a TOML file, or a mapping from each agent's name to its units."""
@@ -48,7 +48,7 @@ def partition_line(agents: Agents) -> str:
 def units_by_agent(line: str) -> dict[str, list[str]]:
     """Return the units of each agent in a line ``name=unit+unit;name=unit``.
 
-    Raises BidexError for another form, or if an agent occurs twice.
+    Raises BidexError if the line has another form, or if an agent occurs twice.
     """
     found: dict[str, list[str]] = {}
     for part in line.split(";"):

@@ -12,7 +12,7 @@ class Hidden(NamedTuple):
     """A part of a task that observations show only in goal entries; success requires each part separately."""
 
     names: tuple[str, ...]
-    """Components of the variation: coordinates of one point (metres, rad), or the draws of an orientation."""
+    """Components of the variation: the coordinates of one point, in metres or rad, or the draws of an orientation."""
     tolerance: float
     """Distance from the goal that success allows, or the allowed angle for an orientation; infinite for a sign."""
     kind: Literal["point", "orientation", "sign"] = "point"
@@ -30,13 +30,13 @@ class Error(NamedTuple):
     """One of the values that must be small for a state to be solved."""
 
     value: Tensor
-    """Not negative, shape (n,), in the unit of the tolerance."""
+    """The error in each environment, at least 0, shape (n,), in the unit of the tolerance."""
     tolerance: float
-    """Bound below which the value lies in solved states."""
+    """Bound of the value; in solved states the value is smaller."""
 
 
 def at_least(value: Tensor, least: float, tolerance: float) -> Error:
-    """Return the error of a value that must exceed ``least``; it is zero at ``least`` + ``tolerance`` and above."""
+    """Return the error of a value that must exceed ``least``; the error is zero from ``least`` + ``tolerance`` on."""
     return Error((least + tolerance - value).clamp(min=0.0), tolerance)
 
 

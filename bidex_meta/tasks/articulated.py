@@ -39,16 +39,18 @@ hand's half, relative to the pivot, metres (docs/figures.md, objects)."""
 
 
 _SHUT = 0.59
-"""Angle by which the shears of target 0 are open, rad."""
+"""Angle by which the shears are open when the hinge is at 0, rad. They are shut when the hinge is at minus this
+angle."""
 
 
 class OpenScissors(ReachTask):
-    """Open shears that lie on a table to a task's angle, with each hand at one loop.
+    """Open shears, which lie on a table, to a task's angle, with each hand at one loop.
 
     Observation: Table 30 (428). Reward: equation 14. The formula does not give the target angle, so each task freezes
-    one (0 is 34 degrees open; -0.59 is shut, the angle at the start). The object pose is the pose of the left hand's
-    half. The goal block shows position and orientation that the right handle has at the target angle, for the present
-    pose of the left hand's half. The rotation difference is that of the right hand's half and shows the missing angle.
+    one. At 0 rad the shears are open by 34 degrees. At -0.59 rad they are shut, as at the start. The object pose is the
+    pose of the left hand's half. The goal block shows the pose that the right handle has at the target angle if the
+    left hand's half stays where it is. The rotation difference is that of the right hand's half and shows the missing
+    angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -76,10 +78,10 @@ class OpenScissors(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return the shears' shift and turn and their goal.
+        """Return the shears' placement and their goal.
 
-        ``scissors``: shift and turn (n, 3); ``target``: angle (n, 1), rad, and as a quaternion ``turn`` (n, 4);
-        ``ghost``: pose of the goal in pictures of version 1 (n, 7).
+        ``scissors``: shift and yaw of the shears (n, 3); ``target``: goal angle of the hinge (n, 1), rad; ``turn``: the
+        same angle as a quaternion (n, 4); ``ghost``: pose of the goal in pictures of version 1 (n, 7).
         """
         root = constant((*_SCISSORS.position, *_SCISSORS.quaternion), variation).repeat(len(variation), 1)
         place(root, variation[:, :3])
@@ -115,7 +117,7 @@ class OpenScissors(ReachTask):
         return within(self.errors(state))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the right handle; in version 1 it is that of shears at the task's start."""
+        """Return the right handle's goal for the present pose of the shears, in version 1 for their start pose."""
         if self.rules.wide:
             pose = self.observe(state)["goal_pose"]
         else:
@@ -124,7 +126,10 @@ class OpenScissors(ReachTask):
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
-    """Return the right handle's pose (n, 7) on the half that is opened by ``turn`` (n, 4) from the other half."""
+    """Return the right handle's pose (n, 7) if the hinge has turned by ``turn``, a quaternion (n, 4).
+
+    ``position`` and ``rotation`` are the pose of the left hand's half.
+    """
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
     return posed(pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened)
@@ -144,9 +149,9 @@ _BODY_POINT = 0.07
 class OpenPenCap(ReachTask):
     """Pull the cap off a pen that lies on a table, with the left hand at its body and the right hand at its cap.
 
-    Observation: Table 34 (428). Reward: equation 16. For success the cap must be pulled by 13 cm, its own length. The
-    goal position is where the cap's point is 0.3 m from the body's point, if the body is at the task's start. The goal
-    orientation is that of the pen at the start. Reward and success do not read the goal.
+    Observation: Table 34 (428). Reward: equation 16. For success the cap must be pulled by 13 cm, its own length. At
+    the goal position the cap's point is 0.3 m from where the body's point is at the task's start. The goal orientation
+    is that of the pen at the start. Reward and success do not read the goal.
     """
 
     needs = Capacity(56, 0, 121)
@@ -177,9 +182,10 @@ class OpenPenCap(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``pen``: shift and turn (n, 3); ``gap``: target distance of the points (n, 1), m; goal of the cap.
+        """Return the pen's placement and the goal of the cap.
 
-        ``goal`` is the pose of the goal (n, 7), ``goal_inverse`` the inverse of its rotation (n, 4).
+        ``pen``: shift and yaw (n, 3); ``gap``: target distance of the points on body and cap (n, 1), m; ``goal``: pose
+        of the goal (n, 7); ``goal_inverse``: inverse of the goal's rotation (n, 4).
         """
         pen = constant((*_PEN.position, *_PEN.quaternion), variation).repeat(len(variation), 1)
         place(pen, variation[:, :3])
@@ -195,7 +201,7 @@ class OpenPenCap(ReachTask):
         return 5.0 * apart(state, *self.points)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the cap, with wide variation relative to the present pose of the pen's body."""
+        """Return the goal of the cap; with wide variation it is relative to the present pose of the pen's body."""
         if not self.rules.wide:
             return super().ghosts(state)
         pen = state.quaternion("pen/quaternion")
@@ -246,7 +252,7 @@ class Switch(ReachTask):
     full travel. Switch 1 is at -y, for the left hand. The entries for the pose and velocity of switch 1 show its
     rocker, because the housing does not move. The goal block holds the target of switch 1 and the orientation of its
     rocker at full travel. A task shifts the housings by up to 3 cm along x and y, but does not turn them; an episode
-    draws nothing.
+    makes no further draws.
     """
 
     needs = Capacity(36, 0, 90)

@@ -60,13 +60,13 @@ class Solver:
 
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
-"""For eggs. They are held for only a second, so that creeping by a millimetre per second does no harm."""
+"""For eggs. Hands hold an egg for only a second, so that it may creep by a millimetre per second."""
 GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
 """For an egg that is thrown across a narrow gap, where nothing moves fast."""
 FIRM = Solver(100, 50)
-"""For light bodies between hands and table: with the common limits the solver would stop early and kick them."""
+"""For light bodies between hands and table. With the default iterations the solver would stop early and kick them."""
 FAST = Solver(100, 50, time_step=1.0 / 180.0)
-"""For fast bases near rigid objects: in 1/120 s a hand at full speed sinks 24 mm into a table."""
+"""For fast bases near rigid objects. In a time step of 1/120 s a hand at full speed sinks 24 mm into a table."""
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
 """For fast bases that press objects as thin as a finger against a table."""
 JITTER, JOINT_NOISE = 0.005, 0.1
@@ -85,17 +85,19 @@ class TaskClass(ABC):
         deviations: Intended differences from the appendix, one line each.
         episode_steps: Time limit, control steps; ``wide_steps``: time limit with wide variation, if that takes longer.
         right: Start pose of the right hand; ``left``: start pose of the left hand.
-        transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale``: that of torques.
+        transition_scale: Scale of the base forces; ``orientation_scale``: scale of the base torques (docs/figures.md,
+            base).
         start_draws: Number of uniform numbers that the start of an episode takes.
         variation_space: Components that a task of this class freezes; an attribute or a property. With wide variation
-            these are only the hidden components: ``adopt`` divides ``wide_space``.
-        episode_space: Components that every episode draws, with wide variation: those that are not hidden.
+            these are only the hidden components: ``adopt`` splits ``wide_space``.
+        episode_space: Components that every episode draws. With wide variation these are the components that are not
+            hidden; otherwise there are none.
         wide_space: Components of both spaces, in the order in which ``freeze`` reads them; None: the class has no
             version 2.
         wide_solved: The condition for success with wide variation.
         wide_blocks: Observation blocks that are appended with wide variation, in classes whose printed observation has
             no goal block.
-        jittered_hands: Hands that get joint noise from jittered starts, because ``start`` gives none.
+        jittered_hands: Hands that get joint noise from jittered starts, because ``start`` adds no noise to them.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
         rules: The suite's rules; ``adopt`` sets them.
         chosen: Options of the constructor by name, with given or default values; ``registry.get`` sets them.
@@ -107,8 +109,8 @@ class TaskClass(ABC):
         needs: Sizes for the fixed buffers of mujoco_warp: the maximum numbers of contacts and constraint rows in 30,208
             states under rough actions. ``python -m tools.bench capacity --task NAME --steps 30000`` measures them. A
             class that was not measured has the largest numbers of all classes.
-        camera_target: Point at which pictures look, world, metres; ``camera_distance``: the camera's distance from it.
-        camera_angle: Azimuth and elevation of the camera, degrees, at which hands, objects and goal are visible.
+        camera_target: Point at the centre of pictures, world, metres; ``camera_distance``: the camera's distance to it.
+        camera_angle: Azimuth and elevation of the camera, degrees, chosen so that hands, objects and goal are visible.
         depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
             at ``camera_target`` from the front.
     """
@@ -317,14 +319,14 @@ class TaskClass(ABC):
         return []
 
     def instruct(self, goal: Mapping[str, float] | None) -> str:
-        """Return what a task asks for as a sentence without a full stop; ``summary`` by default.
+        """Return the instruction of a task, a sentence without a full stop; ``summary`` by default.
 
         ``goal`` holds the components of ``hides`` by name. If it is None, the sentence must not reveal them.
         """
         return self.summary
 
     def instruction(self, variation: Sequence[float] | np.ndarray | None = None, hidden: bool = False) -> str:
-        """Return the instruction of the task with this variation (variation_space.size,); for None that of the class.
+        """Return the instruction of the task with this variation (variation_space.size,), or of the class for None.
 
         With ``hidden`` the sentence leaves out what suites with hidden goals hide.
         """

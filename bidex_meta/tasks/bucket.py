@@ -55,7 +55,8 @@ class GraspAndPlace(ReachTask):
     The table is 1 x 1 m and 60 cm high. Observation: as in the original (425; docs/figures.md, observation). Reward:
     the original's formula with hand-point distances. The original's condition for success, d < 20 cm, is also met by a
     block next to the bucket. A task shifts and turns bucket and block. Both start on the table; in the original they
-    start inside it. Bucket pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
+    start inside the table. Here the bucket's pose and the bucket's link have the same orientation, so entries 401-404
+    and 414-417 are equal.
     """
 
     needs = Capacity(35, 4, 108)
@@ -97,7 +98,10 @@ class GraspAndPlace(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``bucket``, ``block``: shift, turn (n, 3); with wide variation ``goal``: bucket's target (n, 7)."""
+        """Return ``bucket`` and ``block``: shift and yaw (n, 3).
+
+        With wide variation also return ``goal``: target pose of the bucket (n, 7).
+        """
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
 
     def hides(self) -> tuple[Hidden, ...]:
@@ -171,13 +175,13 @@ _SINK, _DEEPEST = 5.0, 0.2
 mouth of a standing bucket, metres."""
 _TROUGH_TILT = 0.541
 _TROUGH, _TROUGH_HALF = (-0.1428, 0.0, 0.0287), (0.0615, 0.022, 0.0136)
-"""The box around the kettle's trough: turn about y, rad; centre in the kettle's frame and half sizes, metres."""
+"""The box around the kettle's trough: rotation about y, rad; centre in the kettle's frame and half sizes, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
 
 
 class PourWater(ReachTask):
-    """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
+    """Pour water from a kettle, held by the right hand, into a bucket, held by the left hand.
 
     The table is 0.5 x 1 m and 40 cm high. Observation: Table 40 (428). Reward: equation 19. The kettle's point is its
     handle, and the bucket's point is its origin.
@@ -185,10 +189,10 @@ class PourWater(ReachTask):
     The spout's goal is on the bucket's axis, 1 cm below the rim if the bucket stands on the table. The goal moves with
     the bucket, but sinks by 5 cm for each cm by which the bucket's floor is lifted, to at most 20 cm below its height
     on the table. If the goal were fixed to the bucket, spout and goal would also meet if the bucket were lifted and
-    tipped under an upright kettle. With the sinking goal, the spout only gets near it if the kettle is tilted over the
-    rim. At less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away,
-    and from 60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start,
-    tilted by 40 degrees towards the spout.
+    tipped under an upright kettle. The spout only gets near the sinking goal if the kettle is tilted over the rim. At
+    less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away, and from
+    60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start, tilted by
+    40 degrees towards the spout.
 
     A task shifts and turns the bucket, and the kettle with the water. The water consists of drops of 5 mm radius
     without friction, which no observation shows. With twelve drops, the default, physics takes 1.4 times as long as in
@@ -247,9 +251,10 @@ class PourWater(ReachTask):
             SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``kettle`` and ``bucket``: shift and turn (n, 3) each; ``goal_rotation``: (x, y, z, w), (n, 4).
+        """Return the placement of kettle and bucket, and the spout's goal orientation.
 
-        ``goal_rotation_inverse`` (n, 4) is the inverse rotation. With wide variation ``goal`` (n, 7) is the bucket's
+        ``kettle`` and ``bucket``: shift and yaw (n, 3) each; ``goal_rotation``: quaternion (x, y, z, w), (n, 4);
+        ``goal_rotation_inverse``: the inverse quaternion (n, 4). With wide variation ``goal`` (n, 7) is the bucket's
         target pose.
         """
         nominal = xyzw(constant(_KETTLE.quaternion, variation))

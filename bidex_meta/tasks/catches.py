@@ -75,8 +75,8 @@ class TwoCatchUnderarm(CatchUnderarm):
 class CatchOver2Underarm(EggTask):
     """Throw an egg from an upright hand down to an upturned palm.
 
-    Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m off its
-    start.
+    Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m away
+    from its start.
     """
 
     needs = Capacity(17, 4, 33)
@@ -105,7 +105,8 @@ class CatchOver2Underarm(EggTask):
 class CatchAbreast(EggTask):
     """Throw an egg sideways between two palms that lie side by side, tilted towards each other.
 
-    Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m off its anchor.
+    Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m away from its
+    anchor.
     """
 
     needs = Capacity(23, 6, 45)

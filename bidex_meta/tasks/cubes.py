@@ -26,7 +26,7 @@ from bidex_meta.tasks.words import centimetres, degrees
 from bidex_meta.utils.maths import constant, multiply, norm, rotate, rotation_angle, wxyz, xyzw
 
 _RED, _BLUE = (0.85, 0.43, 0.30), (0.24, 0.52, 0.74)
-"""Colours of the first cube and of the second cube, which keeps its file's colour."""
+"""Colours of the first and of the second cube; the second cube keeps the colour of its file."""
 _EDGE, _HALF = 0.05, (0.025, 0.025, 0.025)
 """Edge of a cube and its half sizes, metres."""
 _RODS = (
@@ -46,8 +46,8 @@ def _cubes(name: str, first: Point, second: Point) -> tuple[SceneObject, SceneOb
 class _TwoBlocks(ReachTask):
     """Two blocks on a table that must be brought to the frozen positions ``goal1`` and ``goal2``, each (n, 3).
 
-    The target term of the reward is ``weight`` times (``widest`` - d), with d the sum of both distances. Block 1 starts
-    at -y and belongs to the left hand.
+    The target term of the reward is ``weight`` times (``widest`` - d), with d the sum of the blocks' distances from
+    these positions. Block 1 starts at -y and belongs to the left hand.
     """
 
     weight: ClassVar[float]
@@ -71,7 +71,7 @@ class _TwoBlocks(ReachTask):
         return self.weight * (self.widest - (first + second))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the targets, with wide variation in the colours of their blocks."""
+        """Return the targets; with wide variation they have the colours of their blocks."""
         if self.rules.wide:
             colours = (_RED, _BLUE)
         else:
@@ -80,20 +80,20 @@ class _TwoBlocks(ReachTask):
 
 
 def _unturned(position: Tensor) -> Tensor:
-    """Return poses (n, 7) with the world's axes at positions (n, 3)."""
+    """Return poses (n, 7) at positions (n, 3), without rotation."""
     return posed(position, constant((0.0, 0.0, 0.0, 1.0), position).expand(len(position), 4))
 
 
 _PUSHED = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
-"""Goals of PushBlock's blocks, in version 2 the middles of their ranges, metres."""
+"""Goals of PushBlock's blocks, metres; in version 2 these are the middles of the goals' ranges."""
 
 
 class PushBlock(_TwoBlocks):
-    """Push two blocks on a table, one with each hand, 20 cm away to their goals.
+    """Push two blocks on a table to goals 20 cm away, one block with each hand.
 
-    The table is 1 x 1 m and 60 cm high. Its friction is the mean of the original's 0.5 and of 1, the friction of hands
-    and blocks. Observation: Table 26 (417). It does not show the goals. Goals are therefore fixed and starts vary: a
-    task shifts and turns each block. Reward: equation 12.
+    The table is 1 x 1 m and 60 cm high. Its friction is the mean of 0.5, the original table's friction, and 1, the
+    friction of hands and blocks. Observation: Table 26 (417). It does not show the goals. Goals are therefore fixed and
+    starts vary: a task shifts and turns each block. Reward: equation 12.
     """
 
     needs = Capacity(38, 0, 103)
@@ -124,7 +124,7 @@ class PushBlock(_TwoBlocks):
     blocks = (*object_blocks("block1"), *_TwoBlocks.centres)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
+        """Return ``block1``, ``block2``: shift and yaw; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
         first, second = (constant(goal, variation).expand(len(variation), 3) for goal in _PUSHED)
         if self.rules.wide:
             first = first + pad(variation[:, 6:8], (0, 1))
@@ -164,12 +164,12 @@ class PushBlock(_TwoBlocks):
 class StackBlock(_TwoBlocks):
     """Stack two blocks: the left hand's block 1 on the right hand's block 2.
 
-    The table is 0.5 x 1 m and 60 cm high. Observation: Table 38 (428). Its goal is that of the top block: target 1,
-    upright and unturned (the reward does not depend on turns). Reward: equation 18. For success each block must be
-    within 3 cm of its target, and block 1 must be on block 2: one edge higher, within 1 cm, and within 3 cm of the
-    vertical through its centre. A task shifts and turns both blocks, and shifts the targets by up to 3 cm along x and
-    y. The friction of a pair is the mean of the original's figures: 0.25 for blocks, 0.5 for hands and 0.2 for the
-    table (docs/figures.md, friction).
+    The table is 0.5 x 1 m and 60 cm high. Observation: Table 38 (428). The goal entries show target 1, the pose of the
+    top block: upright and with yaw 0 (the reward does not depend on rotations). Reward: equation 18. For success each
+    block must be within 3 cm of its target, and block 1 must be on block 2: one edge higher, within 1 cm, and within 3
+    cm of the vertical through its centre. A task shifts and turns both blocks, and shifts the targets by up to 3 cm
+    along x and y. The friction of a pair is the mean of the original's figures: 0.25 for blocks, 0.5 for hands and 0.2
+    for the table (docs/figures.md, friction).
     """
 
     needs = Capacity(43, 0, 115)
@@ -214,7 +214,7 @@ class StackBlock(_TwoBlocks):
             cube.priority = 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``block1`` and ``block2``: shift and turn; ``goal1`` and ``goal2``: target positions; (n, 3) each.
+        """Return ``block1`` and ``block2``: shift and yaw; ``goal1`` and ``goal2``: target positions; each (n, 3).
 
         In version 1 ``goal`` is the top block's target pose (n, 7). With wide variation ``upper`` (n, 1) is 1 if block
         1 must be on top, and -1 if block 2 must be.
@@ -231,7 +231,7 @@ class StackBlock(_TwoBlocks):
         return frozen | {"goal1": first, "goal2": second, "upper": upper}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return target 1 and block 1's turn; with wide variation the targets of both blocks."""
+        """Return target 1 and block 1's orientation; with wide variation return the targets of both blocks."""
         if self.rules.wide:
             goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
             return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
@@ -304,7 +304,7 @@ class ReOrientation(TaskClass):
             cube.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        """Return ``goal1``, ``goal2``: poses (n, 7); ``goal1_inverse``, ``goal2_inverse``: inverse rotations (n, 4)."""
         frozen = {}
         for i, centre in enumerate(((0.0, -0.76, 0.56), (0.0, -0.39, 0.56)), start=1):
             position = constant(centre, variation).expand(len(variation), 3)
@@ -350,7 +350,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals; with wide variation as rods along x (red), y (green) and z (blue), which show turns."""
+        """Return the goals. With wide variation a goal is three rods along its x (red), y (green) and z (blue)."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]
@@ -367,7 +367,11 @@ def _axes(goal: Tensor) -> list[Ghost]:
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
-    """Turn cubes (n, 7) within 0.5 rad of their goal's orientation by half a turn about the world's x, in place."""
+    """Rotate cubes, in place, by 180 degrees about the world's x if they start too near their goal's orientation.
+
+    "Too near" means within 0.5 rad. ``cube`` holds poses (n, 7); ``goal_inverse`` holds the inverses of the goals'
+    orientations (n, 4).
+    """
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < 0.5
     turned = multiply(constant((1.0, 0.0, 0.0, 0.0), now).expand_as(now), now)

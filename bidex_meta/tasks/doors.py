@@ -32,7 +32,7 @@ _PANELS, _PANEL_HALF = ((0.00696, -0.1993, -0.4647), (0.0041, 0.1971, -0.4647)),
 _HANDLES = ((0.04, -0.39, -0.5), (0.04, 0.39, -0.5))
 """Points that the hands must reach, in the leaves' frames, metres; x is negative for an Inward door."""
 _POLE = (0.025, 0.025, 0.65)
-"""Semi-axes of the goal in pictures, metres: a pole at the handle that shows above a leaf in front of it."""
+"""Semi-axes of the goal in pictures, metres: a pole at the handle, visible above a leaf in front of it."""
 _LEAST_SHARE = 0.1
 """Distance of each handle from the door's middle along y that success requires, metres. If only one leaf of an Inward
 door opens, the handles are 0.497 m apart, and more than 0.5 m if the leaf is pushed against its stop, which yields."""
@@ -44,9 +44,10 @@ class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
     Leaf and handle at +y belong to the right hand. A task freezes the door's position along y and one start angle for
-    both leaves; an episode draws nothing. The goal block holds the pose of the door's base, which is also the object's
-    pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left leaf (hinge
-    2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is from its angle.
+    both leaves; an episode makes no further draws. The goal block holds the pose of the door's base, which is also the
+    object's pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left
+    leaf (hinge 2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is
+    from its angle.
 
     The opening classes measure success along y: a single leaf that is open by 1.26 rad already brings the handles 0.5 m
     apart. The Inward classes have the same door upside down, so that it swings towards the hands. Their handle points
@@ -91,9 +92,10 @@ class _Door(ReachTask):
         return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``: base pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); the leaves' angles, rad.
+        """Return the pose of the door and the angles of its leaves, rad.
 
-        ``angle`` (n, 1) is the start angle of both leaves. With wide variation ``leaves`` (n, 2) are the target angles.
+        ``goal``: pose of the door's base (n, 7); ``goal_inverse``: inverse of the base's rotation (n, 4); ``angle``:
+        start angle of both leaves (n, 1). With wide variation ``leaves`` (n, 2) are the target angles.
         """
         position = constant(_BASE, variation).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]

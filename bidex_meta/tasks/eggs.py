@@ -1,4 +1,4 @@
-"""Common parts of the throwing and catching classes: eggs, goal poses, the exponential reward of equations 1 to 5."""
+"""Common parts of the throwing classes: eggs, goal poses and the exponential reward of equations 1 to 5."""
 
 from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
@@ -32,7 +32,8 @@ JOINT_DRAWS = 24
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
     """Return the observation blocks of each object and its goal.
 
-    ``numbers`` holds ``""`` for a single ``object``, or ``"1"`` and ``"2"`` for ``object1`` and ``object2``.
+    ``numbers`` holds the suffixes of the objects' names: ``""`` for a single ``object``, or ``"1"`` and ``"2"`` for
+    ``object1`` and ``object2``.
     """
     blocks: list[Block] = []
     for i in numbers:
@@ -75,7 +76,7 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
 def lay_egg_on_hand(
     egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
 ) -> None:
-    """Lift an egg (or the spheroid around an object) off its palm, and open the fingers that would penetrate it.
+    """Lift an egg (or the spheroid around an object) off the palm, and open the fingers that would penetrate it.
 
     The egg (n, 7) and the joint angles (n, 24) of the hand that starts at ``pose`` are written in place. Semi-axes are
     in metres.
@@ -155,7 +156,7 @@ class EggTask(TaskClass):
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
         """Choose the base and the object: ``"egg"``, the name of an object in the package, or an MJCF file.
 
-        Raises BidexError if there is no such object, or if its file describes none that a hand can hold. See
+        Raises BidexError if there is no such object, or if its file has no object that a hand can hold. See
         docs/objects.md.
         """
         super().__init__(moving_base)
@@ -184,7 +185,10 @@ class EggTask(TaskClass):
                 self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``..._inverse``: inverse rotations (n, 4)."""
+        """Return ``goal``, or ``goal1`` and ``goal2``: the poses of the goals (n, 7).
+
+        Further entries, with the suffix ``_inverse``, are the inverses of the goals' rotations (n, 4).
+        """
         frozen = {}
         for k, i in enumerate(self.numbers):
             frozen |= frozen_goal(goal_pose(variation[:, 3 * k : 3 * k + 3], variation[:, -2:]), f"goal{i}")
@@ -216,7 +220,10 @@ class EggTask(TaskClass):
         return tuple(Hidden(tuple(f"goal{i}_{axis}" for axis in "xyz"), 0.03) for i in self.numbers)
 
     def instruct(self, goal: Mapping[str, float] | None) -> str:
-        """Return the summary with the object and its goal; success does not ask for the goal's orientation."""
+        """Return the class's summary with the object and its goal position.
+
+        The goal's orientation is left out, because success does not depend on it.
+        """
         summary = self.summary
         if self.held is not None:
             summary = summary.replace("an egg", f"the {self._thing}").replace(

@@ -29,17 +29,20 @@ def posed(position: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
-    """Return a goal pose (n, 7), position and quaternion (x, y, z, w), and the inverse rotation (n, 4), by name."""
+    """Return a dict with the pose of a goal (n, 7) under its name, and the inverse rotation (n, 4) as ``NAME_inverse``.
+
+    A pose is a position and a quaternion (x, y, z, w).
+    """
     return {goal: pose, f"{goal}_inverse": conjugate(pose[:, 3:])}
 
 
 def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Tensor:
-    """Return the quaternion of a body (from its sensor) times the inverse of its goal: (x, y, z, w), shape (n, 4)."""
+    """Return a body's quaternion, from ``sensor``, times the inverse quaternion of its goal, (x, y, z, w), (n, 4)."""
     inverse = state.frozen[f"{goal}_inverse"]
     return state.once(("difference", sensor, goal), lambda: multiply(state.quaternion(sensor), inverse))
 
 
 def observe_goal(state: TaskState, sensor: str, goal: str = "goal") -> dict[str, Tensor]:
-    """Return the two goal blocks of a body whose orientation the sensor gives."""
+    """Return the two goal blocks of a body whose orientation ``sensor`` measures."""
     difference = rotation_difference(state, sensor, goal)
     return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": difference}

@@ -14,7 +14,7 @@ VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
 """Scale of joint velocities and of objects' angular velocities, and scale of forces and torques (docs/figures.md,
 observation)."""
 CLIP = 5.0
-"""Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
+"""Largest absolute value of an entry; entries are clipped after scaling (docs/figures.md, control)."""
 TOUCH_FORCE = 5.0
 """Normal force that touch entries show as 0.5, N. Fingertips felt 3 to 5 N (median) under random and scripted actions,
 and up to 394 N, so that a linear scale would either clip or hide most contacts."""
@@ -33,7 +33,7 @@ class Block:
     Attributes:
         sensors: Names of the sensors that the block is read from, in order; empty if the entries are computed.
         scale: Factor on the sensors' values.
-        goal: Whether the block shows the goal, so that meta suites zero it.
+        goal: Whether the block shows the goal; meta suites zero such blocks.
         saturates: Whether a scaled value x is shown as x / (1 + abs(x)), within (-1, 1).
         description: One line for documentation, with unit and frame.
     """
@@ -128,7 +128,7 @@ def hand_blocks(side: str, moving: bool, touch: bool = False) -> tuple[Block, ..
 
 @checked_arguments
 def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
-    """Return pose and velocities of a free object (13 entries), ``<name>_...``, read from ``<sensors>/...``."""
+    """Return the blocks ``<name>_...`` of a free object, pose and velocities (13 entries), from ``<sensors>/...``."""
     name = name or sensors
     spin = f"{sensors}/angular_velocity"
     return (
@@ -140,7 +140,7 @@ def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
 
 @checked_arguments
 def goal_blocks(name: Text) -> tuple[Block, ...]:
-    """Return goal pose and rotation from goal to object (11 entries), zeroed in meta suites."""
+    """Return the blocks of a goal: its pose, and the rotation from goal to object (11 entries)."""
     return (
         Block(f"{name}_pose", 7, goal=True, description=_POSE),
         Block(f"{name}_rotation_difference", 4, goal=True, description=_DIFFERENCE),

@@ -1,6 +1,6 @@
-"""Start poses of objects: a task freezes shift and turn from the nominal pose, an episode adds a small jitter.
+"""Start poses of objects: a task freezes a shift and a turn from the nominal pose; an episode adds a small jitter.
 
-Turns are about the vertical axis through the object's origin.
+A turn (yaw) is a rotation about the vertical axis through the object's origin.
 """
 
 from collections.abc import Iterable
@@ -14,9 +14,10 @@ from bidex_meta.utils.maths import constant, multiply, wxyz, xyzw
 from bidex_meta.utils.validation import NonNegative, Text
 
 SHIFT, TURN = 0.03, 0.2617993877991494
-"""Half widths of a task's shift along x and y, metres, and turn, radians: 15 degrees (docs/figures.md, decisions)."""
+"""Half widths of a task's shift along x and y, metres, and of its turn, 15 degrees in radians (docs/figures.md,
+decisions)."""
 JITTER, JITTER_TURN = 0.005, 0.05
-"""Half widths of an episode's additional shift, metres, and turn, radians."""
+"""Half widths of an episode's additional shift, metres, and of its additional turn, radians."""
 DRAWS = 3
 """Number of uniform numbers that an episode draws for each jittered object: x, y, turn."""
 
@@ -29,7 +30,7 @@ def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> 
 
 
 def yaw_quaternion(yaw: Tensor) -> Tensor:
-    """Return turns about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
+    """Return rotations about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
 
     Vectorised sines and the scalar sines at the end of an array may differ in the last bit of double precision, and a
     row's start must not depend on its place in a batch.
@@ -40,9 +41,10 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
 
 
 def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
-    """Shift and turn nominal poses (n, 7), quaternion (w, x, y, z), in place, by x, y (metres) and yaw (n, 3).
+    """Shift and turn nominal poses (n, 7), quaternion (w, x, y, z), in place.
 
-    ``draws`` in [-1, 1], (n, 3), give the episodes' jitter; None for a fixture, which has no jitter.
+    ``frozen`` (n, 3) holds x and y in metres and yaw in radians. ``draws`` in [-1, 1], (n, 3), give the episodes'
+    jitter; None for a fixture, which has no jitter.
     """
     if draws is None:
         shift = frozen

@@ -40,7 +40,7 @@ class ReachTask(TaskClass):
         points: Sensors of the points that the left and the right hand must reach.
         constant: Constant of the reward.
         exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
-        terms: Order in which the reward's terms are summed.
+        terms: Names of the reward's terms, in the order in which they are summed.
         ghost: Semi-axes of the ellipsoid that shows the goal in pictures, metres; None: no goal is drawn.
     """
 

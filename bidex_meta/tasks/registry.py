@@ -46,9 +46,9 @@ def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """Return the name by which ``get`` knows a class, for a name in any case; ``package.module:Class`` keeps its case.
+    """Return the name by which ``get`` knows a class.
 
-    The name may end in ``-v2``.
+    Case is ignored in names of shipped classes, but not in ``package.module:Class``. The name may end in ``-v2``.
 
     Raises BidexError if there is no such class; the message calls it a ``kind``.
     """

@@ -22,7 +22,8 @@ Colour = tuple[Fraction, Fraction, Fraction, Fraction]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
-"""Gravity compensation that makes an object fall at 9.81 m/s² although gravity, a millionth of it, points up."""
+"""Gravity compensation that makes an object fall at 9.81 m/s², although the scene's gravity is a millionth of this and
+points up."""
 
 
 @checked_arguments

@@ -9,7 +9,7 @@ from bidex_meta.utils.maths import xyzw
 
 
 def unknown_sensor(name: str, known: Iterable[str]) -> BidexError:
-    """Return an error for a sensor that does not exist, listing the same object's sensors if it has any."""
+    """Return an error for a sensor that does not exist; the message lists the sensors of the same object, if any."""
     names = list(known)
     return unknown_name("sensor", name, [each for each in names if each.split("/")[0] == name.split("/")[0]] or names)
 

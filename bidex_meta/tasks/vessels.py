@@ -73,7 +73,7 @@ class LiftUnderarm(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``object``: shift, turn (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return ``object``: shift and yaw (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
         if self.rules.wide:
             placement = torch.zeros_like(placement)  # episodes draw the placement, so a goal must not depend on it
@@ -161,11 +161,14 @@ class BottleCap(OwnObjectClass):
     blocks = (*object_blocks("bottle"), point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"))
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``bottle``: shift and turn (n, 3); with wide variation ``slide``: the cap's target travel (n, 1)."""
+        """Return ``bottle``: shift and yaw (n, 3).
+
+        With wide variation also return ``slide``: target travel of the cap (n, 1), metres.
+        """
         return super().freeze(variation) | ({"slide": variation[:, 3:]} if self.rules.wide else {})
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the cap's target travel and the difference from it with wide variation, otherwise an empty dict."""
+        """Return, with wide variation, the cap's target travel and the difference from it; otherwise an empty dict."""
         if not self.rules.wide:
             return {}
         slide = state.frozen["slide"]
@@ -218,7 +221,10 @@ class BottleCap(OwnObjectClass):
         return state["bottle/slide"][:, 0] > 0.03
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return whether the bottle fell, with wide variation only: on the table a fast spin may add energy to it."""
+        """Return whether the bottle fell; without wide variation return False.
+
+        A fallen bottle ends the episode, because on the table a fast spin may add energy to it.
+        """
         dropped = state["bottle/position"][:, 2] < _DROPPED
         return dropped & self.rules.wide
 
@@ -268,7 +274,7 @@ class SwingCup(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``cup``: shift and turn (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return ``cup``: shift and yaw (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         position = constant(_CUP.position, variation).repeat(len(variation), 1)
         if not self.rules.wide:
             position[:, :2] += variation[:, :2]

@@ -1,4 +1,4 @@
-"""The numbers of goals in instructions, as words; the errors of rounding are much smaller than any tolerance."""
+"""Numbers of goals as text for instructions; rounding changes them by much less than any tolerance."""
 
 import math
 

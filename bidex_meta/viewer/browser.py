@@ -1,4 +1,4 @@
-"""A viewer in the browser, by viser, for machines without a screen."""
+"""A viewer in the browser, with the library viser, for machines without a screen."""
 
 from importlib import import_module
 from typing import Any
@@ -35,7 +35,7 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
 
-    Raises BidexError for kinds that the browser cannot show, e.g. height fields.
+    Raises BidexError for types of geoms that the browser cannot show, e.g. height fields.
     """
     make = import_module("trimesh.creation")  # trimesh is a dependency of viser
     kind = model.geom_type[geom]

@@ -93,7 +93,7 @@ class Desktop:
 
 
 def _check_windows() -> None:
-    """Raise OSError if no window can be opened: MuJoCo's viewer would end the process."""
+    """Raise OSError if no window can be opened; in this case MuJoCo's viewer would end the process."""
     if not sys.platform.startswith("linux"):
         return
     import glfw

@@ -62,7 +62,7 @@ class Stage:
             self._restart(ended)
 
     def restart(self) -> None:
-        """Begin another episode in the shown environment; the unfinished one does not count."""
+        """Begin another episode in the shown environment; the unfinished episode does not count."""
         mask = torch.zeros(len(self.names), dtype=torch.bool, device=self._obs.device)
         mask[self.row] = True
         self._restart(mask)

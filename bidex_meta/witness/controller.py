@@ -40,7 +40,7 @@ Actions = Iterator[Lead]
 
 
 def beside(point: Tensor, x: float, y: float, height: float) -> Point:
-    """Return a point that is shifted from another one by ``x`` and ``y``, at a height above the floor, metres."""
+    """Return the point that is shifted from ``point`` by ``x`` and ``y``, at a height above the floor, metres."""
     return float(point[0]) + x, float(point[1]) + y, height
 
 
@@ -51,7 +51,7 @@ def point(position: Tensor) -> Point:
 
 
 def rest_action(size: int) -> Tensor:
-    """Return the action (size,) that asks for zero joint angles and no force on the bases."""
+    """Return the action (size,) for zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
     one = torch.zeros(size // 2)
     one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
@@ -59,7 +59,7 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Leads both hands of one environment to points, based on the environment's present state.
+    """Moves both hands of one environment to points, based on the environment's present state.
 
     ``sensor`` returns a sensor's present values, (k,) in double precision, by the sensor's name. ``frozen`` returns a
     frozen value of the task, (k,), by the value's name.
@@ -76,7 +76,7 @@ class HandController:
         self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
 
     def orientation(self, sensor: str) -> Tensor:
-        """Return a sensor's quaternion, (x, y, z, w), (4,)."""
+        """Return the orientation (x, y, z, w) that a sensor measures, (4,)."""
         value = self.where(sensor)
         return xyzw(value / value.norm())
 
@@ -90,19 +90,22 @@ class HandController:
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
-        """Bend the four fingers of a hand and set the other named joints; the rest of the joints go to 0. In rad."""
+        """Set the target angles of a hand's joints, rad.
+
+        The four fingers bend by ``knuckles`` and ``middles``. ``others`` are angles by joint; all other joints get 0.
+        """
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
     def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
-        """Hold a hand's start orientation, turned by ``roll`` and ``yaw`` about the world's axes, rad, from now on.
+        """Hold, from now on, a hand's start orientation turned by ``roll`` and ``yaw`` about the world's axes, rad.
 
         A hand may turn freely until a script calls this method or ``turn``.
         """
         self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
     def turn(self, side: str, way: Tensor) -> None:
-        """Turn a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
+        """Turn a hand from its present orientation by a small rotation vector ``way`` (3,), world, rad."""
         x, y, z = way.tolist()
         angle = math.sqrt(x * x + y * y + z * z)
         sine = math.sin(0.5 * angle) / (angle + 1e-9)
@@ -146,9 +149,9 @@ class HandActions:
         return quantised(torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1))
 
     def _torque(self, held: Tensor, now: Tensor) -> Tensor:
-        """Return the actions (n, 2, 3) that turn hands to the orientations ``held``; zeros for a hand that is free.
+        """Return the actions (n, 2, 3) that turn hands to the orientations ``held``; zeros for a free hand.
 
-        ``now`` are the present orientations of the hands, (w, x, y, z).
+        A hand is free until a script sets its orientation. ``now`` are the present orientations, (w, x, y, z).
         """
         now = xyzw(now / now.norm(dim=-1, keepdim=True))
         error = multiply(held, conjugate(now))

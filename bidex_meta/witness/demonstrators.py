@@ -18,10 +18,11 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class OpenLoopReplay:
-    """Plays the witness of each environment's class without observations; classes without a witness get zero actions.
+    """Plays the witness of each environment's class and ignores observations.
 
-    ``task_names`` are the classes of the world's slots, and ``task_id`` is the slot of each environment. ``actions`` is
-    the size of the world's actions, which may be padded. ``noise`` is the standard deviation of noise on actions.
+    Classes without a witness get zero actions. ``task_names`` are the classes of the world's slots, and ``task_id`` is
+    the slot of each environment. ``actions`` is the size of the world's actions, which may be padded. ``noise`` is the
+    standard deviation of noise on actions.
     """
 
     def __init__(
@@ -55,13 +56,13 @@ class OpenLoopReplay:
 
 
 class Scripted:
-    """Plays the scripts of a world's classes; each script acts on the present state of its environment.
+    """Plays the scripts of a world's classes; each script reads the present state of its environment.
 
     ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots whose scripts play (None: all); other slots
-    get zero actions. A script begins with its environment's episode. It reacts to whatever moved the hands: ``noise``
-    (a standard deviation) or another policy's actions. When a script has ended, its last action is repeated. With
-    ``misled`` each script is given the next task of the pool instead of its own task, as if it had to guess the goal.
-    Raises BidexError for a class without a script.
+    get zero actions. A script begins with its environment's episode. Because it reads the state, it corrects for
+    ``noise`` on the actions (a standard deviation) or for the actions of another policy. When a script has ended, its
+    last action is repeated. With ``misled`` each script is given the next task of the pool instead of its own task, as
+    if it had to guess the goal. Raises BidexError for a class without a script.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class _Class:
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
-        """Play the script of an environment; nothing is read before its first action is requested."""
+        """Play the script of an environment; the state is first read when the first action is requested."""
         place = self._member.env_ids.start + row
         tasks = self._world.num_slot_tasks[self._member.slot]
         given = (self._world.task_index[place : place + 1] + self._ahead) % tasks

@@ -70,7 +70,7 @@ class Simulator:
     def starts(self, shifted: int, seed: int = SEED) -> list[State]:
         """Return the start state, followed by ``shifted`` shifted starts.
 
-        In a shifted start every object or fixture is moved by 0.1 mm in the plane.
+        In a shifted start every object and movable fixture is moved horizontally by 0.1 mm in a random direction.
         """
         generator = torch.Generator().manual_seed(seed)
         places = self._part.group.members[0].scene.qpos
@@ -161,12 +161,15 @@ class Replay:
 
     @property
     def deepest(self) -> float:
-        """Return the deepest contact from the unshifted start, metres: large if one body passed through another."""
+        """Return the deepest contact from the unshifted start, metres; large if one body passed through another."""
         return float(self.depths[:, 0].max())
 
     @property
     def found(self) -> bool:
-        """Return whether this counts as a witness: it succeeds from the start and from eight of ten shifted starts."""
+        """Return whether the actions count as a witness.
+
+        They must succeed from the start and from at least eight of ten shifted starts.
+        """
         return self.first_success is not None and self.succeeded >= 8
 
 

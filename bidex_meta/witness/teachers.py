@@ -15,7 +15,7 @@ from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 class Tutor:
     """A policy, the environments that it labels, int64 (k,), and the number of observation entries that it reads.
 
-    A policy of one class reads the first entries of a suite's observation; padding and the task id follow.
+    A policy of one class reads only the first entries of a suite's observation, which padding and the task id follow.
     """
 
     policy: Agent
@@ -26,9 +26,9 @@ class Tutor:
 class Teachers:
     """Labels the states of a world's environments with actions.
 
-    It is an agent that acts in every step and is reset when episodes begin. ``known``: the environments that have a
-    teacher, bool (N,). ``scripted`` labels the environments in ``scripted_rows``, bool (N,); each of the ``tutors``
-    labels its own environments. ``privileged`` shows the tutors the goals that the world hides.
+    Use it like an agent: call ``eval_action`` in every step and ``reset`` when episodes begin. ``known``: the
+    environments that have a teacher, bool (N,). ``scripted`` labels the environments in ``scripted_rows``, bool (N,);
+    each of the ``tutors`` labels its own environments. ``privileged`` shows the tutors the goals that the world hides.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ class AgentView:
 
     @property
     def columns(self) -> tuple[int, ...]:
-        """Entries of the world's observation that the agent sees, ascending."""
+        """Indices of the entries of the world's observation that the agent sees, ascending."""
         columns: list[int] = []
         for group in self.groups:
             for part in group.where:
@@ -43,11 +43,12 @@ class AgentView:
 
 
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
-    """Return the agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
+    """Return one view per agent of a world, in the order in which ``agents`` gives the agents.
 
-    ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or a dict from each agent's name to its units. In a
-    world without hands the units are ``action/0``, ``action/1``, ..., and every agent observes everything. Raises
-    BidexError if a unit is unknown, missing or named twice, or if the hands' bases move in only some of the classes.
+    ``agents`` is ``single``, ``hands`` or ``fingers``, a text or TOML file as in ``hands/units.py``, or a dict from
+    each agent's name to its units. With ``hands`` and ``fingers`` the agents of the right hand come first. In a world
+    without hands the units are ``action/0``, ``action/1``, ..., and every agent observes everything. Raises BidexError
+    if a unit is unknown, missing or named twice, or if the hands' bases move in only some of the classes.
     """
     units = _units(groups, num_actions)
     views = []

@@ -42,7 +42,7 @@ class Slots(NamedTuple):
 class Transition(NamedTuple):
     """One step of n environments, before rewards are scaled and values of broken environments are replaced.
 
-    Observations have shape (n, d) and are float32, as are rewards (n,); flags are bool (n,).
+    Observations (n, d) and rewards (n,) are float32; flags (n,) are bool.
     """
 
     obs: Tensor
@@ -57,7 +57,7 @@ class Transition(NamedTuple):
 
 
 class BatchedWorld(VectorEnv, ABC):
-    """A ``contract.TaskWorld``: environments that are split evenly over slots, those of a slot next to each other.
+    """A ``contract.TaskWorld`` whose environments are split evenly over slots; a slot's environments are contiguous.
 
     Worlds can be pickled and copied. A copy is built from the same arguments and continues bit for bit. Of the
     attributes that a user may set, only ``stagger`` is copied.
@@ -95,9 +95,9 @@ class BatchedWorld(VectorEnv, ABC):
     ) -> None:
         """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds its own simulation.
 
-        ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation);
-        with ``stagger`` first episodes begin at a random elapsed step (not in DISABLED). Raises BidexError for fewer
-        environments than slots, an unknown mode or a seed below 0.
+        ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation).
+        With ``stagger`` first episodes begin at a random elapsed step, except in DISABLED mode. Raises BidexError for
+        fewer environments than slots, an unknown mode or a seed below 0.
         """
         self.num_envs = checked.num_envs(num_envs, slots.names)
         self.device = device
@@ -144,7 +144,7 @@ class BatchedWorld(VectorEnv, ABC):
         self.episodes = Episodes.fresh(self.num_envs, self.device)
 
     def _renew_draws(self) -> None:
-        """Renew numbers that were drawn in advance; called after the seed or the pools of tasks have changed."""
+        """Replace numbers that were drawn in advance, after the seed or the pools of tasks have changed."""
 
     def _random_keys(self, purpose: str = "") -> Tensor:
         """Return one key per environment, (n, 2), for the random numbers that serve ``purpose``."""
@@ -196,12 +196,15 @@ class BatchedWorld(VectorEnv, ABC):
 
     @abstractmethod
     def _start(self, mask: Tensor, stagger: bool) -> None:
-        """Start episodes in the environments of a mask (``_count_episodes``), and write observations into ``_obs``."""
+        """Start episodes in the environments of a mask.
+
+        Call ``_count_episodes``, and write the first observations into ``_obs``.
+        """
 
     def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
-        """Count new episodes in the environments of a mask.
+        """Reset the counters for new episodes in the environments of a mask.
 
-        The episodes play the tasks ``task_index``. With ``stagger`` a ``share`` of the time limit has already passed.
+        The episodes play the tasks ``task_index``. With ``stagger`` a ``share`` of their time limits counts as elapsed.
         """
         self.episodes.number = self.episodes.number + mask
         self.task_index = torch.where(mask, task_index, self.task_index)
@@ -225,11 +228,11 @@ class BatchedWorld(VectorEnv, ABC):
     def _move(self, active: Tensor, broken: Tensor) -> Outcome:
         """Step the ``active`` environments with the actions in ``_action``, and return the result of ``_finish``.
 
-        New episodes start only afterwards. ``broken`` are the active environments whose action was not finite.
+        The caller starts new episodes afterwards. ``broken`` marks active environments whose action was not finite.
         """
 
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> Outcome:
-        """Count the step and return its outcome; for environments that are not active, only success is read."""
+        """Count the step and return its outcome; of inactive environments only the transition's success is read."""
         obs = transition.obs
         unstable = transition.unstable | broken
         valid = active & ~unstable
@@ -271,7 +274,7 @@ class BatchedWorld(VectorEnv, ABC):
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     def _made(self) -> dict[str, str]:
-        """Return, as texts by name, the settings that together with the state determine the world's future.
+        """Return, by name, the settings that together with the state determine the world's future; values are texts.
 
         A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out,
         because a run may continue with others. Autoreset modes are left out, because an evaluation may finish episodes
@@ -306,7 +309,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment: the environment's entry if there is one, or the world's value."""
+        """Return an attribute once per environment: the environment's entry if there is one, else the whole value."""
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:

@@ -25,15 +25,16 @@ _MOST_ENVIRONMENTS = 10_000_000
 """More environments than any memory holds, but few enough for the engines' libraries to count."""
 _LARGEST_SEED = 2**128
 _LEAST = {"episodes/number": -1}
-"""Smallest whole numbers in a state, if not 0. Before an environment's first episode, the number of its episode is -1.
-"""
+"""Smallest valid integer of each entry of a state, if it is not 0. Before an environment's first episode, the number of
+its episode is -1."""
 _AGAIN = "build the world with the same suite, split and num_envs."
 MOST_EPISODES = 1000
 """Maximum number of episodes that play one task before another is drawn, and maximum number of episodes in a trial."""
 _TOLD, _LONGEST = 5, 100
 """Maximum number of differences that a message names, and maximum number of letters for each."""
 _ROWS = 11
-"""Number of rows on which formulas are tried. No sensor and no block has this size, so that rows can be recognised."""
+"""Number of rows on which formulas are tried. No sensor and no block has this size, so that a tensor's axis of rows can
+be recognised by its size."""
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
@@ -60,7 +61,7 @@ def switches(given: str, slots: Sequence[Slot]) -> None:
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:
-    """Raise BidexError if a name is unknown, or if ``points`` is neither a ``PointsRule`` nor None."""
+    """Raise BidexError if sampling or observation is unknown, or if ``points`` is neither a ``PointsRule`` nor None."""
     for name, given, known in (
         ("task_sampling", task_sampling, ("uniform", "fixed", "fresh")),
         ("observation", observation, get_args(Rule)),
@@ -117,9 +118,9 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """Return the slots with the pools of a saved state, checked against the world's own state and slots.
+    """Return the slots with the task pools of a saved state.
 
-    ``task_id`` (n,): slot of each environment.
+    The state is first checked against the world's ``own`` state and slots. ``task_id`` (n,): slot of each environment.
 
     Raises BidexError if the state belongs to another world or is damaged.
     """
@@ -143,7 +144,7 @@ def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
     """Raise BidexError if a saved state has other names, types or shapes than ``own``, or non-finite numbers.
 
     ``own`` is the state of the world that loads. Its entry ``made`` must be equal in both states. ``inside`` is the
-    path of both states in the states that contain them.
+    path of both states if they are entries of larger states, for messages.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         if isinstance(given, Mapping):
@@ -207,7 +208,8 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
     """Call a class's methods once, for a few rows of its first task and sensors that all read 0.
 
     ``sensors`` has the engine's precision and device; ``observed`` says whether ``observe`` is called too. Raises
-    BidexError if a method returns something else than expected; the message names class, method and both values.
+    BidexError if a method returns anything but what is expected; the message names class, method, what was expected and
+    what was returned.
     """
     task = scene.task
     name = type(task).__name__

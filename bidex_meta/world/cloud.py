@@ -56,7 +56,7 @@ def camera_of(task: TaskClass) -> Camera:
 
 
 _CHUNK = 32
-"""Number of environments that a CPU computes at once, chosen so that their numbers fit into its cache."""
+"""Number of environments that a CPU computes at once, chosen so that their data fits into its cache."""
 
 
 _PIXELS = 128
@@ -72,8 +72,8 @@ class Cloud:
     """Computes the point clouds of environments that share one model.
 
     The candidates are the points of ``surfaces``. A candidate is visible if it faces the camera, lies in the camera's
-    frustum, and nothing nearer was drawn around its pixel in a coarse depth buffer. Shapes do not depend on values, so
-    that CUDA graphs can record the computation.
+    frustum, and nothing nearer was drawn around its pixel in a coarse depth buffer. Shapes of tensors do not depend
+    on values, so that CUDA graphs can record the computation.
 
     A cloud has ``count`` points. With ``kinds`` each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
     """
@@ -110,7 +110,7 @@ class Cloud:
         self._size = len(surfaces.points)
 
     def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Return the clouds of n environments in the world frame, in metres: (n, *shape), float32.
+        """Return the clouds of n environments in the world frame, in metres: (n, count, 3 or 4), float32.
 
         If there are fewer visible candidates than points, candidates are repeated; if there are more, an evenly spread
         subset is taken. Hidden candidates do not affect the result. If nothing is visible, the cloud is all zeros.

@@ -73,7 +73,7 @@ class ObservationGroup:
     """Entries of an observation that have the same kind in every environment of a world."""
 
     name: str
-    """``right_hand``, ``left_hand``, ``object`` (all other entries of a class), ``goal`` (zeros if a suite hides it),
+    """``right_hand``, ``left_hand``, ``object`` (a class's entries in no other group), ``goal`` (zeros if hidden),
     ``padding``, ``task_id`` (one-hot), ``task`` for entries whose kind differs by slot (in MT4 these are padding in
     three classes and the second egg in one), or ``last_step`` (in worlds of trials: the last action, the last reward,
     and 1 if an episode ended). Worlds that know no such kinds have one group ``state``. The groups depend on the
@@ -88,7 +88,10 @@ class ObservationGroup:
 
 
 def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
-    """Return the groups of a world that knows no kinds: ``state``, and ``task_id`` for the last ``num_id_columns``."""
+    """Return the groups of a world that knows no kinds of entries.
+
+    They are ``state``, and ``task_id`` for the last ``num_id_columns`` entries of the ``size`` entries.
+    """
     groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
     return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
 
@@ -98,9 +101,9 @@ class VectorWorld(Protocol):
     """N environments that are stepped together; each belongs to one of ``num_tasks`` slots."""
 
     single_observation_space: Box
-    """Shape (d,), float32; ``observation_space`` (N, d)."""
+    """Observations of one environment: shape (d,), float32. ``observation_space`` has shape (N, d)."""
     single_action_space: Box
-    """Shape (a,), within [-1, 1]; ``action_space`` (N, a)."""
+    """Actions of one environment: shape (a,), within [-1, 1]. ``action_space`` has shape (N, a)."""
     observation_space: Box
     action_space: Box
     num_envs: int
@@ -111,13 +114,13 @@ class VectorWorld(Protocol):
     task_names: list[str]
     """Names of the slots."""
     gammas: tuple[float | None, ...]
-    """Discount factor per step that learners must use for each slot; None: the learner's own."""
+    """Discount factor per step that learners must use for each slot; None means that learners use their own."""
     num_id_columns: int
     """Number of entries at the end of an observation that are the one-hot of the slot: ``num_tasks`` or 0."""
     observation_groups: tuple[ObservationGroup, ...]
     """The named parts of an observation, in the order of their first entries; each entry belongs to one group."""
     metadata: dict[str, Any]
-    """Holds ``autoreset_mode``, gymnasium's SAME_STEP, NEXT_STEP or DISABLED."""
+    """The entry ``autoreset_mode`` is Gymnasium's SAME_STEP, NEXT_STEP or DISABLED."""
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Start episodes; return observations (N, d), float32, and an empty info.
@@ -127,14 +130,16 @@ class VectorWorld(Protocol):
                 seed's next episodes.
             options: ``reset_mask``: environments to start, bool (N,), all by default; the others stay unchanged.
 
-        Raises BidexError for another option, a seed below 0, or a seed with a partial mask.
+        Raises BidexError for any other option, for a seed below 0, or if a seed is given with a mask that does not
+        include all environments.
         """
         ...
 
     def step(self, action: Tensor, /) -> Step:
-        """Take actions (N, a), clipped to [-1, 1]; an environment with a non-finite action ends as unstable.
+        """Apply actions (N, a), which the world clips to [-1, 1], for one control step.
 
-        Returns observations (N, d), rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
+        In an environment with a non-finite action the episode ends as unstable. Returns observations (N, d) and rewards
+        (N,), float32; terminated and truncated (N,), bool, of which at most one is true; and info.
         """
         ...
 
@@ -153,7 +158,7 @@ class VectorWorld(Protocol):
 
 @runtime_checkable
 class TaskWorld(VectorWorld, Protocol):
-    """A world whose environments play known tasks of their slot's pool: for evaluation and meta-learning."""
+    """A world whose environments play known tasks of their slot's pool, as evaluation and meta-learning need."""
 
     slot_env_ids: list[slice]
     """Contiguous environments of each slot, as slices."""
@@ -208,7 +213,9 @@ class EndlessWorld(Protocol):
 
 
 class PrivilegedWorld(Protocol):
-    """A world that can show what its observations hide: for teachers, and for learners that use it in training only.
+    """A world that can show what its observations hide.
+
+    It serves teachers, and learners that use the hidden values in training only.
 
     Hidden values are the numbers of a task that its class hides (such as the goal's position), scaled from their range
     to [-1, 1]. If a class hides fewer than ``hidden_size`` numbers, zeros follow.
@@ -231,7 +238,8 @@ class PrivilegedWorld(Protocol):
     def rewards_if(self, goals: Tensor, /) -> Tensor:
         """Return the rewards that the last step would have earned if the tasks had other hidden values.
 
-        ``goals`` (..., N, hidden_size); returns (..., N), float32. Raises BidexError for another shape.
+        ``goals`` (..., N, hidden_size) are these hidden values. Returns (..., N), float32. Raises BidexError for
+        another shape.
         """
         ...
 

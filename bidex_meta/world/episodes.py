@@ -31,19 +31,19 @@ class Episodes:
     counts: Tensor
     """True if the episode enters statistics (a shortened first episode does not)."""
     finished: Tensor
-    """True if the episode has ended and waits for a reset (never in SAME_STEP mode); the next two fields are its flags.
-    """
+    """True if the episode has ended and its environment waits for a reset (never in SAME_STEP mode). The next two
+    fields are the flags of the episode's last step."""
     terminated: Tensor
     truncated: Tensor
     success: Tensor
-    """True if the episode was solved at any step."""
+    """True if the goal was met at any step of the episode."""
     held: Tensor
-    """Steps for which the episode has been solved without a break."""
+    """Number of consecutive steps, up to the last one, in which the goal was met."""
     reward: Tensor
     unscaled: Tensor
     """Sum of the rewards before the suite's scale of the class; ``reward`` is the sum of the scaled rewards."""
     length: Tensor
-    """Number of steps in these sums."""
+    """Number of steps over which the rewards are summed."""
 
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
@@ -72,7 +72,7 @@ class Episodes:
 
     @property
     def solved_at_end(self) -> Tensor:
-        """Return whether an episode that ends now holds its goal at the end, (n,), bool."""
+        """Return whether an episode that ends now counts as holding its goal at the end, (n,), bool."""
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
@@ -98,11 +98,11 @@ class Episodes:
 
 
 def ended_info(info: Info) -> Info:
-    """Return Gymnasium's keys for the episodes that ended in a step, from the contract's keys; zero outside each mask.
+    """Return Gymnasium's keys for the episodes that ended in a step, from the keys of ``contract``.
 
-    ``episode`` holds r, l, success and unscaled, (N,) each; its mask ``_episode`` marks episodes that ended and count.
-    ``final_info`` holds values of the last step and ``episode`` again, each with a mask. ``_final_info`` marks all
-    environments whose episode ended.
+    Values are zero outside their masks. ``episode`` holds r, l, success and unscaled, (N,) each; its mask ``_episode``
+    marks episodes that ended and count. ``final_info`` holds values of the last step and ``episode`` again, each with a
+    mask. ``_final_info`` marks all environments whose episode ended.
     """
     ended = info["_final_obs"]
     episode_mask = info["episode_mask"]
@@ -126,7 +126,7 @@ class Clock:
         self._began = torch.where(mask, time.perf_counter(), self._began)
 
     def stamp(self, info: Info) -> None:
-        """Add ``t``, float32 (N,), if ``info`` has ended episodes."""
+        """Add the seconds ``t``, float32 (N,), to ``episode`` if ``info`` has this key."""
         if "episode" in info:
             took = torch.where(info["_episode"], time.perf_counter() - self._began, 0).float()
             info["episode"]["t"] = took
@@ -134,9 +134,10 @@ class Clock:
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """Return the member of ``AutoresetMode`` for a mode in any spelling; None stands for SAME_STEP.
+    """Return the member of ``AutoresetMode`` for a mode or its name; None stands for SAME_STEP.
 
-    Raises BidexError for other modes, and if torch's default precision is not single.
+    Upper and lower case, hyphens and underscores make no difference in names. Raises BidexError for other modes, and if
+    torch's default precision is not single.
     """
     check_precision()
     if mode is None:
@@ -165,10 +166,11 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
 
 
 def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
-    """Return the environments that ``reset`` starts, bool (num_envs,): those of ``reset_mask``, or all without a mask.
+    """Return the environments that ``reset`` starts, bool (num_envs,): the option ``reset_mask``, by default all.
 
-    Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and if
-    torch's default precision is not single.
+    ``ready`` says whether a full reset has been made. Raises BidexError for any other option, for a mask of another
+    shape or dtype, for a mask with false entries before the first full reset, and if torch's default precision is not
+    single.
     """
     check_precision()
     if options is not None and not isinstance(options, Mapping):

@@ -23,7 +23,7 @@ OWN_DRAWS = 2
 
 
 class Sizes(NamedTuple):
-    """Sizes of each environment: observation entries (without one-hot), action entries, and the time limit in steps."""
+    """Sizes of an environment: observation entries without the one-hot, action entries, and the time limit in steps."""
 
     state: int
     action: int

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 Result = TypeVar("Result")
-"""Nested containers of tensors that a stretch of work returns. The work may also read and rebind the state."""
+"""Nested containers of tensors that a stretch of work returns. The work may also read and rebind the world's state."""
 
 Together = Callable[[Sequence[Callable[[], None]]], None]
 """A function that runs jobs that do not depend on each other, such as ``SideBySide.run``."""
@@ -49,7 +49,10 @@ class GraphCache:
     def __init__(
         self, get: Callable[[], dict[str, Tensor]], put: Callable[[dict[str, Tensor]], None], record: Record
     ) -> None:
-        """``get`` and ``put`` read and bind the state's tensors by name; ``record`` is e.g. ``cuda_graph``."""
+        """Take the function ``get``, which returns the state's tensors by name, and ``put``, which replaces them.
+
+        ``record`` is e.g. ``cuda_graph``.
+        """
         self._get = get
         self._put = put
         self._record = record
@@ -169,7 +172,7 @@ class SideBySide:
     """Runs jobs one after the other on a CPU, at the same time on a GPU."""
 
     def __init__(self, jobs: int, device: torch.device) -> None:
-        """``jobs`` is the maximum number of jobs that run at the same time."""
+        """Prepare streams; ``jobs`` is the maximum number of jobs that run at the same time."""
         several = device.type == "cuda" and jobs > 1
         if several:
             self._streams = [torch.cuda.Stream(device) for _ in range(jobs)]

@@ -36,7 +36,7 @@ class Slot:
     """Variations, shape (n, variation_space.size), float64."""
     reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
     gamma: BelowOne | None = None
-    """Discount factor per step that learners must use for this slot; None: the learner's own."""
+    """Discount factor per step that learners must use for this slot; None means that learners use their own."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Group:
     engine: Engine
     members: tuple[Member, ...]
     env_ids: Tensor
-    """Environment of each simulation, shape (num,), int64."""
+    """Index in the world of each simulation's environment, shape (num,), int64."""
     span: slice | None
     """The group's environments as a slice if they are contiguous, else None."""
 

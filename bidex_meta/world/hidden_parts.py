@@ -19,7 +19,7 @@ class HiddenParts:
         self.columns: dict[str, list[int]] = {}
         """Hidden columns of each slot's tasks."""
         self._ranges: dict[str, tuple[Tensor, Tensor]] = {}
-        """Middle and half width of each slot's hidden values, (n,) each, float64."""
+        """Middle and half width of the range of each hidden value, by slot, (n,) each, float64."""
         goal_indices = set[int]()
         for slot in slots:
             columns = slot.task_class.hidden_columns()

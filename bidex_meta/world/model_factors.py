@@ -1,7 +1,7 @@
 """The dependence of a scene's model on the factors of a randomisation.
 
 Every number that depends on a factor is multiplied by a power of the factor. This includes the numbers that
-``mj_setConst`` would compute, because a call of it would take as long as a step.
+``mj_setConst`` would compute, because calling it would take as long as a step.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,8 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks.scene import Scene
 
 Exponents = dict[str, dict[str, Tensor]]
-"""Exponents by the model's field and by factor: each number of the field is multiplied by the factor to this power."""
+"""Exponents by field of the model, then by factor: each number of the field is multiplied by the factor to this
+power."""
 
 
 def object_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -35,9 +36,9 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
 
 
 def heights(scene: Scene) -> dict[int, float]:
-    """Return the extent of the free objects (see ``_free``) below their origin at the start, metres.
+    """Return how far each free object (see ``_free``) reaches below its origin at the start, metres.
 
-    The keys are the ``qpos`` columns of z.
+    The key of an object is the ``qpos`` column of its z.
     """
     model = scene.model
     data = mujoco.MjData(scene.model)

@@ -14,9 +14,10 @@ from bidex_meta.utils.maths import conjugate, xyzw
 from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
-"""The observation of a suite: everything; everything and the task's id; everything but the goal."""
+"""Contents of a suite's observations: all entries, all entries and the task id, or all entries with the goal zeroed."""
 _HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both_hands(moving=True, touch=True)}
-"""Observation group of each block of a hand. Prefixes would not do: ``right_handle_position`` belongs to an object."""
+"""Observation group of each block of a hand, by the block's name. The prefix ``right_`` alone does not identify a hand:
+``right_handle_position`` belongs to an object."""
 
 
 class Observer:
@@ -71,7 +72,7 @@ class Observer:
         self._scale[where] = 1.0
 
     def _of_quaternions(self, scene: Scene) -> list[int]:
-        """Return the first entry of each quaternion whose sign the scene's rules choose.
+        """Return the first entry of each quaternion whose sign ``choose_signs`` sets; empty without wide variation.
 
         A goal's block ends with such a quaternion. Quaternions of hands are left out: joints turn a hand continuously
         from one start, so that the sign is unique even if w is near 0.
@@ -91,14 +92,17 @@ class Observer:
         return found
 
     def choose_signs(self, values: Tensor) -> None:
-        """Negate quaternions of objects and goals with w < 0 in observations (n, width), in place (wide variation)."""
+        """Negate, with wide variation, each quaternion of an object or goal whose w is negative.
+
+        The observations (n, width) are changed in place.
+        """
         if len(self._quaternions):
             columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
             turns = values[:, columns].unflatten(1, (-1, 4))
             values[:, columns] = torch.where(turns[..., 3:] < 0.0, -turns, turns).flatten(1)
 
     def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Return orientations of both mounts, and the inverse of those at the start, (x, y, z, w), each (n, 2, 4)."""
+        """Return orientations of both mounts and inverses of their start orientations, (x, y, z, w), each (n, 2, 4)."""
         return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
 
     def __call__(self, sensors: Tensor, action: Tensor, rotation: Tensor | None, out: Tensor | None = None) -> Tensor:
@@ -121,7 +125,7 @@ class Observer:
 
 
 def _indices(scene: Scene, name: str) -> Tensor:
-    """Return the indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
+    """Return the indices of a sensor in ``sensordata``; those of a quaternion are in the order (x, y, z, w)."""
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
     if name.endswith("quaternion"):

@@ -25,7 +25,8 @@ from bidex_meta.world.observations import Observer, Rule
 class Controls:
     """Writes actions into a group's engine: position targets and base forces.
 
-    Order (Tables 9 and 11): right hand first, per hand 20 joints, 3 base translations, 3 base rotations.
+    An action begins with the right hand. Each hand has entries for 20 joints, 3 base translations and 3 base rotations,
+    in this order (Tables 9 and 11).
     """
 
     def __init__(self, group: Group) -> None:
@@ -45,7 +46,7 @@ class Controls:
             self._wrench[member.engine_rows, 3:] = TORQUE_PER_SCALE * task.orientation_scale
 
     def write(self, action: Tensor) -> None:
-        """Set targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
+        """Set joint targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
 
         ``action``: finite numbers in [-1, 1], shape (num, 52 or 40).
         """

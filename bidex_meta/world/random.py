@@ -41,7 +41,7 @@ def env_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
 
 
 def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
-    """Return keys (n, 2) of a stream of numbers within an episode (n,), from the keys (n, 2) of its environment."""
+    """Return keys (n, 2) of a stream of random numbers in episodes (n,), from the keys (n, 2) of the environments."""
     beyond = torch.full_like(episode, _MASK - stream)  # the episode's own draws never count up to this number
     return torch.stack(threefry((keys[:, 0], keys[:, 1]), (episode, beyond)), dim=1)
 
@@ -57,8 +57,8 @@ def normal(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
     """Return uniform numbers in [0, 1), float64 (n, draws).
 
-    A number depends only on key (n, 2), episode (n,) and the number of the draw. All are multiples of 2^-24 and
-    therefore exact in single precision.
+    A number depends only on its key (n, 2), its episode (n,) and the index of the draw. All numbers are multiples of
+    2^-24 and therefore exact in single precision.
     """
     pairs = torch.arange((draws + 1) // 2, device=keys.device)
     words = threefry((keys[:, :1], keys[:, 1:]), (episode[:, None], pairs[None]))

@@ -16,7 +16,7 @@ from bidex_meta.world.part import Part
 from bidex_meta.world.random import derived, normal, uniform
 
 _OBSERVATION, _ACTION, _PUSH = range(3)
-"""Streams of numbers within an episode."""
+"""Streams of random numbers within an episode, for noise in observations, noise in actions, and pushes."""
 _DELAY = "action_delay"
 
 
@@ -24,9 +24,10 @@ class Randomiser:
     """Draws factors, delays, noise and pushes for the environments of a world, and applies them."""
 
     def __init__(self, rule: Randomisation, parts: Sequence[Part], action_size: int, deviation: Tensor) -> None:
-        """``deviation`` (n, columns) is the standard deviation of the noise in the first columns of observations.
+        """Prepare the draws of all environments and the models of all parts.
 
-        Raises BidexError if the size of a mesh object is to vary.
+        ``deviation`` (n, columns) is the standard deviation of the noise in the first columns of observations. Raises
+        BidexError if the size of a mesh object is to vary.
         """
         self._rule = rule
         self._parts = parts
@@ -54,7 +55,7 @@ class Randomiser:
         self._keys.copy_(keys)
 
     def begin(self, mask: Tensor, number: Tensor) -> None:
-        """Draw for new episodes in the environments of a mask (n,), and change the environments' models.
+        """Draw factors and delays for new episodes in the environments of a mask (n,), and change their models.
 
         ``number`` (n,) is the number of each environment's episode.
         """
@@ -180,7 +181,7 @@ class _Models:
 def deviations(rule: Randomisation, layouts: Sequence[Layout], hidden: Sequence[Sequence[int]]) -> Tensor:
     """Return the standard deviation of the noise in each slot's observations, (slots, columns), float32.
 
-    Goals and actions have no noise, nor have the columns that a point cloud replaces (``hidden``, one list per slot).
+    Goals, actions and the columns that a point cloud replaces have no noise. ``hidden`` lists these columns per slot.
     """
     table = torch.zeros(len(layouts), max(layout.size for layout in layouts))
     for row, layout, zero in zip(table, layouts, hidden, strict=True):

@@ -28,7 +28,7 @@ _MOST_RENDERERS = 32
 MOST_PIXELS = 1080
 """Edge of the largest square picture."""
 _SMALL = 320
-"""Largest width of tiles, pixels. Tiles are drawn faster, without reflections and with coarser shadows."""
+"""Pictures up to this width, pixels, are drawn without reflections and with coarser shadows, which is faster."""
 GHOST_ALPHA = 0.35
 """Opacity of goals."""
 
@@ -38,9 +38,9 @@ class DrawnGhost(NamedTuple):
 
     position: np.ndarray
     quaternion: np.ndarray
-    """MuJoCo's (w, x, y, z)."""
+    """Orientation (w, x, y, z), as in MuJoCo."""
     size: np.ndarray
-    """Semi-axes."""
+    """Semi-axes, metres."""
     colour: tuple[float, float, float]
     """Red, green and blue in [0, 1]."""
 
@@ -48,7 +48,8 @@ class DrawnGhost(NamedTuple):
 class Painter(threading.local):
     """Draws environments of a world; renderers are cached. A copy starts without renderers: they cannot be copied.
 
-    A renderer draws only in the thread that made it. Each thread therefore has its own cache, which ends with it.
+    A renderer draws only in the thread that made it. Each thread therefore has its own cache, which is freed when the
+    thread ends.
     """
 
     def __init__(self) -> None:
@@ -74,7 +75,8 @@ class Painter(threading.local):
     def pictures(self, world: "PartedWorld", size: int) -> torch.Tensor:
         """Draw all environments by their classes' own cameras, (num_envs, size, size, 3), uint8.
 
-        mujoco_warp's worlds are drawn on their device, where they are; others on the CPU, one after another.
+        Environments of mujoco_warp are drawn on the engine's device, all of a slot at once. Environments of C MuJoCo
+        are drawn one after another on the CPU.
         """
         pictures = torch.empty(world.num_envs, size, size, 3, dtype=torch.uint8, device=world.device)
         for part in world.parts:
@@ -197,7 +199,7 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) ->
 
 
 def ghosts(world: "PartedWorld", env_id: int) -> list[DrawnGhost]:
-    """Return the goals of an environment's task in its present state, or nothing if the world hides them.
+    """Return the goals of an environment's task in the present state; the list is empty if the world hides goals.
 
     Every picture, film and view calls this function, so that none shows what observations hide.
     """

@@ -1,4 +1,4 @@
-"""Single environments of a suite's task classes, used as Meta-World's: `env = cls()`, then `env.set_task(task)`.
+"""Single environments of a suite's task classes, used like Meta-World's: `env = cls()`, then `env.set_task(task)`.
 
 They serve code that was written for Meta-World; `Benchmark.make_world` makes all environments of a suite at once.
 """
@@ -54,7 +54,7 @@ class EnvRecipe:
     """True if the hands' bases move, False if they are fixed, None for the class's default."""
     options: tuple[tuple[str, float | str], ...]
     padded_size: int
-    """Entries of an observation, without a point cloud."""
+    """Number of entries of an observation, without a point cloud."""
     hides_goal: bool
     reward_scale: float
     class_name: str | None = None
@@ -70,7 +70,7 @@ class EnvRecipe:
 
     @property
     def env_name(self) -> str:
-        """Return the name that the class's tasks have: ``CatchUnderarm-v2`` for the rules of version 2."""
+        """Return the name by which tasks refer to the class; with the rules of version 2 it ends in ``-v2``."""
         return versioned_name(self.name, self.rules)
 
     def make_class(self) -> type["SuiteEnv"]:
@@ -95,7 +95,7 @@ copyreg.pickle(_Remade, _reduced)
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     """A task class as an environment that plays the task it is given; its subclasses are listed in `train_classes`.
 
-    Classes and environments pickle and copy: a copy has the same task and continues bit for bit.
+    Classes and environments can be pickled and copied: a copy has the same task and continues bit for bit.
 
     Observations are those of the suite's worlds without the one-hot: they are padded to the suite's widest class, and
     goal entries are zero if the suite hides goals. If the suite shows point clouds, a cloud follows and replaces the
@@ -112,7 +112,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
     recipe: ClassVar[EnvRecipe]
     task_class: ClassVar[TaskClass]
-    """The class: scene, variations, observation, reward, success."""
+    """The task class, which defines scene, variations, observation, reward and success."""
 
     @checked_arguments
     def __init__(
@@ -157,7 +157,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 
     @property
     def task_name(self) -> str:
-        """Return the task class's name with its version, as the class's tasks have it."""
+        """Return the name by which tasks refer to the class; with the rules of version 2 it ends in ``-v2``."""
         return self.recipe.env_name
 
     @property

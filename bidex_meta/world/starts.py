@@ -43,9 +43,9 @@ class Starts:
             parts: The world's parts.
             keys: Random keys of the environments, (n, 2).
             start_draws: Maximum number of draws that the start of an episode takes in any class.
-            pool_size: Tasks in the pool of each environment's slot, (n,), if episodes draw them; None if environments
-                keep their tasks.
-            together: Runs one job per part.
+            pool_size: Number of tasks in the pool of each environment's slot, (n,), if episodes draw tasks; None if
+                environments keep their tasks.
+            together: Function that runs one job per part.
             task_keys: Random keys of new tasks, (n, 2), if episodes draw new tasks; None: tasks come from the pools.
             episodes_per_task: Number of consecutive episodes that play one drawn task.
         """
@@ -107,7 +107,7 @@ class Starts:
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
     def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Fill the bank of episodes drawn ahead in some environments, beginning with the given episode numbers."""
+        """Fill the store of episodes drawn ahead of some environments, from the given episode numbers on."""
         self._first[env_ids] = number[env_ids]
         many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -123,7 +123,7 @@ class Starts:
                 qpos[engine_row[own], ahead[own]] = start.to(qpos.dtype)
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
-        """Fill the bank of every environment in place, with shapes that do not depend on values."""
+        """Fill the store of every environment in place, with shapes that do not depend on values."""
         self._first.copy_(number)
         many, ahead = _repeated(torch.arange(len(number), device=number.device))
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -152,7 +152,7 @@ class Starts:
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
-        """Return the positions of episodes' (k,) new tasks in their variation spaces as shares in [0, 1), (k, size).
+        """Return the new tasks of episodes (k,), as shares in [0, 1) of the ranges in variation spaces, (k, size).
 
         Return None if episodes draw no new tasks.
         """

@@ -66,9 +66,9 @@ def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) ->
 
 
 def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) -> np.ndarray:
-    """Return whether points (n, 3) of a geom's frame lie deeper than ``margin`` (m) in it, bool (n,).
+    """Return whether points (n, 3), given in a geom's frame, lie deeper than ``margin`` (m) inside the geom, bool (n,).
 
-    A mesh contains no point.
+    Meshes are treated as if they contained no point.
     """
     size = np.asarray(model.geom_size[geom], dtype=np.float64)
     kind = int(model.geom_type[geom])
@@ -191,12 +191,13 @@ _OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """Kinds of points: on things that stand still during an episode, on either hand, on things that physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
-"""Shares of the candidates. If area were the only rule, a table would leave only a handful of points for an egg."""
+"""Share of the candidates that each kind gets. If candidates were spread by area alone, a table would leave only a
+handful of points for an egg."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers draw geoms of groups 0 to 2."""
 _PROBES = 512
 _BURIED = 5e-4
-"""Depth in another geom of the same body, metres, beyond which a point is never seen."""
+"""Points that lie deeper than this in another geom of the same body, metres, are never seen."""
 
 
 @dataclass(frozen=True)

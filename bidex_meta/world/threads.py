@@ -11,8 +11,8 @@ import torch
 def one_torch_thread() -> Iterator[None]:
     """Run torch operations on one thread.
 
-    The world's arrays are small: handing them to other threads costs more than it saves, above all while the engine's
-    threads want the same cores (measured on two cores, MT4, 1024 environments).
+    The world's arrays are small: handing them to other threads costs more time than it saves, above all while the
+    engine's threads use the same cores (measured on two cores, MT4, 1024 environments).
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -39,8 +39,8 @@ def set_up_torch(threads: int, deterministic: bool = False) -> None:
 def keep_freed_memory() -> None:
     """Let glibc keep up to 64 MB of freed memory for the next tensors; this has no effect without glibc.
 
-    By default glibc returns free memory beyond twice the size of the largest block that it has freed (blocks above 32
-    MB do not count). With small tensors every step then waits for pages: an inner step of the meta-learners took up to
-    twice as long, an MT-PPO update 3 % longer.
+    By default glibc returns free memory to the operating system beyond twice the size of the largest block that it has
+    freed (blocks above 32 MB do not count). With small tensors every step then waits for new pages: an inner step of
+    the meta-learners took up to twice as long, an MT-PPO update 3 % longer.
     """
     torch.empty(8_000_000)

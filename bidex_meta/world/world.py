@@ -63,17 +63,17 @@ class WorldConfig:
         observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
         pad_to: Number of observation entries before the task id; None: the number of the widest class.
         task_sampling: "uniform": each autoreset draws a task of the pool; "fixed": environment j keeps task j mod n;
-            "fresh": each episode draws a new task of its class's space; in DISABLED mode as "fixed" (``EndlessWorld``).
+            "fresh": each episode draws a new task of its class's space; in DISABLED mode this means "fixed".
         episodes_per_task: Number of consecutive episodes that play one task, if episodes draw tasks.
         threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.
         stagger: If true, first episodes in SAME_STEP mode begin at random elapsed steps, so that they do not end
             together; they do not count in ``episode``. If false, first episodes begin at 0.
         points: Point cloud before the task id, in place of the objects' states; None: observations show the states.
         randomisation: Factors that are drawn for environments, and noise that is added; None: neither.
-        pixels: Edge of the square pictures in ``info["pixels"]``, by the classes' cameras, pixels; 0: no pictures.
+        pixels: Edge, in pixels, of the square pictures in ``info["pixels"]`` from the classes' cameras; 0: no pictures.
 
-    Raises BidexError for an unknown sampling or observation, a seed below 0, too large pictures, or several episodes
-    per task if environments keep their tasks.
+    Raises BidexError for an unknown sampling or observation, a seed below 0, pictures that are too large, or several
+    episodes per task if environments keep their tasks.
     """
 
     num_envs: int | None = None
@@ -292,7 +292,7 @@ class World(BatchedWorld):
         return self._stepper.keep(self._stepper.run(self._finish_step, active, broken))
 
     def _frozen_if(self, active: Tensor) -> Tensor | None:
-        """Return the mask for the engines: in SAME_STEP mode no environment is ever frozen."""
+        """Return the mask of environments to step; None in SAME_STEP mode, because no environment is ever frozen."""
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             return None
         return active
@@ -461,11 +461,14 @@ class World(BatchedWorld):
         return [pools[slot] for slot in range(self.num_tasks)]
 
     def instruction(self, slot: int, variation: np.ndarray | None = None) -> str:
-        """Return a sentence that describes a task of a slot (None: the class), without what the world hides."""
+        """Return a sentence that describes a task of a slot, or the slot's class if ``variation`` is None.
+
+        The sentence leaves out what the world hides.
+        """
         return self.slots[slot].task_class.instruction(variation, self.hides_goals)
 
     def instructions(self) -> list[str]:
-        """Return for each environment a sentence that says what its task asks for."""
+        """Return for each environment a sentence that describes its task."""
         pools = self.pools
         places = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
         return [self.instruction(slot, pools[slot][index]) for slot, index in places]
@@ -509,7 +512,7 @@ def _with_entries(slot: Slot, env_ids: slice) -> Slot:
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text. For an object's file this is only its name, because folders may move."""
+    """Return an option of a class as text, for an object's file only the file name, because folders may move."""
     if isinstance(value, str):
         return Path(value).stem
     return str(value)

@@ -106,7 +106,7 @@ class NumpyWorld(VectorEnv):
     ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be stepped, as in the world, but its end is
     reported only in the step that ended it; otherwise wrappers would count each later step as an episode. With
     ``stagger`` a training world's first episodes begin at random elapsed steps, so that wrappers that count steps
-    report too short episodes.
+    report episodes that are too short.
     """
 
     @checked_arguments

@@ -27,7 +27,10 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 @dataclass(frozen=True)
 class WorldsConfig:
-    """The worlds of a run (``suite`` or ``task``; ``base`` and ``object`` concern a single class) and how they run."""
+    """The worlds of a run, and how they run.
+
+    ``suite`` names a suite, or ``task`` a single class; ``base`` and ``object`` apply to a single class only.
+    """
 
     suite: str | None = None
     task: str | None = None
@@ -59,7 +62,7 @@ Identity = dict[str, str | int | None]
 
 
 class Worlds(ABC):
-    """The worlds that a config names, with their common properties; ``name`` is as the user wrote it."""
+    """The worlds that a config names, with their common properties; ``name`` is the name in the user's spelling."""
 
     hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
@@ -68,7 +71,7 @@ class Worlds(ABC):
     moving_base: bool | None = None  # True if a single class has moving bases; None: as the class defines it
     on_gpu: ClassVar[bool] = True  # True if a GPU speeds these worlds up
     preset: tuple[str, str] | None = None
-    """Name of the preset that ``auto`` prefers for these worlds, if the learner has it, and the reason in words."""
+    """Name of the preset that ``auto`` prefers for these worlds, if the learner has it, and a text with the reason."""
     default_episodes: ClassVar[int] = 4  # default number of episodes per task in an evaluation
 
     def __init__(self, name: str, config: WorldsConfig) -> None:
@@ -102,7 +105,7 @@ class Worlds(ABC):
 
     @abstractmethod
     def tasks(self, split: str) -> dict[str, list[str]]:
-        """Return the task names of each slot's pool, by slot, in a split's worlds; the dict is empty if none exist."""
+        """Return, by slot, the names of the tasks in a split's pools; the dict is empty if the split has no tasks."""
 
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
@@ -125,7 +128,7 @@ class Worlds(ABC):
 
     @property
     def others(self) -> "Worlds":
-        """Return worlds with the same number of unseen tasks: another seed draws them, and no run trained on them."""
+        """Return worlds with the same number of unseen tasks, drawn with another seed, on which no run trained."""
         return type(self)(self._opened_as, replace(self.config, task_seed=self.seed + OTHER_SEED))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
@@ -141,7 +144,7 @@ class Worlds(ABC):
 
     @property
     def moving_bases(self) -> bool:
-        """Return whether the hands' bases move, as in the shipped suites and in the measurement of the references."""
+        """Return whether the hands' bases move, as in the shipped suites and when the references were measured."""
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
     def identity(self) -> Identity:
@@ -153,9 +156,9 @@ class Worlds(ABC):
         return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """Return the references of the normalised score and of broken episodes.
+        """Return the reference returns, which define the normalised score and the return of broken episodes.
 
-        The result is empty if bases, tasks or reward differ from those that the references were measured with.
+        The dict is empty if bases, tasks or reward differ from those with which the references were measured.
         """
         as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
         if self.moving_bases and as_printed:

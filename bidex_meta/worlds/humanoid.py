@@ -42,8 +42,8 @@ class HumanoidWorld(ForeignWorld):
     Observations are Humanoid-v5's 348 numbers: positions without x and y, velocities, and the inertias, velocities,
     actuator forces and contact forces of the 13 bodies. Actions in [-1, 1] are scaled to the motors' range, [-0.4,
     0.4]. The reward is 1.25 times the speed of the centre of mass along x (m/s), plus 5 while the humanoid is upright,
-    minus costs of control and contact. An episode terminates when the torso's height leaves 1 to 2 m, and is cut after
-    1,000 steps of 15 ms. There is no success. Keywords are those of ``bidex_meta.World``.
+    minus costs of control and contact. An episode terminates when the torso's height leaves 1 to 2 m, and is truncated
+    after 1,000 steps of 15 ms. There is no success. Keywords are those of ``bidex_meta.World``.
     """
 
     def __init__(

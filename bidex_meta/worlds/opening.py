@@ -15,9 +15,9 @@ from bidex_meta.worlds.own import OwnSuite, SingleClass
 
 
 def open_worlds(config: Mapping[str, Json] | WorldsConfig) -> Worlds:
-    """Return the worlds of a config's ``suite`` or class ``task``, named in any case.
+    """Return the worlds of a config's ``suite`` or class ``task``, whose names may be in upper or lower case.
 
-    Raises BidexError if they are unknown or faulty.
+    Raises BidexError if the suite or class is unknown or faulty.
     """
     config = WorldsConfig.of(config)
     if config.suite is None:
@@ -46,7 +46,7 @@ def suites_to_run() -> list[str]:
 
 
 def listed() -> list[dict[str, object]]:
-    """Return the entries of ``bidex-meta list suites``: our suites, Meta-World's, then those of the ladder by rung."""
+    """Return the entries of ``bidex-meta list suites``: our suites, Meta-World's suites, then the ladder's by rung."""
     rows: list[dict[str, object]] = []
     ladder: list[list[dict[str, object]]] = [[] for _ in RUNGS]
     for suite in map(load_suite, suite_names()):

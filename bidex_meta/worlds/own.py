@@ -113,7 +113,7 @@ class SingleClass(Worlds):
 
     @property
     def rules(self) -> Rules:
-        """Return the rules that the class's name asks for."""
+        """Return the rules of the version that the class's name gives."""
         if self.class_name == plain_name(self.class_name):
             return V1
         return V2

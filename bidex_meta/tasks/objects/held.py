@@ -83,7 +83,7 @@ class HeldObject:
         """Lay the object on a broad side and turn it about the palm's normal at random.
 
         Its shortest extent is then along the normal. The object's poses (n, 7), quaternion (w, x, y, z), are written in
-        place. Draws in [-1, 1], (n, 2), give the turn and the side that faces down. If the hand's start pose is not
+        place. Draws in [-1, 1], (n, 2), give the angle and the side that faces down. If the hand's start pose is not
         given, the palm is assumed to be level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
@@ -97,7 +97,7 @@ class HeldObject:
 
     @property
     def _laid(self) -> tuple[float, float, float, float]:
-        """Return the turn (x, y, z, w) that takes the longest side to z and the shortest to y, the palm's normal."""
+        """Return the rotation (x, y, z, w) that takes the longest side to z and the shortest to y, the palm normal."""
         shortest, middle, longest = np.argsort(np.subtract(self.high, self.low), kind="stable")
         turn = np.zeros((3, 3))
         turn[0, middle] = turn[1, shortest] = turn[2, longest] = 1.0
@@ -108,7 +108,7 @@ class HeldObject:
         return x, y, z, w
 
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
-        """Lift the object off its palm, open the fingers that would penetrate it and lay the thumb flat.
+        """Lift the object off the palm, open the fingers that would penetrate it and lay the thumb flat.
 
         The object's poses (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in
         place.
@@ -134,9 +134,10 @@ def shelf() -> list[str]:
 
 
 def held_object(name: object) -> HeldObject | None:
-    """Return an object by its name on the shelf, in any case, or by the path of its MJCF file, which ends in ``.xml``.
+    """Return the object with a name on the shelf, or the object in an MJCF file, whose path ends in ``.xml``.
 
-    Return None for ``"egg"``. Raises BidexError for an unknown name, or a file without an object that a hand can hold.
+    The name's case is ignored. Return None for ``"egg"``. Raises BidexError for an unknown name, or a file without an
+    object that a hand can hold.
     """
     if not isinstance(name, str) or not name.isprintable():
         raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")

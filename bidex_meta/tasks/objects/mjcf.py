@@ -173,7 +173,7 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]
 def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (k, 3) and radii (k,), m, body frame, of balls whose convex hull holds all colliding geoms.
 
-    Ellipsoids and meshes may stand out by 1 % of their size. Without colliding geoms both arrays are empty.
+    Ellipsoids and meshes may protrude by 1 % of their size. Without colliding geoms both arrays are empty.
     """
     centres = [np.zeros((0, 3))]
     radii = [np.zeros(0)]
@@ -187,7 +187,8 @@ def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner, each (3,), of the box around a body's colliding geoms, body frame, metres.
 
-    The result is the intersection of the outline's box and the box of the geoms' own boxes, which both hold the geoms.
+    The result is the intersection of two boxes that both contain the geoms: the box around the outline, and the box
+    around the bounding boxes of the geoms.
     """
     centres, radii = outline(model, body)
     low = (centres - radii[:, None]).min(axis=0)
@@ -200,7 +201,7 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
-    """Return ball centres (k, 3) in the geom's frame, and their radius."""
+    """Return the centres of balls (k, 3) in the geom's frame, and the radius of the balls."""
     kind = mujoco.mjtGeom(model.geom_type[geom])
     size = model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -223,7 +224,7 @@ def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 
 
 def _directions() -> np.ndarray:
-    """Return unit vectors spread evenly over the ball (a Fibonacci lattice), shape (k, 3)."""
+    """Return unit vectors spread evenly over the sphere (a Fibonacci lattice), shape (k, 3)."""
     i = np.arange(_OVER) + 0.5
     z = 1 - 2 * i / _OVER
     angle = np.pi * (1 + 5**0.5) * i

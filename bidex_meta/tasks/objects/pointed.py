@@ -1,6 +1,6 @@
 """Users' objects for classes whose hands must reach points such as handles.
 
-The user's file names these points as the file of the class's usual object does.
+The user's file gives these points the names that they have in the file of the class's usual object.
 """
 
 import hashlib
@@ -54,7 +54,8 @@ class OwnObjectClass(ReachTask):
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
         """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the usual object.
 
-        Raises BidexError if the file holds no such object, or the object starts inside hands or table.
+        Raises BidexError if the file does not meet the rules of docs/objects.md, or if the object starts inside hands
+        or table.
         """
         super().__init__(moving_base)
         (usual,) = self.objects

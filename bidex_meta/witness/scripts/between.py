@@ -18,7 +18,7 @@ class Take:
     """The way in which two hands take an object; lengths in metres.
 
     Attributes:
-        ahead: Offset along x from the object to the hands' points; ``above``: offset along z.
+        ahead: Offset along x from the object to the points of the hands; ``above``: the same along z.
         high: Height at which the hands' points pass over all objects.
         apart: Distance along y from the object to each hand's point before the hands close.
         aim: Largest horizontal distance of the hands' middle from its target while the hands go down.
@@ -43,7 +43,7 @@ _CLOSING = 0.015  # distance by which the target leads a hand that does not pres
 
 
 def ramp(value: float, first: float, last: float) -> float:
-    """Return 0 up to ``first``, 1 from ``last`` on, linear between."""
+    """Return 0 for values up to ``first``, 1 from ``last`` on, and interpolate linearly between."""
     return min(1.0, max(0.0, (value - first) / (last - first)))
 
 
@@ -51,9 +51,10 @@ class Between:
     """Both hands and an object that they take, in their present state."""
 
     def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
-        """Read the state.
+        """Read the state of the hands and of the object called ``thing``.
 
-        ``room`` bounds the distance of each hand's point from the object before the hands close, metres.
+        ``room`` bounds the distances of the right and the left hand's point from the object before the hands close,
+        metres.
         """
         right, left = (min(take.apart, each) for each in room)
         self.take = take
@@ -101,7 +102,7 @@ class Between:
         return (x, y + half, z), (x, y - half, z)
 
     def _rise(self, height: float) -> float:
-        """Return the hands' next height; they rise only when they are apart, else they would lift what they touch."""
+        """Return the hands' next height; they rise only when they are apart, so that they do not lift anything."""
         way = height - self.middle[2]
         apart = ramp(self.half, self.apart - 0.02, self.apart - 0.005)
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
@@ -125,7 +126,7 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Return the next middle of the hands and half their distance, to carry the object up, over the goal, down."""
+        """Return the next middle of the hands and half their distance, to bring the object over the goal and down."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)

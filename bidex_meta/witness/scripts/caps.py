@@ -24,7 +24,7 @@ def pull_cap(hands: HandController) -> Actions:
     ahead = _ahead(hands)
 
     def poke(back: float) -> Point:
-        """Return the left hand's point for which the little finger is ``back`` metres short of the cap."""
+        """Return where the left hand's point must be for the little finger to end ``back`` metres before the cap."""
         cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
         return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
 
@@ -83,7 +83,10 @@ def swing_cup(hands: HandController) -> Actions:
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """Return the left hand's point for a peg at an angle behind the handle and a height above the cup's origin."""
+        """Return where the left hand's point must be for the little finger to be at a place near the handle.
+
+        The place is an angle ``behind`` the handle, rad, and a ``height`` above the cup's origin, metres.
+        """
         return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
     x, y, z = hands.at("left").tolist()
@@ -110,9 +113,9 @@ def _push_on(hands: HandController) -> Actions:
     aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
-        """Return the right hand's point for a fingertip at an angle behind the handle.
+        """Return where the right hand's point must be for the middle fingertip to be near the handle.
 
-        ``before`` is the fingertip's distance from that place towards the hand, metres.
+        The fingertip is an angle ``behind`` the handle, rad, and then ``before`` metres back towards the hand.
         """
         way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
         return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
@@ -128,7 +131,10 @@ def _push_on(hands: HandController) -> Actions:
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """Return the point at an angle behind the left handle on a circle about the cup, at a height above its origin."""
+    """Return a point on a circle about the cup, an ``angle`` behind the left handle, rad.
+
+    The circle lies ``height`` metres above the cup's origin.
+    """
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle
     return cup + torch.tensor([radius * math.cos(at), radius * math.sin(at), height], dtype=cup.dtype)

@@ -14,7 +14,7 @@ _GRIP_HEIGHT = 0.068
 
 
 def lift_underarm(hands: HandController) -> Actions:
-    """Bring the hands under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
+    """Bring the hands, bent back as far as the wrists allow, under the pot's grips, and lift the pot to its goal."""
     # Throwing the pot to its goal earns more reward than lifting it there.
     pot = hands.where("object/position")
     out = (hands.where("object/right_handle_position") - pot) / 0.15  # unit vector from the pot to the right grip

@@ -32,9 +32,9 @@ def pour_water(hands: HandController) -> Actions:
     back = back / back.norm()
 
     def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
-        """Lead the hands to where they hold a kettle at ``origin``.
+        """Move the hands to where they hold a kettle at ``origin``.
 
-        They stay ``loose`` metres off the kettle and are shifted by ``aside`` metres along x.
+        The hands keep a distance of ``loose`` metres from the kettle and are shifted by ``aside`` metres along x.
         """
 
         def at(x: float, along: float, up: float) -> Point:
@@ -117,7 +117,7 @@ def _carry_bucket(hands: HandController) -> Actions:
 def _beside(way: Tensor, sign: float) -> float:
     """Return 1 if a hand is on its side of the bucket, 0 if not, and numbers between for a hand on its way there.
 
-    ``way`` leads from the bucket to the hand.
+    ``way`` is the vector from the bucket to the hand, metres; ``sign`` is 1 for the side at +y and -1 for -y.
     """
     return ramp(abs(float(way[0]) - _AHEAD), 0.05, 0.03) * ramp(sign * float(way[1]), 0.03, 0.045)
 
@@ -125,7 +125,7 @@ def _beside(way: Tensor, sign: float) -> float:
 def _next(way: Tensor, sign: float, half: float) -> Tensor:
     """Return the hand's next waypoint on its way over the bucket, to the bucket's side and down.
 
-    The waypoint (3,) and ``way`` are offsets from the bucket, in metres.
+    The waypoint (3,) and the hand's present position ``way`` are offsets from the bucket, in metres.
     """
     x, y, z = way.tolist()
     over = z - _UP

@@ -43,7 +43,10 @@ def stack_in_order(hands: HandController) -> Actions:
 
 
 def _between(hands: HandController, block: str, other: str) -> Between:
-    """Return the state of the hands and a block; if the other block is near, the hand next to it has little room."""
+    """Return the state of the hands and a block.
+
+    If the ``other`` block is near, the hand next to the other block has little room.
+    """
     x, y, _ = (hands.where(f"{other}/position") - hands.where(f"{block}/position")).tolist()
     if abs(x) < 0.075:
         room = max(0.08, min(_TAKE.apart, abs(y) - 0.025))

@@ -47,9 +47,9 @@ def open_inward(hands: HandController) -> Actions:
     def go(
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
     ) -> Actions:
-        """Lead bent fingers behind the bars of leaves that are open by these angles.
+        """Move the bent fingers behind the bars of leaves opened by ``angles``, rad.
 
-        ``aside`` and ``back`` shift the fingers from there, metres.
+        The fingers are shifted from there towards the hinge by ``aside``, and off the leaf by ``back``, metres.
         """
         pairs = zip(_INWARD, angles, strict=True)
         at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle) for leaf, angle in pairs]
@@ -74,7 +74,10 @@ def close_outward(hands: HandController) -> Actions:
     start = _angles(hands)
 
     def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Lead fingers behind the bars of leaves that are open by these angles, or ``back`` metres away from there."""
+        """Move the fingers behind the bars of leaves opened by ``angles``, or to points ``back`` metres off the bars.
+
+        Angles are in rad; the leaves are open away from the hands.
+        """
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
         for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
@@ -112,7 +115,7 @@ def push(hands: HandController) -> Actions:
     goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Lead fists to leaves that are open towards the hands by these angles, or ``back`` metres away from them."""
+        """Move the fists to leaves opened towards the hands by ``angles``, or to points ``back`` metres off them."""
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
         yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 
@@ -129,9 +132,9 @@ def push(hands: HandController) -> Actions:
 
 
 def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
-    """Return a task's angles for the right and the left leaf minus ``less``, rad.
+    """Return the target angles of the right and the left leaf, each reduced by ``less``, rad.
 
-    If the task has no such angles, return ``usual`` for both leaves.
+    If the task has no target angles, return ``usual`` for both leaves.
     """
     if hands.wide:
         return (hands.frozen("leaves") - less).tolist()
@@ -151,7 +154,10 @@ def _lead(
     speed: float,
     height: float = _DOOR_HEIGHT,
 ) -> Actions:
-    """Move each hand to its point in ``at`` (x, and y outwards from the door's middle), turned outwards by its yaw."""
+    """Move each hand to its point in ``at``, turned outwards by its yaw, rad.
+
+    A point is x, and y measured outwards from the middle of the door, metres.
+    """
     middle = float(hands.where("object/position")[1])
     points: list[Point] = []
     for side, sign, (x, y), yaw in zip(SIDES, (1.0, -1.0), at, yaws, strict=True):

@@ -48,7 +48,7 @@ def _button(hands: HandController, name: str) -> Tensor:
 
 
 def _tip(hands: HandController, side: str, target: Tensor, height: float, finger: str = "mf") -> Point:
-    """Return where the hand's point must be for a finger's last joint to be ``height`` metres above a target."""
+    """Return where the hand's point must be so that a finger's last joint is ``height`` metres above a target."""
     goal = target + torch.tensor([0.0, 0.0, height], dtype=target.dtype)
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
@@ -73,7 +73,7 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Return where the hand's point goes next: down to an end of the pen; if ``closed``, by ``way`` along the pen."""
+    """Return the next target of a hand's point: an end of the pen; if ``closed``, ``way`` metres along the pen."""
     end = hands.where(_ENDS[side]).clone()
     at = hands.at(side)
     end[0] -= 0.008
