@@ -97,8 +97,8 @@ def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None
         (learners(shown=0.5), "goal-shown PPO reaches 51%"),
         (learners(blind=0.3), "blind PPO reaches 30%, at most 25%"),
         ([each for each in learners() if each.arm in ("ppo", "a", "b")], "1 pairs of reward-only learners"),
-        (learners()[:12], "every learner needs 3 seeds, and one has only 2"),
-        ([run("a", 0, 0.1, 0.2, 0.3)], "not yet say"),
+        (learners()[:12], "needs 3 seeds of every learner, and some learners have 2"),
+        ([run("a", 0, 0.1, 0.2, 0.3)], "not yet judge"),
     ],
 )
 def test_what_a_suite_lacks_is_told(runs: list[Any], told: str) -> None:

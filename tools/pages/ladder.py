@@ -220,11 +220,11 @@ def _better(one: list[np.ndarray], other: list[np.ndarray]) -> float:
 def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]]) -> str:
     """Return a sentence that says whether the suite meets the ladder's rule for good suites, and if not, why."""
     if SHOWN not in lines or BLIND not in lines:
-        return "We do not yet say whether this suite is good, because blind or goal-shown PPO is missing."
+        return "We do not yet judge whether this suite is good, because blind or goal-shown PPO is missing."
     if (seeds := min(len(line.shares) for line in lines.values())) < _SEEDS_AT_LEAST:
         return (
-            f"We do not yet say whether this suite is good: every learner needs {_SEEDS_AT_LEAST} seeds, and one has "
-            f"only {seeds}."
+            f"We do not yet judge whether this suite is good: that needs {_SEEDS_AT_LEAST} seeds of every learner, and "
+            f"some learners have {seeds}."
         )
     reasons = []
     shown = float(lines[SHOWN].last.mean())
