@@ -140,7 +140,7 @@ def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
 
 
 def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: contextlib.ExitStack) -> None:
-    """Lock the run's folder, and refuse what would fail in the middle of the training, before anything is built."""
+    """Lock the run's folder, and raise an error at once for configs that would fail in the middle of the training."""
     kind = learner_kind(config.algo, config.task)
     worlds = open_worlds(config.to_json())
     if launch().rank == 0:

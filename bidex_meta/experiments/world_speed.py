@@ -40,7 +40,7 @@ def world_speed(
 
 
 def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
-    """Return the seconds that a world and the bare engines of its twin take for the same random steps."""
+    """Return the seconds that a world takes for random steps, and those that an equal world's engines take alone."""
 
     def now() -> float:
         if full.device.type == "cuda":

@@ -50,7 +50,7 @@ def differences(then: Record, now: Record) -> list[Difference]:
 
 
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
-    """Return for each run the entries that differ between runs of the same subject; usually none.
+    """Return for each run the entries in which runs on the same suite or class differ; usually none.
 
     Runs with different entries must not be pooled. Entries of the training and of the evaluation are compared.
     """

@@ -340,7 +340,7 @@ class Switch(ReachTask):
         return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals of the buttons' points with wide variation, otherwise an empty list."""
+        """Return the goals of the buttons' points if variation is wide, otherwise an empty list."""
         if not self.rules.wide:
             return []
         found = []

@@ -84,7 +84,7 @@ class Attendance(threading.Thread):
                 os._exit(1)
 
     def _missing(self) -> list[int]:
-        """Return the numbers of the processes that neither count up nor have reported their end."""
+        """Return the ranks of the processes that have stopped counting without reporting their end."""
         before = self._beats()
         time.sleep(_LISTEN_SECONDS)
         silent = [i for i, (a, b) in enumerate(zip(before, self._beats(), strict=True)) if a == b and i != self._rank]
@@ -103,7 +103,8 @@ class Attendance(threading.Thread):
 def end_patiently() -> None:
     """Leave ten seconds between SIGTERM and the end of the process, unless another handler is set later.
 
-    As soon as one process is gone, torchrun sends SIGTERM to all others, which need this time to report the loss.
+    As soon as one process is gone, torchrun sends SIGTERM to all others, which need this time to report
+    that a process is gone.
     """
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -74,7 +74,7 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield factor, field and exponents (n, 1) or (n, k).
+    """Yield the name of a factor, the name of a field, and the factor's exponents in the field, (n, 1) or (n, k).
 
     Size factors do not change masses. Inverse inertias depend on both size and mass.
     """

@@ -175,12 +175,12 @@ class World(BatchedWorld):
         self._renew_draws()
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Start episodes; see ``BatchedWorld``. With ``pixels`` info holds the pictures."""
+        """Start episodes; see ``BatchedWorld``. If the world has ``pixels``, info contains pictures."""
         obs, info = super().reset(seed=seed, options=options)
         return obs, self._with_pixels(info)
 
     def step(self, action: Tensor | np.ndarray) -> Step:
-        """Advance one step; see ``BatchedWorld``. With ``pixels`` info holds pictures of the observed state."""
+        """Advance one step; see ``BatchedWorld``. If the world has ``pixels``, info contains pictures of this state."""
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, reward, terminated, truncated, self._with_pixels(info)
 

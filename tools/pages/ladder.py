@@ -155,7 +155,7 @@ def _suite(run: StoredRun) -> str:
 
 
 def _named(run: StoredRun) -> tuple[str, Line]:
-    """Return the name of a run's line, and an empty line."""
+    """Return the name of a run's line in the table, and the line without results."""
     algo = run.config().algo
     if algo != "mtppo":
         return run.arm, Line(", ".join(learner_class(algo).privileges) or _OWN)

@@ -76,7 +76,7 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
 
 @dataclass(frozen=True)
 class InTurnConfig(LearnerConfig):
-    """Options shared by HAPPO and HATRPO, which list these options after their other options."""
+    """Options shared by HAPPO and HATRPO; ``--help`` lists these options after those of the learner itself."""
 
     max_factor: NonNegative = 4.0
     """Largest factor by which the likelihood ratios of the previous agents may scale an agent's advantage; 0: no

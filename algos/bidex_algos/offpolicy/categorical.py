@@ -66,7 +66,7 @@ class CategoricalConfig(OffPolicyConfig):
     clipped_double_q: bool = True  # Targets and actor use the critic with the lower value; off: the mean of both.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes as in the base class, which counts ``hidden`` for all networks, and add the critics."""
+        """Return the base class's estimate, in which all networks have ``hidden`` layers, plus that of the critics."""
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 

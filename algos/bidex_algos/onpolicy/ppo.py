@@ -77,8 +77,8 @@ def policy_loss(
     """Return the loss of samples of any shape (...), summed with ``weights`` (...).
 
     A weight of 0 excludes a sample. Actions and means are (..., a), log standard deviations (a,) or (..., a),
-    log-densities and normalised advantages (...). ``old`` refers to the sampling policy. The objective is clipped at a
-    distance of ``clip`` of the ratio from 1.
+    log-densities and normalised advantages (...). ``old`` refers to the sampling policy. The objective clips the
+    probability ratio to [1 - ``clip``, 1 + ``clip``].
     """
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)

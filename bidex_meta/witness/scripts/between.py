@@ -112,7 +112,7 @@ class Between:
         return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
-        """Return the next middle of the hands and half their distance, to take the object.
+        """Return where the middle of the hands moves next to take the object, and half the hands' distance.
 
         The hands go from above to both sides of the object, then closer together until they hold it.
         """
@@ -126,7 +126,7 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Return the next middle of the hands and half their distance, to bring the object over the goal and down."""
+        """Return where the hands' middle moves next, over the goal and then down, and half the hands' distance."""
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)
