@@ -43,7 +43,7 @@ from bidex_meta.runs.provenance import check_alike
 from bidex_meta.runs.versions import git_state
 from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
-from bidex_meta.utils.files import exists, portable
+from bidex_meta.utils.files import exists, portable, read_json
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import parse
 from bidex_meta.world.threads import set_up_torch
@@ -361,9 +361,14 @@ def receipt(runs: Sequence[SubmittedRun]) -> Json:
     """Return the digests of the evaluated runs, and the commit of the code that evaluates them."""
     return {
         "weights": [run.weights for run in runs],
-        "config": [content_digest(portable(run.config.to_json())) for run in runs],
+        "config": [_config_digest(run.folder) for run in runs],
         "code": commit_of(git_state(Path(__file__).parent)),
     }
+
+
+def _config_digest(folder: RunFolder) -> str:
+    """Return the digest of a run's config as its file has it: without options that bidex-meta gained since then."""
+    return content_digest(portable(read_json(folder.config_path, "a run's config")))
 
 
 def _facts(run: SubmittedRun) -> tuple[float, str, str | None]:

@@ -27,6 +27,7 @@ from bidex_meta.experiments import submitting
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.suite import Suite, load_suite
+from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import parse
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import COUNTS, FINDER, SMALL, points
@@ -407,6 +408,18 @@ def test_check_repeats_an_entry_and_finds_a_forgery(runs, tmp_path: Path, shown,
     with pytest.raises(SystemExit, match="1"):
         submit_main(again)
     assert "different, receipt.config differs" in capsys.readouterr().out
+
+
+def test_an_entry_outlives_new_options(runs, tmp_path: Path, shown) -> None:
+    """Options that a run's version did not have do not make its entry differ."""
+    for run in runs:
+        config = json.loads((run / "config.json").read_text())
+        del config["switches"]
+        (run / "config.json").write_text(json.dumps(config))
+    shown("submit", *runs, "--out", tmp_path, "--device", "cpu", *TUNED)
+    expected = [leaderboard.content_digest(portable(json.loads((run / "config.json").read_text()))) for run in runs]
+    path = tmp_path / "MT4-mtppo.json"
+    assert read_entry(path).receipt.config == expected
 
 
 def submit_main(words: list[object]) -> None:
