@@ -82,7 +82,7 @@ def submit_transfer(
     path = new_path(out / entry_name(open_worlds(config.to_json()).short_name, name))
     for known, entry in read_entries(out).items():
         if isinstance(entry, TransferEntry) and entry.start == found.run.weights:
-            raise BidexError(f"{folder.path} stands in {known}: their weights are equal. Delete that entry.")
+            raise BidexError(f"{folder.path} is already in {known}: their weights are equal. Delete that entry.")
     content = _played(found, episodes, device)
     content |= {"name": name, "tuning": {"trials": tuning[0], "seeds": tuning[1]}}
     write_entry(path, sealed(content, TransferEntry, str(path)))

@@ -279,7 +279,7 @@ def test_a_transfer_is_submitted_and_repeated(trained: Path, shown, refused, mon
     check = ["submit", "--check", path, trained, "--transfer", "t", "--device", "cpu"]
     assert shown(*check).splitlines()[-1] == f"{path}: equal"
     assert "by --transfer" in refused(*check[:4])
-    assert "stands in" in refused(*ours, "--tuning", "1x1", "--name", "other")
+    assert "is already in" in refused(*ours, "--tuning", "1x1", "--name", "other")
     content = json.loads(path.read_text())
     row = content["new"]["shots"][0]["TwoCatchUnderarm"]
     content["new"]["shots"][0]["TwoCatchUnderarm"] = class_row([[0] * 5, [1] * 5], 1)
