@@ -21,8 +21,8 @@ class ListFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|hidden|algos|objects")]
-    """Kind of entries: suites, tasks, hidden (parts that tasks of version 2 hide, with ranges and tolerances in metres and
-    rad), algos, or objects (what the throwing classes can throw)."""
+    """Kind of entries: suites, tasks, hidden (parts that tasks of version 2 hide, with ranges and tolerances in metres
+    and rad), algos, or objects (what the throwing classes can throw)."""
     json: JsonSwitch = False
 
 
