@@ -4,14 +4,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.tables import print_evaluation, print_meta_test
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.evaluating import RunMetaTest, evaluate, meta_test
 from bidex_meta.experiments.learners import learner_kind
-from bidex_meta.experiments.metatest import Options
+from bidex_meta.experiments.metatest import Options, Played
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite import OTHERS
 from bidex_meta.training.learner import Capability
@@ -30,9 +30,10 @@ class EvaluateFlags(Options):
     run: RunPath  # Folder of the run to evaluate.
     checkpoint: str = "last"
     """Checkpoint to evaluate: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
-    split: Literal["auto", "train", "test", "others", "both"] = "auto"
-    """Tasks to play. train: the tasks of training; test: a meta suite's unseen tasks; others: for learners that adapt,
-    unseen tasks of the train classes; both: train and test. auto: train, and for learners that adapt train and test."""
+    split: Played = "auto"
+    """Tasks to play. train: the tasks of training; test: a meta suite's unseen tasks. For learners that adapt also
+    others: unseen tasks of the train classes; unseen: others and test. auto: train, and for learners that adapt train
+    and test."""
     random: Switch = False  # Also play a random policy on the same tasks and print the difference.
     other_tasks: Switch = False
     """Also play an equal number of tasks that the run was not trained on, drawn from another seed."""
@@ -76,7 +77,7 @@ def _refuse_for_adapting(flags: EvaluateFlags, algo: str) -> None:
 
 def _refuse_for_fixed(flags: EvaluateFlags, algo: str) -> None:
     flags.refuse_adaptation(algo)
-    if flags.split == "both":
+    if flags.split == "unseen":
         raise BidexError(
             f"{algo} does not adapt to tasks: each split is evaluated separately. Use --split train or test."
         )

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from bidex_meta.agents import Agent, TrialAgent
 from bidex_meta.config import Switch
@@ -15,7 +15,7 @@ from bidex_meta.evaluation.trial_agents import adapting
 from bidex_meta.experiments import metatest
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import learner_kind, resolve_device
-from bidex_meta.experiments.metatest import Adaptation, Options
+from bidex_meta.experiments.metatest import Adaptation, Options, Played
 from bidex_meta.experiments.policies import checkpoint as load_checkpoint
 from bidex_meta.experiments.policies import policy_of
 from bidex_meta.runs import RunFolder
@@ -146,10 +146,10 @@ class FinalEvaluation:
     other_tasks: Switch = False
     """In the final evaluation, also play an equal number of tasks that the run was not trained on. For learners that
     adapt, use --split others instead."""
-    split: Literal["auto", "train", "test", "others", "both"] = "auto"
+    split: Played = "auto"
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks (on
     ML20, tasks of fifteen train classes and of five unseen classes). others: tasks of the train classes that the run
-    was not trained on."""
+    was not trained on. unseen: others and test."""
     shots: Shots | None = None  # Adaptation rounds of the final evaluation, one after the other. None: 2.
     rollouts: Few | None = None  # Episodes of each task in one round. None: as in training, but at most 40.
     tasks: Count | None = None  # Tasks of each class in the final evaluation, the first of its pool. None: 5.
@@ -274,8 +274,8 @@ def meta_test(
     Args:
         agent: The folder of a run whose learner adapts; or your own agent, a ``TrialAgent`` or ``MetaLearningAgent``.
         suite: For an agent: name or file of a suite that hides its goals. A run has its own suite.
-        split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), or ``auto`` for
-            train and test.
+        split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), ``unseen`` for
+            others and test, or ``auto`` for train and test.
         checkpoint: For a run: ``last``, ``best`` or a file.
         shots: Adaptation rounds, one after the other; None: 2.
         rollouts: Episodes of each task in a shot; None: as in training, but at most 40; 10 for an agent.

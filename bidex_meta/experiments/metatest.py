@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from bidex_meta.agents import Agent
 from bidex_meta.config import RunConfig, Switch
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.meta_test import MetaEvaluation, meta_evaluate
 from bidex_meta.experiments.learners import learner_kind
@@ -16,6 +17,8 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.utils.waiting import note
 from bidex_meta.worlds import Worlds
 
+Played = Literal["auto", "train", "test", "others", "unseen"]
+"""Words for the splits that an evaluation plays."""
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
 # default episodes of a task in a shot, if the config sets no number; the largest number taken from a config
 _ROLLOUTS = 10
@@ -170,9 +173,16 @@ def check_worlds(worlds: Worlds, name: str) -> None:
 
 
 def splits_of(worlds: Worlds, asked: str) -> list[str]:
-    """Return the splits that a meta-test plays: the named split, or all splits for ``both`` and ``auto``."""
+    """Return the splits that a meta-test plays: the named split, all splits for ``auto``, two for ``unseen``.
+
+    Raises BidexError for another word, and for a split that the worlds do not have.
+    """
+    if asked not in get_args(Played):
+        raise BidexError(f"split: expected one of {', '.join(get_args(Played))}, got {shortened(asked)}.")
     if asked == OTHERS:
         return [OTHERS]
-    if asked in ("train", "test") and asked not in worlds.splits:
-        raise BidexError(f"{worlds.name} has no {asked} tasks. Leave --split out.")
-    return [name for name in worlds.splits if asked in ("auto", "both", name)]
+    wanted = "test" if asked == "unseen" else asked
+    if wanted in ("train", "test") and wanted not in worlds.splits:
+        raise BidexError(f"{worlds.name} has no {wanted} tasks. Leave --split out.")
+    found = [name for name in worlds.splits if wanted in ("auto", name)]
+    return [OTHERS, *found] if asked == "unseen" else found

@@ -5,7 +5,9 @@ import json
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
+from bidex_meta.experiments.evaluating import meta_test
 from bidex_meta.experiments.metatest import Adaptation, rollouts_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.learner import Capability
@@ -61,8 +63,9 @@ def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(
     near = part["by_shot"][2]["classes"]["Near"]
     assert (near["episodes"], near["tasks"]) == (2 * 2 * 5, 2)
     assert part["adapt_steps"] == [2 * 2 * 3 * 6] * 2
-    text = shown("evaluate", adapted, "--json", "--split", "others")
-    (others,) = json.loads(text)["splits"].values()
+    text = shown("evaluate", adapted, "--json", "--split", "unseen")
+    others, test = json.loads(text)["splits"].values()
+    assert test["split"] == "test" and test["before"]["classes"].keys() == COUNTS["test"].keys()
     assert others["split"] == "others" and others["before"]["classes"].keys() == COUNTS["train"].keys()
     (adapted.parent / "others.json").write_text(text)
     shown("verify", adapted, "--evaluation", adapted.parent / "others.json")
@@ -103,11 +106,21 @@ def test_compare_takes_what_is_reached_after_adaptation(adapted):
 
 @pytest.mark.parametrize(
     "flags, expected",
-    [("--shots -1", "--shots"), ("--rollouts 0", "--rollouts"), ("--random", "Leave --random"), ("--split x", "both")],
+    [
+        ("--shots -1", "--shots"),
+        ("--rollouts 0", "--rollouts"),
+        ("--random", "Leave --random"),
+        ("--split x", "unseen"),
+    ],
 )
 def test_bad_flags_are_one_line(adapted, refused, flags, expected):
     error = [line for line in refused("evaluate", adapted, *flags.split()).splitlines() if "Meta-test on" not in line]
     assert len(error) == 1 and expected in error[0]
+
+
+def test_an_unknown_split_is_refused_in_python(adapted):
+    with pytest.raises(BidexError, match="split: expected one of auto, train, test, others, unseen, got 'both'"):
+        meta_test(adapted, split="both")
 
 
 def test_what_does_not_adapt_takes_no_shots(adapted, refused):
