@@ -13,7 +13,10 @@ class Agent(Protocol):
         ...
 
     def reset(self, env_mask: Tensor) -> None:
-        """Forget the last episode in the environments of a mask, bool ``(num_envs,)``; they start a new episode."""
+        """Forget the last episode of the environments marked in ``env_mask``, bool ``(num_envs,)``.
+
+        A new episode begins in these environments.
+        """
 
 
 class Timestep(NamedTuple):
@@ -49,17 +52,20 @@ class MetaLearningAgent(Agent, Protocol):
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Receive the number of each environment's task, int64 ``(num_envs,)``; equal numbers mean the same task.
+        """Receive the index of each environment's task, int64 ``(num_envs,)``; equal indices mean the same task.
 
-        None means that each environment has its own task, as in Meta-World's evaluation, which does not call this
-        method.
+        None means that each environment has its own task. This is also the case in Meta-World's evaluation, which does
+        not call this method.
         """
 
     def init(self) -> None:
         """Return to the meta-learned state; forget all adaptation and its data."""
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return exploring actions ``(num_envs, action)``, and the policy's other outputs for ``step``."""
+        """Return exploring actions ``(num_envs, action)``, and the policy's other outputs by name.
+
+        The evaluation passes these outputs back to ``step``, as ``Timestep.aux_policy_outputs``.
+        """
         ...
 
     def step(self, timestep: Timestep) -> None:
@@ -84,7 +90,10 @@ class TrialAgent(Protocol):
     """
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin trials of other tasks in the environments of a mask, bool ``(N,)``: forget the previous trials."""
+        """Begin a trial of another task in the environments marked in ``env_mask``, bool ``(N,)``.
+
+        The agent must forget the previous trials of these environments.
+        """
 
     def act(self, obs: Tensor) -> Tensor:
         """Return actions ``(N, action)`` in [-1, 1] for observations ``(N, observation)``."""

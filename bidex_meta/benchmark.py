@@ -88,7 +88,7 @@ class Benchmark:
     def train_classes(self) -> dict[str, type[SuiteEnv]]:
         """Return the environment classes of the train split by `env_name`, in the order of the suite file.
 
-        A class of version 2 also has its name without `-v2` as a key.
+        In a suite of version 2, look-ups also accept a class's name without `-v2`.
         """
         return self._env_classes("train")
 
@@ -99,18 +99,18 @@ class Benchmark:
 
     @checked_arguments
     def task_classes(self, split: Split = "train") -> dict[str, TaskClass]:
-        """Return the task classes of a split (scene, observation, reward) by name."""
+        """Return the task classes of a split by name; a task class defines scene, observation and reward."""
         classes = {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
         return ByClass(classes, self.suite.rules)
 
     @property
     def train_tasks(self) -> list[Task]:
-        """Return the tasks of the train split, class after class."""
+        """Return the tasks of the train split, grouped by class."""
         return list(chain.from_iterable(self._tasks["train"].values()))
 
     @property
     def test_tasks(self) -> list[Task]:
-        """Return the tasks of the test split, class after class; empty in a multi-task suite."""
+        """Return the tasks of the test split, grouped by class; empty in a multi-task suite."""
         return list(chain.from_iterable(self._tasks["test"].values()))
 
     def tasks_of(self, name: str, split: str = "train") -> list[Task]:
@@ -125,7 +125,10 @@ class Benchmark:
 
     @property
     def others(self) -> "Benchmark":
-        """Return the same suite with the same number of unseen tasks, drawn with a seed that no run trains with."""
+        """Return the same suite with the same number of unseen tasks.
+
+        These tasks are drawn with a seed that no run uses for training.
+        """
         suite = self.suite
         if suite.train_tasks == 0:
             suite = replace(suite, train_tasks=None)
@@ -157,11 +160,11 @@ class Benchmark:
     ) -> World:
         """Make a batched world of one split.
 
-        In a training world (SAME_STEP) of a multi-task suite, every episode draws one task of the environment's class.
-        In a meta suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo the
-        number of tasks. With `tasks_per_class=0` every episode of a training world of the train split draws a new task.
-        If `episodes_per_task` is above 1, environments of a training world keep each drawn task for that number of
-        episodes.
+        In a training world (autoreset mode SAME_STEP) of a multi-task suite, every episode draws one task of the
+        environment's class. In a meta suite, and in every evaluation world (mode DISABLED), environment j of a class
+        keeps task j modulo the number of tasks. There are two exceptions. With `tasks_per_class=0` every episode of a
+        training world of the train split draws a new task. With `episodes_per_task` above 1, each environment of a
+        training world keeps each drawn task for that number of episodes.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: the same number of unseen tasks of the train classes, drawn with
@@ -176,11 +179,11 @@ class Benchmark:
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either device) or `"auto"`: the faster one.
             stagger: In training worlds the first episodes begin at random elapsed steps, so that environments do not
                 all end together; these first episodes do not count. False: all begin at step 0.
-            randomisation: True: as in the suite's file; False: none; None: as in the file, but only in training worlds;
-                or a `Randomisation` (docs/randomisation.md).
+            randomisation: True: the randomisation of the suite's file; False: none; None: that of the suite's file, but
+                only in training worlds; or a `Randomisation` (docs/randomisation.md).
             pixels: Edge length of the square pictures in `info["pixels"]`, pixels (docs/looking.md); 0: no pictures.
             episodes_per_task: Number of consecutive episodes in which an environment keeps a drawn task, as in a trial
-                (docs/clients.md#trials-as-episodes); 1: as described above.
+                (docs/clients.md#trials-as-episodes).
             deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
                 always does.
             switches: Experimental changes of the physics, such as `"incremental"` (docs/gpu.md#switches).
@@ -306,22 +309,23 @@ def make_task_world(
     deterministic: bool = False,
     switches: str = "",
 ) -> World:
-    """Make a world of one class on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
+    """Make a world of a single task class with 50 tasks, which a seed draws.
 
-    `task_name` is a task class, e.g. `"HandOver"` (the only one with a fixed base: observation size 398, 40 actions),
-    or your own class as `"package.module:Class"` (docs/own-task.md). Arguments that `Benchmark.make_world` does not
+    Observations show the goal; they have no task id and no padding. `task_name` is a task class, e.g.
+    `"CatchUnderarm"`, or your own class as `"package.module:Class"` (docs/own-task.md). `"HandOver"` is the only class
+    with fixed bases; it has 398 observation entries and 40 actions. Arguments that `Benchmark.make_world` does not
     have:
 
-    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50;
-      `"fresh"`: each episode draws a new task, which is not one of the 50. None: uniform in training worlds, fixed in
-      evaluation worlds.
+    - `task_sampling`: with `"uniform"` each episode draws one of the 50 tasks; with `"fixed"` environment j keeps task
+      j modulo 50; with `"fresh"` each episode draws a new task, which is not one of the 50. None: uniform in training
+      worlds, fixed in evaluation worlds.
     - `moving_base`: whether the hands' bases move; None: as the class defines it.
-    - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state.
+    - `points`: number of points of the cloud that replaces the object's state (docs/points.md); 0: the state is shown.
     - `touch`: whether observations show touch sensors of both hands (docs/world.md#the-contract).
     - `randomisation`: randomisation of the environments (docs/randomisation.md); None: nothing is randomised.
-    - `task_seed`: seed of the 50 tasks; None: `seed`.
-    - `object`: name or MJCF file (docs/objects.md) of an object that replaces the class's own; the slot's name then
-      ends in a dash and the object's name.
+    - `task_seed`: seed that draws the 50 tasks; None: `seed`.
+    - `object`: name or MJCF file (docs/objects.md) of an object that replaces the class's own object. The name in the
+      world's `task_names` then ends in a dash and the object's name.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """

@@ -1,4 +1,7 @@
-"""The config of a run: flags set it, ``config.json`` stores it, and resumed runs and sweeps compare it."""
+"""The config of a run.
+
+Flags set the config, and ``config.json`` stores it. Resumed runs and sweeps compare their config with the stored one.
+"""
 
 import dataclasses
 import json
@@ -176,7 +179,7 @@ class RunConfig(Generic[LearnerSettings]):
 
     @property
     def learner_values(self) -> JsonObject:
-        """Return the learner's config as plain values."""
+        """Return the learner's config as a dict of JSON values."""
         return json.loads(msgspec.json.encode(self.learner))
 
     def to_json(self) -> JsonObject:
@@ -184,13 +187,14 @@ class RunConfig(Generic[LearnerSettings]):
         return json.loads(msgspec.json.encode(self))
 
     def flat(self) -> JsonObject:
-        """Return plain values in one flat dict, with names such as ``seed`` and ``learner.gamma``."""
+        """Return the config as one flat dict of JSON values, with names such as ``seed`` and ``learner.gamma``."""
         return flat(self.to_json())
 
     def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
-        """Yield the name, the value in this config and the value in ``other`` of every entry that differs.
+        """Compare this config with ``other``: yield a triple for each entry that differs.
 
-        Entries that a resumed run may change are left out.
+        The triple has the entry's name, its value in this config and its value in ``other``. Entries in ``ignored`` are
+        left out, and so are entries that a resumed run may change.
         """
         free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
         here = self.flat()
@@ -216,9 +220,10 @@ class RunConfig(Generic[LearnerSettings]):
         return None
 
     def goal(self, last: Mapping[str, Json]) -> int:
-        """Return the steps that a run trains for.
+        """Return the number of environment steps at which the run is complete.
 
-        These are the steps of the last metrics if time or a metric ended the run, otherwise ``steps``.
+        This is ``steps``. If the run has a time limit, or if a metric ended it early, it is instead the step of
+        ``last``, the run's last metrics.
         """
         if self.minutes is not None or self.early_end(last):
             return last["step"]
@@ -239,7 +244,10 @@ def read_config(path: Path) -> RunConfig[JsonObject]:
 
 
 def config_of(content: object, where: str) -> RunConfig[JsonObject]:
-    """Return a run's config from a file's content; raise BidexError, which names ``where``, if it is not a config."""
+    """Return a run's config from the content of a file.
+
+    Raises BidexError if the content is not a config. The message names the file as ``where``.
+    """
     missing = [name for name in _WRITTEN if isinstance(content, dict) and name not in content]
     if missing:
         raise BidexError(f"{where}: expected an entry {missing[0]}, found none. Give a run folder.")

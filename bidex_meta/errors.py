@@ -1,4 +1,7 @@
-"""The exception for bad input (one line: what was expected, what came, and how to fix it), and exit codes."""
+"""The exception for bad input, and exit codes.
+
+The exception's message is one line that says what was expected, what was given, and how to fix it.
+"""
 
 import difflib
 from collections.abc import Iterable, Mapping

@@ -1,10 +1,14 @@
-"""Suites of a single class: ``MT1-Switch-v2``, ``ML1-Switch-v2``, and with fewer hidden numbers ``ML1-Switch-choice2``.
+"""Suites of a single class, such as ``MT1-Switch-v2``, which shows its goals, and ``ML1-Switch-v2``, which hides them.
 
-``bidex_meta.suite`` makes them from the files of ``MT1-v2`` and ``ML1-v2``. A choice suite has two or four tasks, which
-are the same in both splits. A goal has two numbers, and each is small or large. With two tasks both are small or both
-are large; with four tasks they vary independently. In a ``-shared`` suite both numbers have the same value, anywhere in
-the class's range. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2`` hides: a policy that is trained on
-the former shows what adaptation can reach in the latter.
+``bidex_meta.suite`` makes these suites from the files of ``MT1-v2`` and ``ML1-v2``. The door classes and Switch have
+goals of two angles. These classes also have suites with fewer different goals:
+
+- ``choice2``, such as ``ML1-Switch-choice2``: two tasks. Both angles are small, or both are large.
+- ``choice4``: four tasks. Each angle is small or large, independently of the other.
+- ``shared``: both angles have the same value, anywhere in the class's range.
+
+A choice suite has the same tasks in both splits. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2``
+hides: the success of a policy that is trained on the former shows what adaptation can reach in the latter.
 """
 
 import re
@@ -14,7 +18,7 @@ from typing import Literal, NamedTuple
 
 
 class Choice(NamedTuple):
-    """Two hidden components of a class that has choice and shared suites, and the values of its goals, rad."""
+    """The two goal angles of a class that has choice and shared suites: names of the angles, and their values, rad."""
 
     first: str
     second: str
@@ -56,7 +60,10 @@ _OF_SUITES = {"ML5-v2": 3, "ML1-v2": 4, "ML4-v2": 4, "ML20-v2": 5}
 
 
 class Rung(NamedTuple):
-    """A step of the ladder of suites (docs/results/ladder.md): suites whose tasks hide about the same amount."""
+    """A rung of the ladder: a group of suites whose tasks hide about the same amount from the policy.
+
+    The ladder (docs/results/ladder.md) orders suites by how much their tasks hide.
+    """
 
     hidden: str
     """Hidden part of a task, in words."""
@@ -102,7 +109,10 @@ class OfOneClass(NamedTuple):
         return f"{self.class_name} with hidden goals: train on fifty, adapt to fifty others"
 
     def tasks(self) -> list[_Task]:
-        """Return name, split and fixed components of each listed task; an empty list if tasks are drawn."""
+        """Return the tasks that the suite lists; an empty list if its tasks are drawn.
+
+        Each task is a tuple of its name, its split, and the values of the goal's components, rad, by name.
+        """
         if self.variant == "v2":
             return []
         choice = CHOICES[self.class_name]
@@ -117,7 +127,11 @@ class OfOneClass(NamedTuple):
         return tasks
 
     def _shared_tasks(self) -> list[_Task]:
-        """Return tasks evenly spaced over the class's range, alternately for training and testing."""
+        """Return the tasks of a suite in which both angles of the goal are equal.
+
+        The tasks of a split are evenly spaced over the class's range of angles. Test tasks lie midway between train
+        tasks. A suite that shows its goals has only train tasks.
+        """
         choice = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
@@ -130,7 +144,11 @@ class OfOneClass(NamedTuple):
 
 
 def rung_of(name: str, classes: Iterable[str]) -> int | None:
-    """Return the index in ``RUNGS`` of a suite that hides goals by the rules of version 2; None for other suites."""
+    """Return the rung of a suite as an index in ``RUNGS``, which orders suites by how much their tasks hide.
+
+    ``classes`` are the suite's train classes. The result is None unless the suite is a shipped one that hides its goals
+    by the rules of version 2.
+    """
     if name in _OF_SUITES:
         return _OF_SUITES[name]
     parts = parts_of(name)
@@ -145,7 +163,7 @@ def rung_of(name: str, classes: Iterable[str]) -> int | None:
 
 
 def names_of(classes: Iterable[str]) -> list[str]:
-    """Return the names of all suites of a single class, for the given classes."""
+    """Return the names of all single-class suites of the given classes."""
     names = []
     for name in classes:
         for kind in ("MT1", "ML1"):

@@ -1,4 +1,4 @@
-"""The choices of a suite that hold for all its classes: the rules of versions 1 and 2, and randomisation."""
+"""Settings that apply to all classes of a suite: its rules (version 1, version 2 or a mixture), and randomisation."""
 
 import re
 from collections.abc import Mapping
@@ -21,7 +21,10 @@ success counts at the end."""
 @checked_arguments
 @dataclass(frozen=True)
 class Rules:
-    """Four independent rules of a suite; the defaults are those of version 1, and ``V2`` has those of version 2."""
+    """The four rules in which versions 1 and 2 of a suite differ: reward, variation of tasks, success, and starts.
+
+    A suite can choose each rule independently. The defaults are those of version 1, and ``V2`` has those of version 2.
+    """
 
     reward: Literal["paper", "v2"] = "paper"
     """``paper``: the formula that the paper prints for each class; ``v2``: the terms of ``aligned_terms``."""
@@ -38,7 +41,7 @@ class Rules:
 
     @property
     def wide(self) -> bool:
-        """Return whether the variation is wide."""
+        """Return whether the suite uses the wide variation of tasks, in which every class hides a quantity."""
         return self.variation == "wide"
 
     @property
@@ -48,7 +51,7 @@ class Rules:
 
     @property
     def jittered(self) -> bool:
-        """Return whether starts are jittered."""
+        """Return whether every episode begins with joint noise and shifted objects and fixtures."""
         return self.starts == "jittered"
 
 
@@ -66,7 +69,10 @@ def plain_name(name: str) -> str:
 
 
 def versioned_name(name: str, rules: Rules) -> str:
-    """Return a class's name, with ``-v2`` (before an object's name) if the rules are those of version 2."""
+    """Return a class's name with ``-v2`` added if the rules are those of version 2, otherwise unchanged.
+
+    In a name with an object, ``-v2`` comes before the object: ``CatchUnderarm-v2-block``.
+    """
     task_class, dash, thing = plain_name(name).partition("-")
     if rules == V2:
         return f"{task_class}-v2{dash}{thing}"
@@ -74,7 +80,10 @@ def versioned_name(name: str, rules: Rules) -> str:
 
 
 def rules_apart(others: Mapping[str, object], rules: Rules) -> str:
-    """Describe how other rules, given as values by name, differ from ``rules``; return "" if they are equal."""
+    """Describe in words how the rules ``others`` differ from ``rules``; return "" if they are equal.
+
+    ``others`` maps the names of rules to their values.
+    """
     pairs = [(name, others.get(name), value) for name, value in vars(rules).items()]
     return ", ".join(one_line(f"{name} {other}, not {value}") for name, other, value in pairs if other != value)
 
@@ -87,9 +96,10 @@ _Range = tuple[_Factor, _Factor]
 
 @dataclass(frozen=True)
 class Randomisation:
-    """Random factors, drawn uniformly from ranges for each environment, and noise. By default there is neither.
+    """Random changes of environments: factors on quantities of the physics, noise, delays of actions, and pushes.
 
-    Raises BidexError for values out of bounds, or if a range ends below its start.
+    Factors are drawn uniformly from ranges. By default nothing is changed. Raises BidexError for values out of bounds,
+    or if a range ends below its start.
     """
 
     friction: _Range = (1.0, 1.0)

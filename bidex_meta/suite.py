@@ -57,7 +57,7 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
 @checked_arguments
 @dataclass(frozen=True)
 class ListedTask:
-    """One task that a suite file lists; a class with listed tasks draws none."""
+    """One task that a suite file lists. A class that lists tasks has no randomly drawn tasks."""
 
     name: str
     """Name that is unique within the class, e.g. `"left"`."""
@@ -91,7 +91,7 @@ class SuiteClass:
 @checked_arguments
 @dataclass(frozen=True)
 class Suite:
-    """A suite file, checked."""
+    """The checked content of a suite file."""
 
     name: str
     version: int
@@ -127,7 +127,10 @@ class Suite:
     """True if observations show touch sensors of both hands."""
 
     def __post_init__(self) -> None:
-        """Remove ``-v2`` from names of classes; raise BidexError for such a name in a suite with other rules."""
+        """Remove ``-v2`` from the names of classes.
+
+        Raises BidexError if a name ends in ``-v2`` but the suite's rules are not those of version 2.
+        """
         object.__setattr__(self, "classes", tuple(_without_version(self, entry) for entry in self.classes))
 
     @property
@@ -158,9 +161,9 @@ class Suite:
         return self.tasks_per_class or 0
 
     def task_names(self, split: Split) -> dict[str, list[str]]:
-        """Return the task names of each slot of a split: those that the file lists, or numbers if it lists none.
+        """Return the names of the tasks in each slot of a split; a drawn task's name is its number.
 
-        A slot is a class, or a listed task if each listed task has its own entry in the one-hot.
+        A slot is a class, or a listed task if each listed task has its own entry in the task id (one-hot).
         """
         drawn = list(map(str, range(self.drawn_tasks(split))))
         pools = {}
@@ -190,7 +193,10 @@ _OF_THE_FILE = ("name", "version", "description", "file")
 
 
 def _chosen(value: object) -> Json:
-    """Return a value for JSON: dataclasses become dicts of fields that differ from the default, paths become names."""
+    """Convert a value to JSON, for the suite's digest.
+
+    A dataclass becomes a dict of the fields that differ from their defaults. An absolute path becomes its file name.
+    """
     if is_dataclass(value):
         given = ((entry, getattr(value, entry.name)) for entry in fields(value))
         return {entry.name: _chosen(each) for entry, each in given if each != entry.default and each is not None}
@@ -378,7 +384,10 @@ def _parse(file: Path) -> Suite:
 
 
 def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]:
-    """Yield the class of an entry, or with `objects` one class per object."""
+    """Yield the task classes that one entry of a suite file stands for.
+
+    An entry stands for one class, or, if it has ``objects``, for one class per object.
+    """
     options: dict[str, float | str] = dict(entry.options)
     for name, value in options.items():
         if isinstance(value, str) != (name == "object"):
@@ -408,7 +417,10 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
 
 
 def _object(file: Path, name: str) -> str:
-    """Return an object's name, or for a file its absolute path; ``name`` is relative to the suite file's folder."""
+    """Return the absolute path of an object's MJCF file; return the name of a shipped object unchanged.
+
+    Relative paths start at the suite file's folder.
+    """
     if name.endswith(".xml"):
         return str(absolute(file.parent / expanded(name)))
     return name
@@ -442,7 +454,7 @@ def _check(suite: Suite) -> None:
 
 
 def _check_drawn(name: str, classes: tuple[SuiteClass, ...], count: int) -> None:
-    """Raise BidexError if a class lists its tasks, because a number of drawn tasks would then have no effect."""
+    """Raise BidexError if a class lists its tasks: ``count``, a number of tasks to draw, would then have no effect."""
     for entry in classes:
         if entry.tasks:
             raise BidexError(

@@ -65,12 +65,17 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line that follows ``bidex-meta``, by default the process's own, and return the exit code.
+    """Run the command line that follows ``bidex-meta`` and return the exit code.
 
-    The exit code is 1 if training diverged or a run differs from its record, 2 for bad input or if the system refuses
-    something (a full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, and 141 if nobody reads
-    stderr any more. After SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM it is 128 plus the signal's number, or 0 if training
-    saved and ended at SIGTERM. Otherwise it is 0. A subcommand may raise SystemExit.
+    ``arguments`` are its words; None: those of this process. Some subcommands raise SystemExit with the code instead.
+
+    - 0: the command has succeeded, or training has saved and ended after SIGTERM.
+    - 1: training diverged, runs of a sweep failed, or a check found a difference.
+    - 2: the input or a user's own code is faulty, or the system refuses something (full disk, read-only folder, no
+      memory).
+    - 130: Ctrl-C was pressed.
+    - 141: nobody reads stderr any more.
+    - 128 plus the signal's number: SIGHUP, SIGUSR1, SIGUSR2 or SIGTERM has ended the command.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -119,7 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM or one of ``notices()`` was received; the cleanup is the same as after Ctrl-C."""
+    """Raised when a signal asks the process to end: SIGTERM, or one of ``notices()`` (SIGHUP, SIGUSR1, SIGUSR2).
+
+    The cleanup is the same as after Ctrl-C.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -128,9 +136,10 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Raise an exception when SIGTERM or one of ``notices()`` is received.
+    """Raise an exception in the ``with`` block when SIGTERM or one of ``notices()`` is received.
 
-    The cleanup of the command then leaves no half-written file, and the reason is printed.
+    ``notices()`` are further signals that ask a process to end, such as SIGHUP. Because of the exception, the command
+    cleans up, leaves no half-written file, and prints why it ended.
     """
     # With several processes, signals keep their handlers, because a collective operation waits outside Python and would
     # delay ours.
@@ -155,7 +164,10 @@ class _OnStderr(logging.Handler):
     """Prints the library's log records, one per line."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record; raise BrokenPipeError if nobody reads stderr (logging's own handler would go on)."""
+        """Print a record; raise BrokenPipeError if nobody reads stderr.
+
+        The standard handlers of ``logging`` would catch this error, and the command would continue.
+        """
         tell(record.getMessage())
 
 
@@ -178,7 +190,10 @@ def _log_on_stderr() -> Iterator[None]:
 
 
 def _failed(reason: str, code: int, debug: bool) -> int:
-    """Print the reason on one line and return the code; with ``debug``, raise the caught error again."""
+    """Print the reason for a failure to stderr, on one line, and return ``code``.
+
+    If ``debug`` is true, re-raise the exception that is being handled.
+    """
     if debug:
         raise
     message = one_line(reason)

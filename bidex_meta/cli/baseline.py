@@ -1,4 +1,4 @@
-"""``bidex-meta baseline``: measure the references of the normalised score."""
+"""``bidex-meta baseline``: measure the reference returns that define the normalised score."""
 
 import json
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from bidex_meta.utils.validation import Few, Seed, Threads
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Measure the two ends of the normalised score: the returns of an untrained policy and of the best known policy.
+    """Measure a return that defines the normalised score: the return of an untrained policy or of a known solution.
 
     Example: bidex-meta baseline random --suite MT20 --out random.json
 
-    The better of random and zero actions scores 0, the expert 100. In this command an episode in which the physics
-    breaks counts with the return of the worst finished episode of its class. Other commands count it with the stored
-    return of random actions.
+    The score is 0 at the return of random or of zero actions, whichever is better. It is 100 at the return of the best
+    known policy, the expert. An episode in which the physics breaks gets the return of the worst finished episode of
+    its class in this command, and the stored return of random actions in other commands.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
@@ -42,7 +42,7 @@ class BaselineFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, print, and store if ``--out`` is given."""
+    """Measure the policy's returns, print them, and store them if ``--out`` is given."""
     flags = parse(BaselineFlags, arguments, "baseline")
     policy = known_name("baseline", flags.what, POLICIES)
     found = baseline(

@@ -38,7 +38,7 @@ class BenchFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure and print."""
+    """Measure the speed of the world and print it."""
     flags = parse(BenchFlags, arguments, "bench")
     known_name("bench", flags.what, ["world"])
     if flags.steps == 0:

@@ -29,7 +29,7 @@ class CompareFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Read, compare, print."""
+    """Read the runs, compare their groups, and print the comparison."""
     flags = parse(CompareFlags, arguments, "compare")
     runs = named_runs(flags.runs, "compare")
     groups = read_groups(runs)

@@ -29,7 +29,10 @@ class CompletionFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the script; the learner flags of ``run`` are those of MT-PPO."""
+    """Print the completion script for a shell.
+
+    After ``run`` the script completes the learner flags of MT-PPO, the default learner.
+    """
     shell = parse(CompletionFlags, arguments, "completion").shell
     from bidex_meta.cli import COMMANDS
     from bidex_meta.tasks.objects.held import EGG, shelf

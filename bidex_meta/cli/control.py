@@ -15,11 +15,14 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 
 @dataclass(frozen=True)
 class ControlFlags:
-    """Adapt to held-out tasks from their own data and from data of each train task, with common random numbers.
+    """Test whether a policy that adapts to a held-out task learns from that task's own data.
 
     Example: bidex-meta control runs/ML1-wide/promp/*
 
-    This is for suites whose classes are in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
+    The policy is adapted to a held-out task's own data, and separately to the data of each train task of the class.
+    Each adapted policy is then evaluated on the held-out task, from the same starts and with the same random numbers.
+    The suite must have its classes in both splits (ML1, ML1-wide). If you name several runs, they must be seeds of one
+    experiment.
     """
 
     runs: RunPaths  # Run folders that differ only in the seed.
@@ -54,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
-    """Print a table with one row per arm."""
+    """Print a table with one row for each kind of data that the policy was adapted to."""
     caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
     )

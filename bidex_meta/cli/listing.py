@@ -1,4 +1,4 @@
-"""``bidex-meta list``: list suites, tasks, hidden parts of tasks, algos or objects."""
+"""``bidex-meta list``: list suites, tasks, algos or objects, or the values that tasks hide from the policy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from bidex_meta.worlds import listed
 
 @dataclass(frozen=True)
 class ListFlags:
-    """List the available suites, tasks, hidden parts of tasks, algos or objects.
+    """List the available suites, tasks, algos or objects, or the values that tasks hide from the policy.
 
     Example: bidex-meta list tasks --json
     """

@@ -17,9 +17,10 @@ from bidex_meta.worlds import Worlds, WorldsConfig, open_worlds
 
 
 def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
-    """Return the agent that acts in a shown world: ``zero``, ``random``, or the policy of a run folder.
+    """Return the agent that acts in the world of a picture, a film or a viewer.
 
-    Raises BidexError if the policy does not fit the world.
+    ``policy`` is ``zero``, ``random`` or the folder of a run; ``which`` is the run's checkpoint. Raises BidexError if
+    the policy does not fit the world.
     """
     if policy == "zero":
         return ZeroAgent(world.action_space)
@@ -41,9 +42,10 @@ def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Age
 
 
 def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
-    """Return the worlds in which a policy is shown, the class of each slot, and the class to show.
+    """Return what a picture, film or viewer shows: the worlds, the class of each of their slots, and the class to show.
 
-    The worlds are those of the named suite or task, or those of the policy's run if none is named.
+    A slot is a class or a listed task. The flags name the suite or the task of the worlds. If they name none, the
+    worlds are those of the policy's run. Raises BidexError for an unknown class, and if there is nothing to show.
     """
     if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")

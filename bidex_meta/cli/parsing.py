@@ -1,4 +1,4 @@
-"""Parse flags into dataclasses by tyro, with every error message on one line."""
+"""Parse flags into dataclasses with tyro, and put every error message on one line."""
 
 import contextlib
 import dataclasses
@@ -41,9 +41,10 @@ _asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False
 
 
 def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] = ()) -> FlagsFound:
-    """Return the dataclass of the flags of a subcommand's ``main``, and default values if the command sets its own.
+    """Return the dataclass of a subcommand's flags, and the default values if the subcommand sets its own.
 
-    ``arguments`` are the words that the flags may depend on, e.g. ``--algo``.
+    ``command`` is the subcommand's ``main``. ``arguments`` are the words on which the flags may depend, e.g.
+    ``--algo``.
     """
     token = _asked_for_flags.set(True)
     try:
@@ -98,11 +99,12 @@ def parse(
     default: Options | None = None,
     usual: Mapping[str, Sequence[str]] | None = None,
 ) -> Options:
-    """Parse the flags of a subcommand into a dataclass, whose docstring opens with a sentence and an example.
+    """Parse the flags of a subcommand into the dataclass ``options``.
 
-    ``default`` has the values of flags that are not given. ``usual`` maps headings to flags; if it is given, ``--help``
-    shows only these flags, and ``--help-all`` shows all flags. BidexError is raised if a flag is unknown (the message
-    names the nearest flag) or a value is bad; SystemExit is raised after the help text is printed.
+    The docstring of ``options`` is shown as help, so it opens with a sentence and an example. ``default`` has the
+    values of flags that are not given. ``usual`` maps headings to flags; if it is given, ``--help`` shows only these
+    flags, and ``--help-all`` shows all flags. BidexError is raised if a flag is unknown (the message names the nearest
+    flag) or a value is bad; SystemExit is raised after the help text is printed.
     """
     if _asked_for_flags.get():
         raise FlagsFound(options, default)
@@ -192,7 +194,11 @@ def _refuse(word: str, options: Any, command: str) -> NoReturn:
 
 
 def _near(flag: str, known: list[str]) -> list[str]:
-    """Return flags with the same last part (``--gamma``), the same initials (``--lr``), or a similar spelling."""
+    """Return the known flags that the user may have meant by an unknown flag.
+
+    These have the same last part (``--gamma`` for ``--learner.gamma``), the initials that were given (``--lr`` for
+    ``--learner.learning-rate``), or a similar spelling.
+    """
     given = flag.lstrip("-").lower().replace("_", "-").rpartition(".")[2]
     last = {name: name.lstrip("-").rpartition(".")[2] for name in known}
     initials = {name: "".join(word[:1] for word in last[name].split("-")) for name in known}
@@ -217,7 +223,10 @@ def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
 
 
 def _one_line(box: str) -> str:
-    """Extract the message in tyro's box: the lines between the box's title and the first rule."""
+    """Extract the error message from the box that tyro draws around it.
+
+    The message is between the box's title and the next horizontal line.
+    """
     lines = [line.strip().strip("│").strip() for line in box.splitlines()]
     # If the terminal cannot draw boxes, the title is a separate line with a rule below, not part of the upper edge.
     start = next((i + 1 for i, line in enumerate(lines) if line and set(line) <= set("-")), 0)

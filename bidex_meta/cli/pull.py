@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _name_suite(run: RunFolder, out: Path) -> None:
-    """Write the full path of the suite file that was published with the run into the run's config."""
+    """Set the suite in a fetched run's config to the full path of the suite file, if one was published with the run."""
     config = run.config()
     if config.suite is not None and config.suite in [path.name for path in run.path.glob(SUITES)]:
         run.change_config(replace(config, suite=str(out / config.suite)))

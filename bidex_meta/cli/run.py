@@ -18,8 +18,9 @@ from bidex_meta.training.launch import launch, resume_command, say
 def main(arguments: Sequence[str]) -> None:
     """Train and evaluate. Bad input is reported before anything is written.
 
-    Raises SystemExit: 1 if another process was lost, 2 if another process has reported bad input, and, after a signal
-    has ended the training and training has saved, 128 plus the signal's number (no SystemExit for SIGTERM).
+    SystemExit is raised with code 1 if another process of the run was lost, and with code 2 if another process has
+    reported bad input. If a signal arrives, training saves a checkpoint and ends. SystemExit is then raised with 128
+    plus the signal's number, but not after SIGTERM.
     """
     try:
         distributed.init_from_environment()
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _check_printed(flags: RunFlags) -> None:
-    """Refuse a config as ``train`` would, but do not check the memory of this machine."""
+    """Raise BidexError for a config that ``train`` would refuse. The memory of this machine is not checked."""
     check(flags.config, with_memory=False)
     if flags.resume is not None:
         check_resumed(RunFolder.open(flags.resume), flags.config)

@@ -66,7 +66,11 @@ def run_flags(arguments: Sequence[str]) -> RunFlags:
 
 
 def _defaults(arguments: Sequence[str], folder: RunFolder | None) -> AnyConfig:
-    """Return the config of a run of the given learner, suite and device, or of the run to be resumed."""
+    """Return the config that has the default values of the flags.
+
+    With ``folder``, this is the config of the run to be resumed. Otherwise it is the default config for the learner,
+    preset, suite and device that ``arguments`` name.
+    """
     names = ("suite", "task", "object", "algo", "preset", "device")
     given: dict[str, Any] = {name: value for name in names if (value := peek(arguments, f"--{name}"))}
     if dataset := peek_all(arguments, "--dataset"):

@@ -1,4 +1,4 @@
-"""``bidex-meta submit``: write an entry of the leaderboard, of runs or of a meta-test that was played elsewhere."""
+"""``bidex-meta submit``: write a leaderboard entry, of runs or of the stored meta-test of another agent."""
 
 import re
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry for runs, which play their own and an equal number of new tasks, or for a meta-test.
+    """Write a leaderboard entry, of runs or of the stored meta-test of another agent.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
-    The runs may differ only in the seed. The results of a meta-test of an agent that is not a run are entered without
-    verification.
+    The command evaluates runs on their own tasks and on the same number of new tasks. The runs may differ only in the
+    seed. The results of a meta-test of an agent that is not a run are entered without verification.
     """
 
     runs: RunPaths  # Run folders, one for each seed.
@@ -43,7 +43,7 @@ class SubmitFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Check, play, write, print."""
+    """Check the flags, then write a leaderboard entry or check an existing one, and print the result."""
     flags = parse(SubmitFlags, arguments, "submit")
     if flags.runs and flags.evaluation is not None:
         raise BidexError("Expected run folders or --evaluation, got both. Submit them separately.")
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _tuning(text: str | None) -> tuple[int, int]:
-    """Return the numbers of settings and seeds that the submitter states."""
+    """Return how many settings the submitter has tried, and with how many seeds each, from a text such as ``12x1``."""
     numbers = re.fullmatch(r"([1-9]\d{0,8})x([1-9]\d{0,8})", text or "")
     if numbers is None:
         raise BidexError(
@@ -90,7 +90,10 @@ def _folders(flags: SubmitFlags) -> list[RunFolder]:
 
 
 def _check(flags: SubmitFlags, path: Path) -> None:
-    """Repeat an entry, and print differences and the verdict; return exit code 1 if something differs."""
+    """Evaluate the runs of an existing entry again, and print the differences and the verdict.
+
+    Raises SystemExit with code 1 if something differs.
+    """
     if not flags.runs or (flags.tuning, flags.name, flags.episodes) != (None, None, None):
         raise BidexError("--check takes an entry, its runs and --device, and all else from the entry. Leave it out.")
     if flags.transfer is not None:

@@ -20,11 +20,11 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SweepFlags:
-    """Run what a file asks for: suites x learners x seeds x overrides. Run the command again to continue.
+    """Start the runs that a file describes: all combinations of suites, learners, seeds and changed settings.
 
     Example: bidex-meta sweep results/sweeps/multitask.toml --workers 2
 
-    docs/sweeps.md explains the file.
+    Run the command again to continue the sweep. docs/sweeps.md explains the file.
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]

@@ -1,4 +1,4 @@
-"""Print tables for people and rows as JSON."""
+"""Print tables for people, and rows of data as JSON."""
 
 import json
 import re
@@ -29,11 +29,12 @@ _BROKEN = (
 
 @dataclass
 class Sheet:
-    """Rows under headers; a table that is too wide for the terminal leaves out columns, and names them.
+    """A table. If it is too wide for the terminal, columns are left out, and the caption names them.
 
-    A number with its interval, ``0.7 [0.6, 0.8]`` under ``return [95 %]``, takes two columns. Intervals are left out
-    first, then the columns named in ``spare`` in this order, then the last columns; with ``keeps_intervals`` the
-    columns in ``spare`` are left out before the intervals. Names and numbers are never cut.
+    A cell such as ``0.7 [0.6, 0.8]`` under ``return [95 %]`` becomes two columns, the number and its interval.
+    Intervals are left out first, then the columns named in ``spare``, in the order of ``spare``, then the last columns.
+    With ``keeps_intervals`` the columns in ``spare`` are left out before the intervals. The first two columns always
+    stay, and names and numbers are never cut.
     """
 
     headers: Sequence[str]
@@ -51,7 +52,10 @@ class Sheet:
         self.styles.append(style)
 
     def printed(self, width: int) -> str:
-        """Lay the table out in ``width`` terminal columns, or in more if the first two table columns need them."""
+        """Return the table as text that is ``width`` characters wide.
+
+        The text is wider if the table's first two columns, which are never left out, need more.
+        """
         shown = self._columns()
         left_out: list[str] = []
         for column in sorted(shown[2:], key=self._first_to_go):
@@ -130,7 +134,10 @@ def _needed(columns: Sequence[_Column]) -> int:
 
 
 def _widths(columns: Sequence[_Column], width: int) -> list[int]:
-    """Return the columns' widths: the least widths; the remaining width goes to the most wrapped columns."""
+    """Return the width of each column of a table that may be ``width`` characters wide.
+
+    Each column has at least its least width. The remaining width goes to the columns whose text would be wrapped most.
+    """
     widths = [column.least for column in columns]
     wanted = [max(map(len, [*column.cells, column.header]), default=1) for column in columns]
     for _ in range(width - _needed(columns)):
@@ -219,7 +226,7 @@ def result_table(title: str, policy: Evaluation, random: Evaluation) -> Sheet:
 
 
 def gained(measures: Mapping[str, Difference | None]) -> list[str]:
-    """Return cells with the gains in success, return and score."""
+    """Return three cells of a table: the gains in success, return and score, each with its interval."""
     success, earned, score = (measures[name] for name in ("success", "return", "score"))
     percents = NONE
     if success is not None:
@@ -245,7 +252,10 @@ def print_table(table: Sheet) -> None:
 
 
 def print_evaluation(found: "RunEvaluation", brief: bool = False) -> None:
-    """Print the tables of an evaluation; ``brief`` tables, which need a random policy's results, fit a terminal."""
+    """Print the tables of an evaluation.
+
+    If ``brief`` is true and a random policy was evaluated too, the tables are short enough for a terminal.
+    """
     title = f"{found.algo} on {found.worlds.name}"
     if not brief:
         title += f", {found.own.split} tasks"

@@ -20,12 +20,13 @@ _SPARE = ("seeds", "return")  # columns that a narrow terminal leaves out first
 
 @dataclass(frozen=True)
 class TransferFlags:
-    """Learn held-out classes from a run's policy and from scratch, by reinforcement learning and from demonstrations.
+    """Measure how much a run's policy helps to learn held-out classes.
 
     Example: bidex-meta transfer results/ML20-mtppo-seed0 --classes LiftUnderarm --out runs/transfer
 
-    If the command is interrupted, run it again to continue. Flags after -- are passed to `bidex-meta run` for every
-    run, such as `-- --learner.critic-first 20000` (docs/transfer.md).
+    The command trains on each class from the run's policy and from scratch, by reinforcement learning and by imitation
+    of demonstrations. If the command is interrupted, run it again to continue. Flags after -- are passed to `bidex-meta
+    run` for every run, such as `-- --learner.critic-first 20000` (docs/transfer.md).
     """
 
     run: RunPath  # Folder of the run whose policy is measured; its suite must have held-out classes.
@@ -47,7 +48,7 @@ class TransferFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the runs that are left and print the tables; exit with code 1 if a run has failed."""
+    """Train the runs that are not finished and print the tables; exit with code 1 if a run has failed."""
     at = arguments.index("--") if "--" in arguments else len(arguments)
     flags = parse(TransferFlags, arguments[:at], "transfer")
     suite = RunFolder.open(flags.run).config().suite or "MT4"  # a run without a suite is refused by ``transfer``

@@ -1,4 +1,4 @@
-"""``bidex-meta validity``: measure if there is something to learn about the tasks of a suite."""
+"""``bidex-meta validity``: measure whether a suite's tasks must be identified to be solved, and whether they can be."""
 
 import json
 from collections.abc import Sequence
@@ -20,16 +20,23 @@ from bidex_meta.worlds import WorldsConfig, open_worlds
 
 @dataclass(frozen=True)
 class ValidityFlags:
-    """Measure whether there is something to learn about the tasks of a suite.
+    """Measure whether a policy must identify a suite's tasks to solve them, and whether rewards identify the tasks.
 
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
-    The table has five measures per class. (1) The highest success on unseen tasks that a policy can reach without
-    knowing what a task hides. (2) The share of first observations that identify the task; chance is one over the number
-    of tasks. (3) The share of exploring episodes whose rewards identify the hidden parts; exploration plays rough
-    actions, or a witness, or a script that was given a wrong goal, the last two with noise. (4) The success of
-    untrained policies, and of scripts and runs that know the task. (5) The agreement of return and success over all
-    these episodes.
+    The table has five measures per class:
+
+    (1) the highest success on unseen tasks that a policy can reach without knowing what a task hides;
+
+    (2) the share of first observations that identify the task; chance is one over the number of tasks;
+
+    (3) the share of exploring episodes whose rewards identify the hidden values, for the best of three ways to explore:
+    random actions, a noisy witness (recorded actions that solve one task), and a noisy script that was given a wrong
+    goal;
+
+    (4) the success of untrained policies, of the witness, and of scripts and runs that know the task;
+
+    (5) the agreement of return and success over the episodes of all these policies.
     """
 
     suite: str = "ML20-v2"
@@ -48,7 +55,7 @@ class ValidityFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, print, and store if ``--out`` is given."""
+    """Compute the measures, print them, and write them to a file if ``--out`` is given."""
     flags = parse(ValidityFlags, arguments, "validity")
     if flags.out is not None:
         check_writable(flags.out)

@@ -1,4 +1,4 @@
-"""A single environment as `gymnasium.Env` with NumPy arrays; copies and pickles continue exactly."""
+"""A single environment as `gymnasium.Env` with NumPy arrays; its copies and pickles continue as the original would."""
 
 import gymnasium
 import numpy as np
@@ -55,13 +55,13 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs[0].cpu().numpy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Advance 1/60 s by an action (a,) in [-1, 1].
+        """Advance the environment by 1/60 s with an action (a,) in [-1, 1].
 
-        Returns observation (d,) float32, reward, terminated, truncated and info. `info` has ``success`` (of this state;
-        in version 2 whether the goal has been held for 0.25 s), ``unstable`` and ``reward_terms``. At an episode's end
-        `info` also has ``is_success``: whether the episode was a success, in version 1 at any step, in version 2 at its
-        end. BidexError is raised if no episode is running, because otherwise the end of the last episode would count
-        twice.
+        Returns observation (d,) float32, reward, terminated, truncated and info. `info` always has ``unstable``,
+        ``reward_terms`` and ``success``: whether the present state meets the goal, or, in version 2, whether the goal
+        has been held for 0.25 s. At an episode's end `info` also has ``is_success``, the success of the episode. In
+        version 1 an episode succeeds if the goal is met at any step, in version 2 if the goal is held at the end.
+        BidexError is raised if no episode is running, because otherwise the end of the last episode would count twice.
         """
         if self._over:
             raise BidexError("Expected reset() before step(): there is no running episode.")

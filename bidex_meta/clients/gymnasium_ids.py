@@ -1,4 +1,7 @@
-"""Gymnasium ids of every shipped suite (only vector entry points) and every task class (single and vector)."""
+"""Gymnasium ids of the shipped suites and of the task classes.
+
+An id of a suite makes only vector environments. An id of a task class makes single and vector environments.
+"""
 
 import secrets
 from itertools import product
@@ -55,12 +58,16 @@ def make_suite_world(
 ) -> VectorEnv:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, with environments of all classes.
 
-    `seed` chooses tasks, starts and task draws. If `benchmark_seed` is given, it chooses the tasks instead; without
-    `seed`, it also chooses starts and task draws. If neither seed is given, the tasks are those of seed 0, and starts
-    and draws differ each time. The render modes, None and `"rgb_array"`, are equivalent, because a world renders only
-    on request. Other arguments are as in `Benchmark.make_world`, except that `stagger` is off: wrappers would count
-    shortened episodes. With `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is
-    Meta-World's vector of single environments with NumPy arrays, and `num_envs` is ignored.
+    `seed` chooses the tasks. It also seeds the starts and the draws of a task for each episode. If `benchmark_seed` is
+    given, it chooses the tasks instead of `seed`; without `seed`, it also seeds starts and draws. If neither seed is
+    given, the tasks are those of seed 0, and starts and draws differ each time.
+
+    The render modes, None and `"rgb_array"`, are equivalent, because a world renders only on request. `stagger` lets
+    first episodes begin at random elapsed steps. It is off by default, because Gymnasium's wrappers would count these
+    shortened episodes. Other arguments are as in `Benchmark.make_world`.
+
+    With `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is Meta-World's vector of
+    single environments with NumPy arrays, and `num_envs` is ignored.
     """
     check_render_mode(render_mode)
     task_seed, start_seed = both_seeds(seed, benchmark_seed)

@@ -22,7 +22,10 @@ def extra(name: str) -> Iterator[None]:
 
 
 def check_training(world: VectorWorld, stagger: bool, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
-    """Set whether a world staggers episodes; raise BidexError if the world's autoreset mode is not ``mode``."""
+    """Prepare a world for an adapter: check its autoreset mode, and switch staggered starts on or off.
+
+    With ``stagger`` the first episodes begin at random elapsed steps. Raises BidexError if the mode is not ``mode``.
+    """
     check_argument("world", world, VectorWorld)
     given = world.metadata["autoreset_mode"]
     if given != mode:

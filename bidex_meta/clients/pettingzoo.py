@@ -1,4 +1,7 @@
-"""A task class as PettingZoo's parallel environment, with hands, fingers or other units as agents. Extra: `marl`."""
+"""A task class as PettingZoo's parallel environment, with hands, fingers or other units as agents.
+
+Requires `pip install 'bidex-meta[marl]'`.
+"""
 
 from collections.abc import Mapping
 
@@ -19,11 +22,11 @@ with extra("marl"):
 
 
 class HandsEnv(ParallelEnv):
-    """A single environment of a task class with several agents, which share reward, ends and `info`.
+    """A single environment of a task class with several agents, which all get the same reward, end and `info`.
 
-    `agents` is the partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or a mapping from agents to units
-    (docs/learners/multiagent.md). Other arguments are as in `TaskEnv`. Raises BidexError for an unknown task class or
-    render mode, or a bad partition.
+    `agents` divides the hands among agents: `"hands"`, `"fingers"`, `"single"` (one agent for everything), a TOML file,
+    or a mapping from each agent's name to its units, which are fingers and palms (docs/learners/multiagent.md). Other
+    arguments are as in `TaskEnv`. Raises BidexError for an unknown task class or render mode, or a faulty `agents`.
     """
 
     metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
@@ -70,10 +73,12 @@ class HandsEnv(ParallelEnv):
 
     @checked_arguments
     def step(self, actions: Mapping[str, object]) -> tuple[dict, dict, dict, dict, dict]:
-        """Advance 1/60 s by each agent's action in [-1, 1], whose entries are in the order of the world's actions.
+        """Advance the environment by 1/60 s with one action per agent.
 
-        Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; all are empty
-        once the episode is over. BidexError is raised if an agent's action is missing or has another shape.
+        An action is in [-1, 1]. Its entries are those actions of the world that the agent controls, in the world's
+        order. Returns five dicts by agent: observations, rewards, terminated, truncated and infos (as in
+        `TaskEnv.step`). After the end of the episode, further steps return empty dicts. BidexError is raised if an
+        agent's action is missing or has another shape.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
@@ -99,7 +104,7 @@ class HandsEnv(ParallelEnv):
         return obs, rewards, ends, cuts, {name: dict(info) for name in every}
 
     def state(self) -> np.ndarray:
-        """Return the full observation, for critics of all agents."""
+        """Return the full observation, for centralised critics."""
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:

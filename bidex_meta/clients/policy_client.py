@@ -1,14 +1,17 @@
-"""An agent for our evaluation whose policy runs in another process, over a WebSocket. Extra: `policy-server`.
+"""An agent for our evaluation whose policy runs in another process, over a WebSocket.
 
-Messages are msgpack maps. An array is a map of `dtype` (NumPy's, such as `<f4`), `shape` and `data` (raw bytes, in C
-order). For each step of N environments the client sends:
+Requires `pip install 'bidex-meta[policy-server]'`.
+
+Messages are msgpack maps. An array is a map of `dtype` (NumPy's, such as
+`<f4`), `shape` and `data` (raw bytes, in C order). For each step of N environments the client sends:
 
 - `state`: observations (N, d), float32.
 - `reset`: whether an episode begins with this observation, bool (N,).
 - `instruction`: a sentence for each environment that says what to do, if the world has such sentences.
 - `pixels`: pictures (N, edge, edge, 3), uint8, if the world was made with `pixels`.
 
-The server answers `action`: an array (N, a) of floats in [-1, 1]; or `error`: a text, which ends the evaluation.
+The server answers with a map that has either `action`, an array (N, a) of floats in [-1, 1], or `error`, a text, which
+ends the evaluation.
 """
 
 from typing import Any
@@ -70,7 +73,7 @@ class PolicyClient:
         self.close()
 
     def reset(self, env_mask: Tensor) -> None:
-        """Tell the server with the next observation that episodes begin in the environments of a mask (N,)."""
+        """Store in which environments an episode begins, bool (N,), for the next message to the server."""
         self._begins |= env_mask.cpu()
 
     def eval_action(self, obs: Tensor) -> Tensor:

@@ -1,4 +1,7 @@
-"""A world as rsl-rl's VecEnv: `OnPolicyRunner(RslRlVecEnv(world), config)`. Extra: `rsl-rl`."""
+"""A world as rsl-rl's VecEnv: `OnPolicyRunner(RslRlVecEnv(world), config)`.
+
+Requires `pip install 'bidex-meta[rsl-rl]'`.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,13 +21,16 @@ with extra("rsl-rl"):
 
 
 class RslRlVecEnv(VecEnv):
-    """All environments of one world on the world's device; observations are in the groups `policy` and `critic`.
+    """All environments of one world as an rsl-rl VecEnv; tensors stay on the world's device.
 
-    `extras` has `time_outs` (episodes cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty if no
-    episode ended). `policy` lists the `observation_groups` of the world that the policy gets (empty: all); the critic
-    gets all groups. `cfg` is a dict that rsl-rl's loggers store. `stagger` shortens first episodes (docs/clients.md);
-    rsl-rl's "Mean reward" counts shortened episodes, but `log` does not. Raises BidexError for a mode other than
-    SAME_STEP, an unknown group, or values of `episode_length_buf` that are negative or not whole.
+    Observations are in two groups. The group `policy` contains the `observation_groups` of the world that the argument
+    `policy` lists (empty: all). The group `critic` always contains all of them. `cfg` is a dict that rsl-rl's loggers
+    store. In `extras`, `time_outs` marks episodes that were cut by the time limit or by broken physics, and `log` has
+    the values of `EpisodeLog`, or none if no episode ended.
+
+    `stagger` shortens first episodes (docs/clients.md). rsl-rl's "Mean reward" counts these episodes, but `log` does
+    not. Raises BidexError for a world in another autoreset mode than SAME_STEP, for an unknown group, or if
+    `episode_length_buf` is set to values that are negative or not whole.
     """
 
     @checked_arguments
@@ -110,11 +116,12 @@ class EpisodeLog:
         self._terms: dict[str, Tensor] = {}
 
     def update(self, info: Info, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
-        """Return the values of the k episodes that ended in a step, (k,), float32, to be averaged; empty if none ended.
+        """Return metrics of the episodes that ended in a step, by tag; the dict is empty if none ended.
 
-        Full episodes yield `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as
-        sums over an episode, `Episode_Reward/<term>`. All episodes, also shortened ones, yield
-        `Episode_Termination/terminated`, `time_out` and `unstable`.
+        Each metric has one value per episode, float32; the logger averages them. Full episodes yield
+        `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as sums over an
+        episode, `Episode_Reward/<term>`. All episodes, also shortened ones, yield three tags that begin with
+        `Episode_Termination/`: `terminated`, `time_out` and `unstable`.
         """
         ended = info["_final_obs"]
         episode_mask = info["episode_mask"]

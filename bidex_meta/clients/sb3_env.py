@@ -1,4 +1,7 @@
-"""A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`. Extra: `sb3`."""
+"""A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`.
+
+Requires `pip install 'bidex-meta[sb3]'`.
+"""
 
 import math
 from collections import defaultdict, deque
@@ -19,13 +22,15 @@ with extra("sb3"):
 
 
 class SB3VecEnv(vec_env.VecEnv):
-    """All environments of one world, with NumPy arrays; one SB3 seed seeds the starts of all environments.
+    """All environments of one world as a stable-baselines3 (SB3) VecEnv, with NumPy arrays.
 
-    At an episode's end `infos` has `terminal_observation` and `TimeLimit.truncated` (if true, SB3 bootstraps from that
-    observation's value). Unless the episode was a shortened first episode, `infos` also has `episode` (r, l, t),
-    `is_success` (by the suite's rule) and `task`. `stagger` shortens first episodes (docs/clients.md); SB3 does not
-    count shortened episodes, but `VecMonitor` does. Raises BidexError for a world in another autoreset mode than
-    SAME_STEP.
+    One SB3 seed seeds the starts of all environments. When an episode ends, the environment's entry of `infos` has
+    `terminal_observation` and `TimeLimit.truncated`. If the latter is true, SB3 bootstraps from the value of that
+    observation. The entry also has `episode` (r, l, t), `is_success` (by the suite's rule) and `task`, unless the
+    episode was shortened.
+
+    `stagger` shortens first episodes (docs/clients.md). SB3 does not count shortened episodes, but `VecMonitor` does.
+    Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     @checked_arguments
@@ -65,7 +70,7 @@ class SB3VecEnv(vec_env.VecEnv):
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
 
     def get_attr(self, attr_name: str, indices: _Rows = None) -> list[object]:
-        """Return the world's attribute for each environment."""
+        """Return an attribute of the world as a list with one value for each environment in `indices` (None: all)."""
         return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: _Rows = None) -> None:
@@ -79,7 +84,10 @@ class SB3VecEnv(vec_env.VecEnv):
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
-        """Return True only for `Monitor`, because `infos` reports whole episodes, which SB3 counts in evaluations."""
+        """Return for each environment whether a wrapper is present: True only for `Monitor`.
+
+        SB3's evaluation then takes returns and lengths from `infos`, which report whole episodes.
+        """
         return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> list[np.ndarray]:

@@ -1,4 +1,7 @@
-"""A world as skrl's environment wrapper: `SequentialTrainer(env=SkrlEnv(world), agents=agent)`. Extra: `skrl`."""
+"""A world as skrl's environment wrapper: `SequentialTrainer(env=SkrlEnv(world), agents=agent)`.
+
+Requires `pip install 'bidex-meta[skrl]'`.
+"""
 
 from typing import Any
 
@@ -18,15 +21,19 @@ with extra("skrl"):
 
 
 class SkrlEnv(Wrapper):
-    """All environments of one world on the world's device, without the NumPy arrays that `wrap_env` puts in between.
+    """All environments of one world as a skrl environment; tensors stay on the world's device.
 
-    skrl stores the observation that `step` returns as the next observation, bootstraps from it at time limits, and acts
-    on it. skrl does not read `final_obs`, so the world must be in mode NEXT_STEP: an ended environment returns its last
-    observation, and its next step starts the next episode, with reward 0, regardless of the action.
+    skrl's own `wrap_env` would convert the tensors to NumPy arrays and back; this class does not.
 
-    `infos` are those of the world; if full episodes ended, `episode` has their means in the form that skrl's trainers
-    log. `seed` is the seed of the first reset (None: the world's). `stagger` shortens first episodes (docs/clients.md),
-    which skrl's "Total reward" counts. Raises BidexError for a world in another autoreset mode.
+    The world must be in autoreset mode NEXT_STEP, because skrl does not read `final_obs`. skrl stores the observation
+    that `step` returns as the next observation, bootstraps from it at time limits, and acts on it. In NEXT_STEP mode an
+    ended environment returns its last observation. Its next step starts the next episode, with reward 0, regardless of
+    the action.
+
+    `infos` are those of the world. If full episodes ended, `infos` also has `episode`: means over these episodes in the
+    form that skrl's trainers log. `seed` is the seed of the first reset (None: the world's). `stagger` shortens first
+    episodes (docs/clients.md); skrl's "Total reward" counts shortened episodes too. Raises BidexError for a world in
+    another mode.
     """
 
     @checked_arguments
@@ -49,7 +56,10 @@ class SkrlEnv(Wrapper):
         return self.world.single_action_space
 
     def reset(self) -> tuple[Tensor, Info]:
-        """Start all environments in the first call, later only ended ones; return the observations (num_envs, d)."""
+        """Start all environments in the first call, and only the ended ones in later calls.
+
+        Returns the observations (num_envs, d) and an empty info.
+        """
         if self._obs is None:
             self._obs, _ = self.world.reset(seed=self._seed)
         elif self._ended is not None and bool(self._ended.any()):  # skrl resets a single environment itself

@@ -1,4 +1,7 @@
-"""A world as TorchRL's environment: `Collector(TorchRLEnv(world), policy, ...)`. Extra: `torchrl`."""
+"""A world as TorchRL's environment: `Collector(TorchRLEnv(world), policy, ...)`.
+
+Requires `pip install 'bidex-meta[torchrl]'`.
+"""
 
 import torch
 from torch import Tensor
@@ -15,13 +18,15 @@ _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 
 
 class TorchRLEnv(envs.EnvBase):
-    """All environments of one world, with batch size (num_envs,); each entry is (num_envs, ...).
+    """All environments of one world as a TorchRL environment with batch size (num_envs,); entries are (num_envs, ...).
 
-    `next` holds the observation that the step led to, also if an episode ended. TorchRL then asks for a reset, which
-    returns the first observation of the new episode; the world has already begun this episode. In addition to
-    `observation` there are `success` (of this state) and `episode` (r, l, success so far). `stagger` shortens first
-    episodes (docs/clients.md), which TorchRL's transforms count. Raises BidexError for a world in another autoreset
-    mode than SAME_STEP.
+    `next` always holds the observation that the step led to, also if the episode ended. After an end TorchRL requests a
+    reset, which returns the first observation of the new episode; the world has already begun this episode. Two entries
+    come in addition to `observation`: `success` of the present state, and `episode`, which holds return `r`, length `l`
+    and `success` of the episode so far.
+
+    `stagger` shortens first episodes (docs/clients.md); TorchRL's transforms count shortened episodes too. Raises
+    BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     @checked_arguments

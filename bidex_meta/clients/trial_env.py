@@ -37,12 +37,13 @@ _SEEDS = 2**31
 
 
 class TrialWorld(PooledWorldWrapper):
-    """A training world whose episodes are trials of `world.episodes_per_task` episodes: a `contract.VectorWorld`.
+    """A training world in which each episode is a trial: `world.episodes_per_task` episodes of one task.
 
-    `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` can be passed to the other adapters,
-    such as `SB3VecEnv`. Return and length are those of the trial; success is that of the trial's last episode. Within a
-    trial, the next episode starts in the step that ends the previous one, and neither `terminated` nor `truncated` is
-    set. The trial ends when its last episode ends, or when physics breaks. First episodes are not shortened.
+    `TrialWorld(Benchmark("ML1-v2").make_world("train", 64, episodes_per_task=3))` is a `contract.VectorWorld` and can
+    be passed to the other adapters, such as `SB3VecEnv`. Return and length are those of the trial; success is that of
+    the trial's last episode. Within a trial, the next episode starts in the step that ends the previous one, and
+    neither `terminated` nor `truncated` is set. The trial ends when its last episode ends, or when physics breaks.
+    Staggered starts are switched off, so no episode is shortened.
 
     Raises BidexError for a world in another autoreset mode than SAME_STEP, or one that shows its goals.
     """
@@ -106,7 +107,10 @@ class TrialWorld(PooledWorldWrapper):
         return self.world.episodes.number % self.episodes_per_task
 
     def _forget(self, mask: Tensor) -> None:
-        """Begin trials in the environments of a mask; forget what the previous trials have shown."""
+        """Clear what is stored about finished trials in the environments of ``mask``, where new trials begin.
+
+        This is the last step (action, reward and end of an episode), the sums over the trial, and the clock.
+        """
         self._clock.begin(mask)
         self._last = self._last.masked_fill(mask[:, None], 0.0)
         if not self._sums:
@@ -115,9 +119,9 @@ class TrialWorld(PooledWorldWrapper):
         self._sums = {name: value.masked_fill(mask, 0) for name, value in self._sums.items()}
 
     def _begin(self, mask: Tensor, obs: Tensor, info: Info) -> tuple[Tensor, Info]:
-        """Return the observations of trials that begin in the environments of a mask.
+        """Finish the start of trials in the environments of ``mask``; return all observations and the info.
 
-        An environment that left a trial before its last episode is reset until a trial of another task begins.
+        If an environment has left its trial before the last episode, it is reset until a trial of another task begins.
         """
         while bool((left := mask & (self._episode_of_trial() > 0)).any()):
             obs, pictures = self.world.reset(options={"reset_mask": left})
@@ -125,7 +129,7 @@ class TrialWorld(PooledWorldWrapper):
         return torch.cat((obs, self._last), dim=1), info
 
     def state_dict(self) -> State:
-        """Return the world's state, and the last step and the sums of the running trials."""
+        """Return the state of the world and of its running trials, for a checkpoint."""
         trials = {"last": self._last, **self._sums}
         return {**super().state_dict(), "trials": {name: value.clone() for name, value in trials.items()}}
 
@@ -265,7 +269,7 @@ def make_trials(
 
 
 def _extended(observation: Space, action: Space) -> Box:
-    """Return the space of observations followed by the last action, the last reward and the end of an episode."""
+    """Return the observation space with three further parts: last action, last reward, and flag of an episode's end."""
     assert isinstance(observation, Box) and isinstance(action, Box)
     low = (*observation.low, *action.low, -np.inf, 0.0)
     high = (*observation.high, *action.high, np.inf, 1.0)

@@ -1,10 +1,11 @@
 """Checks and summaries of a data set.
 
-The check recomputes rewards by the class's own formula, from the sensors that the observation shows and the task's
-values that the episode stores. This reveals transitions that were stored with a wrong environment, task or start. If a
-formula reads a sensor that the observation does not show, the check reports this. Most classes with tables are such
-cases, because their formulas read a point of the hand, and so are data with point clouds, which replace objects'
-states.
+The check recomputes the rewards with the reward formula of each class. The formula reads sensors, which the check takes
+from the observations, and values of the task, which the episode stores. A reward that differs shows that a transition
+was stored with a wrong environment, task or start. If a formula reads a sensor that the observations do not show, the
+check cannot recompute the rewards and reports this. Most classes with a table in the scene are such cases, because
+their formulas read a point of the hand. Data with point clouds are such cases too, because the clouds replace the
+states of objects.
 """
 
 import math
@@ -180,7 +181,10 @@ class _Formulas:
         return self._known[name]
 
     def _class(self, name: str) -> TaskClass:
-        """Return the class whose bases, fixed or moving, match the data's number of actions."""
+        """Return the task class ``name`` with fixed or with moving bases, whichever has the data's number of actions.
+
+        Raises BidexError if neither has.
+        """
         classes = [registry.get(name, base, self._touch) for base in self._bases]
         actions = self._dataset.action_size
         for task in classes:
@@ -195,10 +199,12 @@ class _Formulas:
 
 
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
-    """Return slice and factor of each sensor that an observation shows completely and unchanged, by sensor.
+    """Return the sensors whose values can be read back from an observation.
 
-    Sensors with ``hidden`` entries are left out. Joint positions are left out, because the observation maps each one
-    from its joint's range. Sensors in blocks of the observation that saturate are left out too.
+    Each name is mapped to a slice of the observation and to the factor by which the sensor's values were multiplied.
+    Three kinds of sensors are left out: sensors with entries in ``hidden`` (indices of the observation), joint
+    positions, which the observation maps from the joint's range, and sensors in blocks of the observation that
+    saturate.
     """
     shown: _Shown = {}
     for block, where in task.layout:
@@ -224,7 +230,7 @@ def _size(block: Block, sensor: str) -> int:
 
 @dataclass(frozen=True)
 class SlotSummary:
-    """One slot of a data set."""
+    """Summary of the episodes of one slot of a data set; a slot is a class, or a class and one of its listed tasks."""
 
     name: str  # class, or class and task
     episodes: int
@@ -238,7 +244,10 @@ class SlotSummary:
 
 
 def summary(dataset: Dataset) -> list[SlotSummary]:
-    """Summarise each slot that has episodes; read only the tables."""
+    """Summarise each slot (a class, or a class and a listed task) that has episodes.
+
+    Only the tables of the data set are read, not its transitions.
+    """
     table = dataset.table
     summaries = []
     for number, name in enumerate(dataset.metadata["tasks"]):

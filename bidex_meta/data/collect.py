@@ -32,7 +32,7 @@ _SLACK = 1.05  # the last round is planned for a little more than is missing, si
 
 @runtime_checkable
 class SamplingAgent(Agent, Protocol):
-    """An agent whose policy has a distribution."""
+    """An agent with a stochastic policy."""
 
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
         """Draw actions (N, a) from the policy's distribution."""
@@ -41,7 +41,7 @@ class SamplingAgent(Agent, Protocol):
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy as it acts in a collection."""
+    """A policy in a recording: how its actions are chosen (mean or sampled), and how much noise is added."""
 
     policy: Agent | None  # None: uniform actions
     sampled: bool = False
@@ -77,7 +77,10 @@ class Actor:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a collection by policy, computed only from the collection's parts."""
+    """Numbers of transitions and episodes that a recording has stored for each policy, and the results so far.
+
+    The numbers are computed only from the stored parts, so that they are right even after a recording was killed.
+    """
 
     rounds: int  # existing parts
     steps: list[int]  # transitions of each policy

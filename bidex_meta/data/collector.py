@@ -28,12 +28,13 @@ _KEY = "recorder"  # name of our entry in a checkpoint's world state
 class EpisodeCollector(PooledWorldWrapper):
     """Collects whole episodes without changing what the world does.
 
-    A transition in which physics broke is left out, and its episode ends as truncated before that transition. Only the
-    episodes of ``rows``, the environments to collect from (None: all), are in memory: a step of one environment takes 4
-    (d + a + 2) bytes. ``sink`` receives each episode when the episode has ended; episodes that end in the same step
-    arrive by ascending environment. ``left_out`` counts uncollected transitions and episodes by reason; ``policy`` is
-    the number of the acting policy; ``active``, bool (rows,), marks the environments whose new episodes are collected
-    (at first all of them).
+    ``rows`` are the environments to collect from (None: all). ``sink`` receives each episode when the episode has
+    ended; episodes that end in the same step arrive by ascending environment. If physics breaks in a transition, the
+    episode is stored without this transition and is marked as truncated. ``left_out`` counts uncollected transitions
+    and episodes by reason. ``policy`` is the number of the acting policy, which is stored with each episode.
+    ``active``, bool (rows,), marks the environments whose new episodes are collected (at first all of them).
+
+    Memory holds only the running episodes of ``rows``: 4 (d + a + 2) bytes for each step of one environment.
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
@@ -74,7 +75,7 @@ class EpisodeCollector(PooledWorldWrapper):
         self._task = np.zeros(num, np.int64)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Start episodes; leave out the running episodes of the environments that are reset."""
+        """Start episodes; discard the running episodes of the environments that are reset."""
         obs, info = self.world.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         if mask is None:
@@ -136,7 +137,11 @@ class EpisodeCollector(PooledWorldWrapper):
             self._task = np.where(mask, self._own(self.world.task_index), self._task)
 
     def _end(self, row: int, terminated: bool, unstable: bool, episode_mask: bool, success: bool) -> None:
-        """Pass an episode to the sink, unless the episode was shortened or has no good transition."""
+        """Pass an ended episode to the sink.
+
+        An episode is discarded if it began after its first step (``episode_mask`` is False), or if physics broke in its
+        first transition.
+        """
         length = int(self._length[row])
         slot = self._slots[row]
         task = int(self._task[row])
@@ -223,12 +228,12 @@ class EpisodeCollector(PooledWorldWrapper):
 
 
 class RunCollector(EpisodeCollector):
-    """Collects from ``rows`` of a run's training world; each episode is stored once even if the run is resumed.
+    """Collects episodes in the environments ``rows`` of a run's training world; a resumed run stores no episode twice.
 
-    Saving a checkpoint calls ``state_dict``, which commits the collected episodes as a part; the result holds the
-    number of parts and the running episodes. A run that resumes from this state deletes later parts and plays them
-    again. ``folder`` is the data set's folder. Call ``open``, or set ``folder`` before ``load_state_dict``, which opens
-    the folder.
+    Saving a checkpoint calls ``state_dict``, which writes the collected episodes as a part of the data set. The
+    returned state holds the number of parts and the running episodes. A run that resumes from this state deletes later
+    parts and plays their episodes again. ``folder`` is the data set's folder. Call ``open``, or set ``folder`` before
+    ``load_state_dict``, which opens the folder.
     """
 
     folder: Path
@@ -245,7 +250,10 @@ class RunCollector(EpisodeCollector):
         return self._writer
 
     def open(self, folder: Path, parts: int = 0) -> None:
-        """Set the folder, before the first reset, and delete this process's parts with number ``parts`` or higher."""
+        """Open the data set ``folder`` for recording; this is done before the first reset.
+
+        Parts of this process with number ``parts`` or higher are deleted.
+        """
         self.folder = folder
         self._writer = DatasetWriter(folder, self.process, keep=parts)
         if self.process == 0:  # the data set is no longer complete
@@ -278,9 +286,9 @@ class RunCollector(EpisodeCollector):
 
 
 def spread_environments(world: VectorWorld, share: float) -> list[int]:
-    """Return a share, above 0, of a world's environments, evenly over slots and at least one per slot.
+    """Choose environments to record: the given share, above 0, of the environments of each slot, at least one per slot.
 
-    A share of 1 or more returns all environments.
+    A slot is a class or a listed task. A share of 1 or more returns all environments.
     """
     chosen: list[int] = []
     slots = world.task_id.tolist()

@@ -33,7 +33,7 @@ _CHECKED_AT_OPENING = 64_000_000
 
 @dataclass(frozen=True)
 class _Reference:
-    """Unscaled returns of a class."""
+    """Mean returns of a class's reference policies, before the suite's reward scale."""
 
     random: Finite
     zero: Finite | None = None
@@ -120,9 +120,10 @@ def open_dataset(name_or_path: str | Path) -> "Dataset":
 class Dataset:
     """A data set of whole episodes on disk, from ``open_dataset``; only small tables stay in memory.
 
-    ``folder`` is the folder ``data``, ``content`` is all of ``metadata.json``, and ``metadata`` is our entry in it
-    (``bidex_meta.experiments.run_data.dataset_metadata``). Without our entry ``metadata`` has only ``tasks`` and
-    ``kind``.
+    ``folder`` is the folder of the files (the subfolder ``data``). ``content`` is all of ``metadata.json``.
+    ``metadata`` is the entry ``bidex`` in it, which this library adds
+    (``bidex_meta.experiments.run_data.dataset_metadata``). If a data set has no such entry, ``metadata`` has only
+    ``tasks`` and ``kind``.
     """
 
     def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
@@ -161,9 +162,10 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """Return the columns of ``part_files.TABLE`` and ``variation`` by episode.
+        """Return the table of all episodes: a dict from the name of a column to an array with an entry per episode.
 
-        Raises BidexError if files are damaged.
+        The columns are those of ``part_files.TABLE``, and ``variation``, the values that the task fixes. Raises
+        BidexError if files are damaged or missing.
         """
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes = len(columns["steps"])
@@ -188,9 +190,9 @@ class Dataset:
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return lower and upper bounds of actions, (a,) each, of a data set from elsewhere; None for our own (±1).
+        """Return the lower and upper bounds of actions, (a,) each; None if bidex-meta recorded the data (bounds ±1).
 
-        Raises BidexError if the bounds are not finite.
+        Raises BidexError unless all bounds are finite and upper bounds are above lower bounds.
         """
         if "bidex" in self.content:
             return None
@@ -302,7 +304,10 @@ class Dataset:
 
 
 def _joined(columns: list[np.ndarray]) -> np.ndarray:
-    """Concatenate columns; pad variations with NaN to the widest one."""
+    """Concatenate a column of several tables.
+
+    A column with several values per episode (``variation``) is padded with NaN to the widest of them.
+    """
     if not columns:
         return np.zeros(0)
     if columns[0].ndim == 1:

@@ -1,4 +1,7 @@
-"""Join data sets in memory, in the form of the world that a policy is trained for; store each observation once."""
+"""Join data sets in memory for training, in the form that the world gives to observations, actions and rewards.
+
+Each observation is stored once, although it belongs to two transitions.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,12 +49,15 @@ class Joined:
 
 
 def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
-    """Read at least one data set for a world, without stepping or resetting the world.
+    """Load data sets in the form of a world's observations, actions and rewards; the world is not stepped or reset.
 
-    Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards get the world's scale. Goals that the world hides become zero, and actions from elsewhere are mapped to [-1,
-    1]. If ``every`` is True, each of the world's classes needs data. BidexError is raised if actions, states or clouds
-    have another form, if actions from elsewhere have no bounds, if classes do not match, or if memory is too small.
+    At least one data set is needed. Classes are matched by name. Observations get the world's task id and, if a class
+    was recorded on its own, the world's padding. Rewards get the world's scale. Goals that the world hides become zero.
+    Actions that another library recorded are mapped from their bounds to [-1, 1]. If ``every`` is True, each of the
+    world's classes needs data.
+
+    BidexError is raised if actions, states, touch sensors or point clouds do not fit the world, if another library's
+    actions have no bounds, if classes do not match, or if memory is too small.
     """
     ids = world.num_id_columns
     plain = world.single_observation_space.shape[0] - ids
@@ -75,9 +81,11 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Join episodes, each with its slot and its observations (T + 1, d) in the world's form.
+    """Join episodes into one set of transitions.
 
-    Raises BidexError if the episodes have fewer than ``steps`` transitions.
+    Each item of ``episodes`` has an episode, its slot (class or listed task) in the world, and its observations (T + 1,
+    d) in the world's form. ``steps`` and ``count`` are the numbers of transitions and episodes; ``observations`` and
+    ``actions`` are sizes. Raises BidexError if the episodes have fewer than ``steps`` transitions.
     """
     states = torch.zeros(steps + count, observations)
     acts = torch.zeros(steps, actions)
@@ -113,7 +121,10 @@ def check_touch(dataset: Dataset, touch: bool) -> None:
 
 
 class _Columns(NamedTuple):
-    """Columns of an observation without its task id; padding comes before the point cloud."""
+    """Columns of an observation that hold the state, and columns that hold the point cloud; the task id is left out.
+
+    Padding belongs to the state and comes before the point cloud.
+    """
 
     state: np.ndarray  # columns of the state, that is, all but the cloud, ascending
     cloud: np.ndarray  # columns of the point cloud, point after point
@@ -135,10 +146,10 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """Converts a data set's episodes to a world's form.
+    """Converts a data set's episodes to the form of a world's observations, actions and rewards.
 
-    ``plain`` is the size of the world's observations without the one-hot, and ``actions`` the number of its actions.
-    ``slots`` has the world's slot for each slot of the data set.
+    ``plain`` is the size of the world's observations without the task id, and ``actions`` the number of its actions.
+    ``slots`` has the world's slot (class or listed task) for each slot of the data set.
     """
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
@@ -171,7 +182,10 @@ class _Form:
                 self._factors[number] = theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0)
 
     def _check_observations(self, may_pad: bool) -> None:
-        """Raise BidexError if clouds or state sizes differ; with ``may_pad`` the world's states may be wider."""
+        """Raise BidexError if the data set's point clouds or state sizes differ from the world's.
+
+        With ``may_pad`` the world's states may be wider, because padding fills the remaining columns.
+        """
         name = self.dataset.name
         own = self._own
         theirs = self._theirs
@@ -185,7 +199,10 @@ class _Form:
             raise BidexError(f"{fault}. Train on the tasks that it was recorded on.")
 
     def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
-        """Yield all episodes, each with its slot and its observations in the world's form."""
+        """Yield each episode, the index of its task in the world, and its observations in the world's form.
+
+        ``ids`` is the size of the world's task id.
+        """
         return (self._fitted(episode, ids) for episode in self.dataset.episodes())
 
     def _fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
@@ -210,7 +227,11 @@ class _Form:
 
 
 def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
-    """Yield, for each name, the world's slot of this name."""
+    """Yield, for each name of a class or listed task in a data set, the index of this name in the world.
+
+    With ``outside``, another library recorded the data. In a world with a single task, all names then have index 0.
+    Raises BidexError for a name that the world does not have.
+    """
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)
         return

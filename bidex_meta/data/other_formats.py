@@ -22,7 +22,10 @@ def check_spaces(content: Json, name: str) -> None:
 
 
 def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.ndarray:
-    """Read an episode's array that Minari calls ``array``; raise BidexError for a wrong shape, type or ``length``."""
+    """Read an array of a stored episode; ``array`` is Minari's name of it, such as ``observations``.
+
+    Raises BidexError for a wrong shape or type, or if ``length`` is given and is not the array's length.
+    """
     if not hasattr(stored, "shape"):
         raise _not_flat(name, array, f"a group of {shortened(', '.join(stored))}")
     shape = stored.shape or ()

@@ -176,7 +176,10 @@ class SealedFile:
 
 
 class PartWriter:
-    """A part that is being written: episodes go to the disk at once, under a temporary name until ``commit``."""
+    """A part of a data set that is being written; each added episode is written to the disk immediately.
+
+    The file has a temporary name until ``commit``.
+    """
 
     def __init__(self, path: Path) -> None:
         self._sealed = SealedFile(path)
@@ -238,7 +241,10 @@ def write_main(folder: Path, parts: Iterable[Path]) -> None:
 
 @contextmanager
 def reading(path: Path) -> Iterator[H5]:
-    """Yield h5py's file for reading; raise BidexError if there is no file, or if the data read inside is damaged."""
+    """Yield an open HDF5 file for reading.
+
+    Raises BidexError if there is no file, or if the data that the ``with`` block reads are damaged.
+    """
     h5 = hdf5()
     if not is_file(path):
         raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
@@ -254,7 +260,10 @@ def reading(path: Path) -> Iterator[H5]:
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
-    """Read a part's table: columns (episodes,), and ``variation`` (episodes, v); raise BidexError for damage."""
+    """Read the table of a part's episodes: columns (episodes,), and ``variation`` (episodes, v).
+
+    Raises BidexError if the part is damaged or missing.
+    """
     with reading(path) as file:
         table = {name: file["table"][name] for name in (*TABLE, "variation")}
         rows = table["steps"].shape[:1]

@@ -22,7 +22,7 @@ _MARK = "sealed"  # second entry in the metadata: one flipped bit cannot remove 
 
 
 def block(file: IO[bytes]) -> bytes:
-    """Compute the user block for the content of an open file."""
+    """Return the user block (first 512 bytes) for an HDF5 file: the file's length and the digest of all other bytes."""
     length = file.seek(0, 2)
     digest = 0
     file.seek(BLOCK)
@@ -36,7 +36,10 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Check a file's digest by reading all bytes; return False if there is none. Raises BidexError if it is wrong."""
+    """Read a file and compare it with its stored digest; return False if the file has no digest.
+
+    Raises BidexError if the digest or the length is wrong.
+    """
     with open_regular(path, "a file of a data set") as file:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):
@@ -63,7 +66,10 @@ def _ending(text: bytes) -> bytes:
 
 
 def check_text(path: Path, data: bytes) -> bool:
-    """Check the digest of metadata; return False if there is none. Raises BidexError if the metadata have changed."""
+    """Compare metadata with their stored digest; return False if the metadata have no digest.
+
+    ``data`` is the content of the file ``path``. Raises BidexError if the metadata have changed.
+    """
     text, found, _ = data.rpartition(_LAST.encode())
     if not found and not re.search(rb'"%s"\s*:\s*true' % _MARK.encode(), data):
         return False

@@ -33,7 +33,7 @@ _NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
 
 @dataclass(frozen=True)
 class _Plan:
-    """The entries that are read again from a collection's plan."""
+    """The entries that a resumed recording reads from its stored plan."""
 
     threads: Threads | None = None
 
@@ -51,7 +51,11 @@ def default_name(subject: str, kind: str) -> str:
 
 
 def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
-    """Return folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
+    """Return the folder and the name of a new data set of a suite or class.
+
+    ``out`` is the folder, and the name follows from its path. If ``out`` is None, the name is ``default_name``, and the
+    folder is the one of this name in the data folder.
+    """
     root = data_folder()
     usual = default_name(subject, kind)
     if out is None:
@@ -71,9 +75,9 @@ def check_name(name: str) -> None:
 
 
 def check_room(folder: Path, needed: int, subject: str) -> None:
-    """Raise BidexError if the disk of a folder, which need not exist, has too few bytes free.
+    """Raise BidexError if the disk of a folder has too few bytes free; the folder need not exist.
 
-    ``subject`` is what takes the ``needed`` bytes, for the message.
+    ``needed`` is the number of bytes that will be written. ``subject`` says in the message what needs them.
     """
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
@@ -83,9 +87,9 @@ def check_room(folder: Path, needed: int, subject: str) -> None:
 
 
 class DatasetWriter:
-    """Writes episodes of one process into the parts of a data set.
+    """Writes the episodes of one process into parts of a data set.
 
-    ``folder`` is the data set's folder; the data set is opened by the folder's name within the data folder. Each
+    The argument ``folder`` is the data set's folder, and the attribute ``folder`` is its subfolder ``data``. Each
     ``process`` has its own parts. A new writer keeps the first ``keep`` parts of its process and deletes later ones.
     ``parts`` is the number of committed parts. ``left_out`` counts, by reason, the transitions and episodes that were
     not stored since the last commit; the collector adds to these counts.
@@ -133,10 +137,10 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
-    """Lock a folder against other processes while the block records into it.
+    """Lock a folder against other processes while the ``with`` block records into it.
 
-    The folder is created before the block begins, and removed again if it stays empty. Arguments and errors are those
-    of ``has_begun``; BidexError is also raised if another process records there.
+    The folder is created first. If it is empty after the block, it is removed again. Arguments and errors are those of
+    ``has_begun``; BidexError is also raised if another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]
@@ -237,9 +241,10 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: J
 
 
 def adopt(inner: Path, folder: Path, name: str) -> None:
-    """Publish a folder ``data`` as another data set, by links, or by copies if the file system cannot link.
+    """Publish the data in ``inner``, which a training run has recorded, as a data set ``name`` in ``folder``.
 
-    Raises the same errors as ``claimed``.
+    The files become hard links, or copies if the file system cannot link. Raises BidexError if ``inner`` is not such a
+    recording, and the same errors as ``claimed``.
     """
     check_name(name)
     with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
