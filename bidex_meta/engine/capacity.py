@@ -11,7 +11,7 @@ from bidex_meta.utils.validation import Whole
 @checked_arguments
 @dataclass(frozen=True)
 class Capacity:
-    """Sizes of the buffers per world, or the peak use of each buffer."""
+    """Sizes per world of mujoco_warp's buffers for contacts and constraints; also describes their measured peak use."""
 
     contacts: (
         Whole  # candidate pairs of the broadphase, and contacts; all worlds share one pool, of this number per world
@@ -21,10 +21,10 @@ class Capacity:
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:
-    """Return the buffer sizes for worlds of several kinds: 1.5 times the largest size that any kind needs.
+    """Return buffer sizes that suffice for all given models: 1.5 times the largest peak use in ``seen``.
 
-    The margin is needed because a trained policy holds objects that random actions only touch. The buffers take little
-    memory: 0.10 to 0.18 MB per world in all.
+    ``seen`` holds the peak use of each model, measured with random actions. The margin is needed because a trained
+    policy holds objects that random actions only touch. All buffers together take 0.10 to 0.18 MB per world.
     """
     contacts, convex, rows = (1.5 * max(each) for each in zip(*map(astuple, seen), strict=True))
     return Capacity(16 * math.ceil(contacts / 16), max(2, math.ceil(convex)), 16 * math.ceil(rows / 16))

@@ -15,11 +15,13 @@ def choose_engine(
     device: str | torch.device, engine: str = "auto", threads: int | None = None, deterministic: bool = False,
     switches: str = ""
 ) -> tuple[torch.device, EngineMaker]:  # fmt: skip
-    """Return the device and its engine maker; ``threads`` is the number of C MuJoCo's threads, by default one per CPU.
+    """Return the torch device, and a function that builds a physics engine on this device.
 
-    ``deterministic`` makes mujoco_warp repeat bit for bit on a GPU, as C MuJoCo always does. ``engine`` "auto" selects
-    C MuJoCo on the CPU and mujoco_warp on a GPU. ``Switches.of`` explains ``switches``. Raises BidexError for an
-    unknown engine or switch, a missing device, C MuJoCo on a GPU, or an impossible number of threads.
+    ``engine`` is "c" (C MuJoCo), "warp" (mujoco_warp) or "auto", which selects C MuJoCo on the CPU and mujoco_warp on
+    a GPU. ``threads`` is the number of threads of C MuJoCo, by default one per CPU. ``deterministic`` makes results of
+    mujoco_warp on a GPU reproducible bit for bit; results of C MuJoCo always are. ``switches`` names experimental
+    changes of the physics, see ``Switches``. Raises BidexError for an unknown engine or switch, a missing device, C
+    MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, 1024)
@@ -52,7 +54,10 @@ def known_device(device: str | torch.device) -> torch.device:
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return the device with this name, with ``auto`` resolved; raise BidexError if this machine has no such device."""
+    """Return the device with this name; ``"auto"`` selects a GPU if there is one, otherwise the CPU.
+
+    Raises BidexError if this machine has no such device.
+    """
     if isinstance(device, str) and device == "auto":
         if torch.cuda.is_available():
             device = "cuda"

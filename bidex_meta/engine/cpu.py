@@ -1,4 +1,4 @@
-"""C MuJoCo on all cores of the machine: ``mujoco.batch``."""
+"""Physics engine that runs C MuJoCo on all cores of the machine, by means of ``mujoco.batch``."""
 # ruff: noqa: D102 (``Engine`` says what the methods do)
 
 import ctypes
@@ -25,17 +25,17 @@ _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", 
 
 
 class CpuEngine(Engine):
-    """Simulations of models of equal structure, in double precision. See ``Engine`` for the tensors of the state.
+    """A batch of C MuJoCo simulations of models with equal structure, in double precision.
 
-    After each step MuJoCo's position and velocity stages refresh the sensors. This costs about a tenth of the speed,
-    but measured positions and velocities are then those of the new state, and a persistent batch need not repeat these
-    stages in its next step. Without ``refresh`` they are left out, as in ``mj_step``: derived values are then from
-    before the last substep.
+    ``Engine`` describes the tensors of the state. After each step, MuJoCo's position and velocity stages refresh the
+    sensors. This costs about a tenth of the speed, but measured positions and velocities are then those of the new
+    state, and a persistent batch need not repeat these stages in its next step. If ``refresh`` is False, the stages
+    are left out, as in ``mj_step``: derived values are then from before the last substep.
 
-    ``unstable`` reports a row with a number out of bounds. The row is put at rest at the model's reference pose: before
-    a step by ``_quarantine``, and within a step by MuJoCo's autoreset. Otherwise all geoms of a row with NaN would
-    touch, and solving for their contacts would take up to thousands of times as long as a normal step, while all rows
-    wait.
+    If a number of a simulation is not finite or too large, ``unstable`` reports the simulation. The simulation is put
+    at rest at the model's reference pose: before a step by ``_quarantine``, and within a step by MuJoCo's autoreset.
+    Without this measure, NaN would make all geoms of the simulation touch. Solving for their contacts would take up to
+    thousands of times as long as a normal step, and all other simulations would wait.
     """
 
     device = torch.device("cpu")
@@ -110,9 +110,9 @@ class CpuEngine(Engine):
             self._failed[torch.as_tensor(error.ids)] = True
 
     def _quarantine(self) -> None:
-        """Put rows into a safe state if one of their numbers is out of bounds.
+        """Reset each simulation whose state has a non-finite or too large number, or a quaternion that is no rotation.
 
-        The world may have written such a number, or the last step may have left it.
+        The world may have written such a number, or the last step may have produced it.
         """
         # This avoids most operations over all rows: a row whose norm is within the smallest bound is within all bounds.
         size = torch.linalg.vector_norm(self._numbers, dim=1)
@@ -146,7 +146,11 @@ class CpuEngine(Engine):
         return self._poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Reset rows; a row whose start is out of bounds stands at the reference pose and is unstable."""
+        """Reset the simulations in ``mask`` to the positions in ``start``.
+
+        If a row of ``start`` has a number out of bounds, its simulation is reset to the model's reference pose instead,
+        and ``unstable`` reports the simulation.
+        """
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         start = start.to(self.qpos.dtype)
@@ -212,7 +216,10 @@ _WITH_THREADS: "weakref.WeakSet[CpuEngine]" = weakref.WeakSet()
 
 
 def _after_fork() -> None:
-    """Mark batches in a child process: stepping or freeing a batch would wait forever for the parent's threads."""
+    """Mark the inherited batches as unusable in a child process after a fork, and keep them from being freed.
+
+    Stepping or freeing such a batch would wait forever for threads that exist only in the parent process.
+    """
     for engine in _WITH_THREADS:
         engine._forked = True
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine._batch))

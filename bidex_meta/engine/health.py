@@ -1,4 +1,4 @@
-"""Bounds of a simulation's numbers, and checks of a saved state before it is restored."""
+"""Limits on the numbers in a simulation's state, and checks of a saved state before it is restored."""
 
 from collections.abc import Mapping
 
@@ -32,9 +32,10 @@ def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
 
 
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the saved state of either engine, shaped like ``views``, the fields of the receiving engine.
+    """Return a saved state in the shapes and dtypes of ``views``, the state fields of the engine that will restore it.
 
-    Raises BidexError for a state of another model or another number of rows, or with numbers that are not finite.
+    The state may come from either engine, C MuJoCo or mujoco_warp. Raises BidexError for a state of another model or
+    another number of simulations, or if one of its numbers is not finite.
     """
     if not isinstance(state, Mapping) or set(state) != set(views):
         if isinstance(state, Mapping):
@@ -46,9 +47,9 @@ def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tenso
 
 
 def dense(given: object, device: torch.device, dtype: torch.dtype | None = None) -> Tensor | None:
-    """Return a tensor, array or nested lists as a dense tensor on a device, detached; ``dtype`` None keeps the type.
+    """Convert a tensor, an array or nested lists to a dense, detached tensor on ``device``.
 
-    Returns None if the input is no array of real numbers.
+    If ``dtype`` is None, the type of the numbers is kept. Returns None if the input is not an array of real numbers.
     """
     try:
         # The copy is in C order, because torch does not accept arrays with negative strides.
@@ -87,7 +88,10 @@ def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
 
 
 def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Return for each row in ``rows`` (indices, (k,)) whether a number is out of bounds or not finite, bool (k,)."""
+    """Return, for each simulation in ``rows``, whether one of its numbers is not finite or too large, bool (k,).
+
+    ``rows`` (k,) are indices of simulations. ``fields`` are the tensors of the state, with one row per simulation.
+    """
     bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for name, value in fields.items():  # a comparison with NaN is false
         if name in ("qpos", "qvel", "mocap_pos", "mocap_quat"):

@@ -1,6 +1,7 @@
-"""The Warp engine's own kernels for health, starts and gravity; a thread handles a world, or one of its numbers.
+"""Warp kernels that detect and reset broken simulations, write start states, and compensate gravity.
 
-Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
+Each thread handles one simulated world or one number of a world. Warp's ``and`` evaluates both sides, so an index is
+checked in an outer ``if`` before an inner ``if`` uses it.
 """
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -24,7 +25,10 @@ Wrenches = wp.array2d[wp.spatial_vector]
 
 @wp.kernel(enable_backward=False)
 def watch(qpos: Numbers, qvel: Numbers, qacc: Numbers, limit: float, limit_of_qacc: float, failed: Flags):
-    """Mark worlds with a number that is not finite or beyond its limit (a comparison with NaN is false)."""
+    """Set ``failed`` for each world with a position, velocity or acceleration that is not finite or beyond its limit.
+
+    The conditions are negated, because a comparison with NaN is false.
+    """
     world, i = wp.tid()
     if not (wp.abs(qpos[world, i]) <= limit):
         failed[world] = True
@@ -59,7 +63,11 @@ def examine_poses(
     qpos: Numbers, quaternions: wp.array[int], mocap_pos: Points, mocap_quat: Turns, limit: float, shortest: float,
     longest: float, failed: Flags
 ):  # fmt: skip
-    """Mark worlds with a fixture out of bounds, or a quaternion (four entries of qpos each) that is no rotation."""
+    """Set ``failed`` for each world with an invalid quaternion, or with a mocap body out of bounds.
+
+    A quaternion is invalid if its length is not between ``shortest`` and ``longest``. ``quaternions`` holds the index
+    of the first of the four entries that each quaternion has in ``qpos``.
+    """
     world, i = wp.tid()
     if i < quaternions.shape[0]:
         k = quaternions[i]
@@ -88,7 +96,7 @@ def disarm(
     failed: Flags, mocap_pos0: Points, mocap_quat0: Turns, time: Times, ctrl: Numbers, qfrc_applied: Numbers,
     xfrc_applied: Wrenches, mocap_pos: Points, mocap_quat: Turns
 ):  # fmt: skip
-    """Clear controls and forces of failed worlds, and put their fixtures back."""
+    """Set time, controls and forces of failed worlds to zero, and put their mocap bodies back to the stored poses."""
     world, i = wp.tid()
     if not failed[world]:
         return
@@ -108,9 +116,10 @@ def disarm(
 def place(
     mask: Flags, start: Numbers, limit: float, qpos: Numbers, mocap_pos: Points, mocap_quat: Turns, failed: Flags
 ):
-    """Write starts into the worlds whose mask entry is true: ``qpos``, then position and quaternion of each mocap body.
+    """Write a start state into each world whose mask entry is true.
 
-    A start with a bad number is not written: its world stays at the reference pose and counts as failed.
+    A row of ``start`` holds ``qpos``, then the position and quaternion of each mocap body. A row with a number that is
+    not finite or beyond the limit is not written: its world stays at the reference pose, and ``failed`` is set.
     """
     world = wp.tid()
     if not mask[world]:
@@ -138,7 +147,10 @@ def carry(
     gravity: wp.array[wp.vec3], root: wp.array[int], mass: Numbers, share: Numbers, moved: wp.array2d[int],
     bodies: wp.array[int], xipos: Points, subtree_com: Points, cdof: Wrenches, qfrc_passive: Numbers
 ):  # fmt: skip
-    """Add the gravity compensation of the given bodies; ``share`` is each body's compensated fraction."""
+    """Add to the passive forces ``qfrc_passive`` the gravity compensation of the given bodies.
+
+    ``share`` is the fraction of its weight for which each body is compensated (MuJoCo's ``gravcomp``).
+    """
     world, dof = wp.tid()
     force = float(0.0)
     for i in range(bodies.shape[0]):
@@ -153,10 +165,13 @@ def carry(
 
 
 class Guard:
-    """Detection and quarantine of broken worlds. Nothing here waits for the device."""
+    """Finds worlds whose state has a non-finite or too large number, and resets them to the model's reference pose.
+
+    All methods only launch kernels; none waits for the device.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mjw.Data) -> None:
-        """Allocate on the current device; ``keep`` must be called before the first step."""
+        """Allocate the arrays on the current device. Call ``keep`` before the first step."""
         self.failed = wp.zeros(data.nworld, dtype=bool)
         """True for worlds that broke since their last reset, shape (num,), bool."""
         self._quaternions = wp.array(quaternion_columns(model)[::4].astype(np.int32), dtype=int)
@@ -166,14 +181,15 @@ class Guard:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.failed.device)
 
     def keep(self, data: mjw.Data) -> None:
-        """Store the fixture poses of all worlds, to which the fixtures of broken worlds return."""
+        """Store the present poses of all mocap bodies; ``examine`` restores these poses in broken worlds."""
         for kept, now in zip(self._fixtures, (data.mocap_pos, data.mocap_quat), strict=True):
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Mark and disarm worlds with a bad number, written from outside, in fields that no substep checks.
+        """Mark worlds whose time, controls, applied forces, warm start or poses are not finite or out of bounds.
 
-        This runs before each control step.
+        This runs before each control step, because callers write these fields and no substep checks them. In all marked
+        worlds, time, controls and forces are set to zero, and mocap bodies return to the poses stored by ``keep``.
         """
         applied = [d.ctrl, d.qfrc_applied, d.xfrc_applied]
         width = max(array.shape[1] for array in applied)

@@ -27,9 +27,9 @@ class Lean:
         whole: The complete model.
         early: Copy for the forward dynamics of all substeps but the last.
         last: Copy for the forward dynamics of the last substep, which gives the force sensors.
-        integration: Copy for the implicit integration of all substeps, if any.
+        integration: Copy for the implicit integration of all substeps; None if the integrator is explicit.
         refresh: Copy for positions, velocities and their sensors after the last substep.
-        solver: The solver of the fully implicit integrator, if the model uses it.
+        solver: The solver of the fully implicit integrator; None if the model uses another integrator.
     """
 
     whole: mjw.Model
@@ -40,7 +40,10 @@ class Lean:
     solver: ImplicitSolver | None
 
     def step(self, d: mjw.Data, last: bool) -> None:
-        """Run ``mjw.step``; only the last substep computes sensors, and only force sensors."""
+        """Run one substep, with the same new state as ``mjw.step`` but fewer sensors.
+
+        Only the last substep of a control step (``last``) computes sensors, and only force sensors.
+        """
         model = self.last if last else self.early
         if self.integration is None:
             mjw.step(model, d)
@@ -57,7 +60,10 @@ class Lean:
 
 
 def lean(m: mjw.Model) -> Lean:
-    """Make lean copies of a model; features that the model's arrays lack now must not be added later."""
+    """Make copies of a model that skip the kernels of features that the model does not use.
+
+    Do not add such a feature to the model's arrays later, for example friction, because the copies would ignore it.
+    """
     implicit = m.opt.integrator in _IMPLICIT and not m.opt.enableflags & mjw.EnableBit.SLEEP
     none = wp.empty(0, dtype=int, device=m.sensor_pos_adr.device)
     early = "early"
@@ -95,9 +101,10 @@ def lean(m: mjw.Model) -> Lean:
 
 
 def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
-    """Return the callback that runs after all other passive forces, which are computed with gravity switched off.
+    """Return a callback for mujoco_warp that adds the gravity compensation of the bodies that have one.
 
-    It switches gravity on again and adds the gravity compensation of the bodies that have one.
+    mujoco_warp's own gravity compensation, which loops over all bodies, is avoided by switching gravity off before the
+    passive forces are computed. The callback runs after all other passive forces and switches gravity on again.
     """
     bodies = wp.array(np.flatnonzero(m.body_gravcomp.numpy().any(axis=0)), dtype=int, device=m.body_gravcomp.device)
     constants = [m.opt.gravity, m.body_rootid, m.body_mass, m.body_gravcomp, m.body_isdofancestor, bodies]
@@ -111,7 +118,10 @@ def _carrier(m: mjw.Model) -> Callable[[mjw.Model, mjw.Data], None]:
 
 
 def _gravity_apart(m: mjw.Model) -> bool:
-    """Return whether passive forces are computed and gravity compensation is the last of them."""
+    """Return whether our callback can replace mujoco_warp's gravity compensation without changing any result.
+
+    This is so if passive forces are enabled and gravity compensation is the last force added to them.
+    """
     off = m.opt.disableflags
     none = mjw.DisableBit.SPRING | mjw.DisableBit.DAMPER
     last = not (m.has_fluid or m.flg_adhesion or _any(m.jnt_actgravcomp) or m.callback.passive)
@@ -127,7 +137,10 @@ def _any(*arrays: wp.array) -> bool:
 
 
 def _tendons_limit_only(m: mjw.Model) -> bool:
-    """Return whether tendons are sums of joint positions, with no forces but limit and equality forces."""
+    """Return whether all tendons are fixed tendons (sums of joint positions) that act only by limits and equalities.
+
+    Such tendons have no actuator, stiffness, damping, armature or friction.
+    """
     forces = (m.tendon_stiffness, m.tendon_stiffnesspoly, m.tendon_damping, m.tendon_dampingpoly)
     driven = mjw.TrnType.TENDON in m.actuator_trntype.numpy()
     return m.wrap_jnt_adr.size == m.nwrap and not driven and not _any(*forces, m.tendon_armature, m.tendon_frictionloss)

@@ -1,8 +1,8 @@
 """Solver of the implicit integrator's linear system, with one warp of threads per world (mujoco_warp has one thread).
 
-The matrix has an entry for two degrees of freedom if they are the same or if one is the ancestor of the other
-(mujoco_warp's D structure). Elimination begins with the last degree of freedom and therefore needs no further entries.
-The results equal mujoco_warp's, bit for bit.
+The matrix is sparse and has mujoco_warp's D structure: besides the diagonal, it has entries only for pairs of degrees
+of freedom of which one is an ancestor of the other. Elimination begins with the last degree of freedom and therefore
+creates no fill-in. The results equal mujoco_warp's, bit for bit.
 """
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -32,7 +32,7 @@ def _solve(
     lanes: int, rows: Indices, diagonal: Indices, columns: Indices, first_update: Indices, updates: wp.array2d[int],
     first_of_level: Indices, by_level: Indices, right: Numbers, lu: Numbers, x: Numbers
 ):  # fmt: skip
-    """Factorise ``lu``, shape (num, nD), in place and solve for ``x``, shape (num, nv)."""
+    """Factorise the matrix ``lu`` (num, nD) in place, and solve ``lu x = right`` for ``x`` (num, nv) in each world."""
     world, lane = wp.tid()
     nv = diagonal.shape[0]
     for back in range(nv):
@@ -68,10 +68,10 @@ def _solve(
 
 
 class ImplicitSolver:
-    """A replacement of ``mjw.implicit`` for a model with the fully implicit integrator."""
+    """Replacement for ``mjw.implicit`` that integrates a model with the fully implicit integrator."""
 
     def __init__(self, m: mjw.Model) -> None:
-        """List the entries that each elimination updates; arrays are on the model's device."""
+        """Precompute, on the model's device, the matrix entries that the elimination of each row updates."""
         starts, diagonal, columns = (a.numpy().astype(np.int32) for a in (m.D_rowadr, m.D_diag, m.D_colind))
         rows = np.append(starts, len(columns)).astype(np.int32)
         place: dict[tuple[int, int], int] = {}

@@ -13,10 +13,11 @@ _LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
 
 
 def model_identity(model: mujoco.MjModel) -> str:
-    """Return 12 hexadecimal digits: a digest of solver options and numbers of bodies, joints, geoms and actuators.
+    """Return a digest (12 hexadecimal digits) of a model's solver options and physical parameters.
 
-    Names, appearance and MuJoCo's version do not matter. Numbers are rounded to six digits, so that a processor that
-    rounds the compiler's sums differently gives the same digits.
+    The digest covers bodies, joints, geoms, sites, actuators, equalities, tendons, contact pairs and sensors. Names,
+    appearance and MuJoCo's version do not matter. Numbers are rounded to six digits, because MuJoCo's compiler may
+    round slightly differently on different processors.
     """
     digest = hashlib.sha256()
     numbers = {name: value for name, value in _members(model).items() if name.startswith(_PARTS)}
@@ -75,7 +76,11 @@ def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
 
 
 def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
-    """Return whether two models differ only in numbers that may differ from row to row of one batch."""
+    """Return whether two models can be simulated in one batch.
+
+    They can if they differ only in fields that a batch keeps per simulation, numbers derived from these fields, names
+    or appearance.
+    """
     if _sizes(a) != _sizes(b):
         return False
     differing = differing_fields(a, b)

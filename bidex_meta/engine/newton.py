@@ -1,10 +1,14 @@
-"""Newton's method of mujoco_warp in seven kernels per iteration, which updates the Hessian of elliptic cones too.
+"""Variant of mujoco_warp's Newton solver that updates the Hessian incrementally for elliptic friction cones too.
 
-mujoco_warp updates the Hessian of pyramids: it adds and removes the rows that enter or leave the quadratic zone, and
-skips gradient, Hessian and factorisation of worlds in which nothing changed. For elliptic cones it rebuilds everything
-in every iteration, because the Hessian of a contact in the cone zone always changes. Here the Hessian without these
-contacts is kept and updated as for pyramids. The contacts in the cone zone are added to a copy, which is factorised in
-place. A world without such contacts is treated like a world of pyramids. Results agree within the solver's tolerance.
+For pyramidal cones, mujoco_warp updates the Hessian between iterations: it adds the constraint rows that enter the
+quadratic zone and removes those that leave it. It skips gradient, Hessian and factorisation of worlds in which nothing
+changed. For elliptic cones mujoco_warp rebuilds everything in every iteration, because the Hessian of a contact in the
+cone zone always changes.
+
+This module keeps a base Hessian without the contacts in the cone zone, and updates it as mujoco_warp does for pyramids.
+The contacts in the cone zone are added to a copy, which is factorised in place. A world without such contacts is
+treated like a world with pyramidal cones. An iteration takes seven kernels. Results agree with mujoco_warp's within the
+solver's tolerance.
 """
 # ruff: noqa: RUF046, UP018  (Warp makes constants of plain literals)
 # pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
@@ -41,13 +45,19 @@ Matrices = wp.array3d[float]
 
 
 def fits(m: mjw.Model) -> bool:
-    """Return whether a model's solver, Jacobian and size are those for which this method is made."""
+    """Return whether this module can solve a model: Newton solver, sparse Jacobian, and 33 to 96 degrees of freedom.
+
+    The number of degrees of freedom must also be smaller than its padded value ``nv_pad``.
+    """
     return m.opt.solver == mjw.SolverType.NEWTON and m.is_sparse and _LEAST < m.nv <= _MOST and m.nv < m.nv_pad
 
 
 @contextmanager
 def incremental_newton() -> Iterator[None]:
-    """Replace mujoco_warp's iteration while kernels are launched or recorded for a model that ``fits``."""
+    """Make mujoco_warp use this module's solver iteration within the ``with`` block.
+
+    Launch or record kernels in the block only for models for which ``fits`` returns True.
+    """
     ours = {
         "_use_incremental": lambda m: True,
         "_solver_iteration": _solver_iteration,
@@ -68,13 +78,13 @@ _update_gradient = solver._update_gradient
 
 
 def _first_gradient(m: mjw.Model, d: mjw.Data, ctx: Any, compact: bool = False) -> None:
-    """Compute the gradient and the Hessian without contacts in the cone zone, then the first direction."""
+    """Compute the gradient, the base Hessian (without contacts in the cone zone) and the first search direction."""
     # mujoco_warp's kernel for pyramids leaves out rows in the cone zone.
     _update_gradient(replace(m, opt=replace(m.opt, cone=mjw.ConeType.PYRAMIDAL)), d, ctx, compact)
 
 
 def _first_direction(m: mjw.Model, d: mjw.Data, ctx: Any) -> None:
-    """Add the contacts in the cone zone, factorise the Hessian and compute the direction of the first step."""
+    """Add the contacts in the cone zone to the Hessian, factorise it, and compute the first search direction."""
     ctx.cones = wp.empty(d.nworld, dtype=int)
     outputs = [ctx.hfactor, ctx.quad_changed_count, ctx.state_changed_count, ctx.cones]
     _per_world(_begin, d, [ctx.done, *_contacts(m, d, ctx), ctx.h], outputs)
@@ -83,7 +93,7 @@ def _first_direction(m: mjw.Model, d: mjw.Data, ctx: Any) -> None:
 
 
 def _solver_iteration(m: mjw.Model, d: mjw.Data, ctx: Any, nsolving: wp.array, compact: bool = False) -> None:
-    """Take a step in all worlds that have not converged, and compute the direction of the next one."""
+    """Take a Newton step in all worlds that have not converged, and compute the direction of the next step."""
     solver._linesearch(m, d, ctx)
     efc = d.efc
     contact = d.contact
@@ -105,14 +115,14 @@ def _solver_iteration(m: mjw.Model, d: mjw.Data, ctx: Any, nsolving: wp.array, c
 
 
 def _contacts(m: mjw.Model, d: mjw.Data, ctx: Any) -> list[wp.array]:
-    """Return the arrays that the Hessian is made of."""
+    """Return the contact and constraint arrays from which the kernels compute the Hessian, in the kernels' order."""
     efc = d.efc
     blocks = [efc.jtdaj_adr, efc.jtdaj_nrow, efc.jtdaj_nblock, efc.J_rownnz, efc.J_rowadr, efc.J_colind, efc.J]
     return [m.opt.impratio_invsqrt, d.contact.friction, d.contact.dim, efc.id, *blocks, efc.D, efc.state, ctx.Jaref]
 
 
 def _per_world(kernel: wp.Kernel, d: mjw.Data, inputs: list, outputs: list) -> None:
-    """Launch a kernel whose threads share a world."""
+    """Launch a kernel with one block of threads per world (one thread per world on the CPU)."""
     device = d.qpos.device
     lanes = _LANES if device.is_cuda else 1
     wp.launch(kernel, dim=(d.nworld, lanes), inputs=[lanes, *inputs], outputs=outputs, block_dim=lanes, device=device)
@@ -145,7 +155,10 @@ def _with_cones(
     columns: Columns, jacobian: Matrices, weight: Numbers, zone: Indices, residual: Numbers, base: Matrices,
     hessian: Matrices
 ) -> int:  # fmt: skip
-    """Write the upper triangle of ``base`` plus the contacts in the cone zone; return the number of these contacts."""
+    """Write the upper triangle of a world's Hessian: ``base`` plus the terms of the contacts in the cone zone.
+
+    Returns the number of contacts in the cone zone.
+    """
     n = base.shape[1]
     for i in range(n):
         for j in range(i + lane, n, lanes):
@@ -206,7 +219,10 @@ def _begin(
     jacobian: Matrices, weight: Numbers, zone: Indices, residual: Numbers, base: Matrices, hessian: Matrices,
     rows_changed: Counts, changed: Counts, cones: Counts
 ):  # fmt: skip
-    """Complete the first Hessian of all worlds, and start the count of changes."""
+    """Add the contacts in the cone zone to the first Hessian of each world, and initialise the counters of changes.
+
+    The counter of changed states starts at the number of these contacts, because their Hessian always changes.
+    """
     world, lane = wp.tid()
     if done[world]:
         return
@@ -297,7 +313,10 @@ def _finish(
     improvement: Scalars, alpha: Scalars, cones: Counts, steps: Counts, overflow: Counts, solving: Counts, done: Flags,
     same_direction: Flags, rows_changed: Counts, changed: Counts
 ):  # fmt: skip
-    """Mark worlds that have converged or have no step left; in the others restart the count of changes."""
+    """Mark worlds that have converged or reached the iteration limit as done.
+
+    In all other worlds, the counters of changes are reset for the next iteration.
+    """
     world = wp.tid()
     if done[world]:
         return

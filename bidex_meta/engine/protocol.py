@@ -20,17 +20,22 @@ class Renderer(Protocol):
     """Draws many environments of one model at once."""
 
     def draw(self, placement: Tensor) -> Tensor:
-        """Return pictures (num, edge, edge, 3), uint8, of placements (num, nq + 7 nmocap); see ``Engine.placement``."""
+        """Return one picture of each environment, shape (num, edge, edge, 3), uint8.
+
+        A row of ``placement`` (num, nq + 7 nmocap) holds the positions of one environment: ``qpos``, then the position
+        and quaternion of each mocap body.
+        """
         ...
 
 
 class Engine(Protocol):
-    """A batch of simulations of equal structure.
+    """A batch of simulations whose models have the same structure.
 
-    The tensors of the state are views that stay the same from step to step; the world writes ``qpos``, ``qvel``,
-    ``ctrl`` and ``xfrc_applied`` in place.
-    A broken row costs no more time than other rows, whatever the world writes: each step first looks for broken rows
-    (``health.py``). A broken row continues from the model's reference pose until its reset.
+    The tensors of the state have one row per simulation. They are views that stay the same from step to step; the
+    world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
+
+    Each step first looks for simulations with non-finite or too large numbers (``health.py``). Such a simulation
+    continues from the model's reference pose until its reset, so it takes no more time than the others.
     """
 
     num: int
@@ -55,15 +60,18 @@ class Engine(Protocol):
         """
 
     def placement(self) -> Tensor:
-        """Return a copy of every simulation's present placement, as ``reset`` takes it. Shape (num, nq + 7 nmocap)."""
+        """Return a copy of all present positions, (num, nq + 7 nmocap), in the form that ``reset`` accepts.
+
+        Each row holds ``qpos``, then the position and quaternion (w, x, y, z) of each mocap body.
+        """
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """Return positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of bodies, world frame.
+        """Return the positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of all bodies.
 
-        Both are views of the state that the sensors describe; each step overwrites them.
+        Both are in the world frame and from the same moment as the sensors. They are views, which each step overwrites.
         """
         ...
 
@@ -76,12 +84,12 @@ class Engine(Protocol):
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Restart the simulations of a mask (num,), bool.
+        """Restart the simulations whose entry in ``mask`` (num,), bool, is true, at the positions in ``start``.
 
-        ``start``: ``qpos``, then position and quaternion (w, x, y, z) of each fixture whose place differs from
-        task to task. It has one row for each true entry of the mask, (k, nq + 7 nmocap). A ``masked`` engine must not
-        count true entries; for such an engine ``start`` has a row for every simulation, and rows outside the mask are
-        ignored.
+        A row of ``start`` holds ``qpos``, then the position and quaternion (w, x, y, z) of each mocap body (a fixture
+        whose pose differs from task to task). ``start`` has one row for each true entry of the mask, (k, nq + 7
+        nmocap). If the engine's attribute ``masked`` is True, ``start`` has one row for every simulation instead, and
+        rows outside the mask are ignored: counting true entries would make the host wait for the device.
         """
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -92,10 +100,10 @@ class Engine(Protocol):
         """Restore a ``state_dict``; raise BidexError if its model or number of rows differs, or if it is not finite."""
 
     def expand(self, names: Iterable[str]) -> dict[str, Tensor]:
-        """Give each simulation its own copy of some model fields: returns writable views (num, n, k), by name.
+        """Give each simulation its own copy of the named model fields, and return writable views (num, n, k) by name.
 
-        The views hold the old values; fields that the engine does not have are left out. The caller updates
-        derived fields.
+        The views hold the old values at first. Fields that the engine does not have are left out. After a change, the
+        caller must also update the fields that MuJoCo derives from the changed ones.
         """
         ...
 
@@ -108,8 +116,8 @@ class Engine(Protocol):
     def renderer(self, model: mujoco.MjModel, num: int, edge: int, alpha: float) -> Renderer:
         """Return a renderer of ``num`` environments of a model, for square pictures of ``edge`` pixels.
 
-        The model has the camera ``CAMERA``. Geoms of ``GHOST_GROUP`` have the opacity ``alpha``. Raises
-        BidexError unless the engine ``has_renderer``.
+        The model must have a camera named ``CAMERA``. Geoms in the group ``GHOST_GROUP`` are drawn with the opacity
+        ``alpha``. Raises BidexError unless the engine's attribute ``has_renderer`` is True.
         """
         raise BidexError(f"Expected an engine that draws (mujoco_warp), got {type(self).__name__}.")
 

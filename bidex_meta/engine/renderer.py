@@ -22,7 +22,10 @@ class BatchRenderer(Renderer):
     def __init__(
         self, model: mujoco.MjModel, num: int, edge: int, alpha: float, on_device: Callable[[], AbstractContextManager]
     ) -> None:
-        """Put the model on the device, for square pictures of ``edge`` pixels; ``alpha``: opacity of ghosts."""
+        """Put the model on the device, for square pictures of ``edge`` x ``edge`` pixels.
+
+        ``alpha`` is the opacity of the geoms in ``GHOST_GROUP``.
+        """
         self._on_device = on_device
         self._alpha = alpha
         self._num = num

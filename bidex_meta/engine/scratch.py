@@ -7,14 +7,14 @@ import warp as wp
 
 
 class Scratch:
-    """A memory allocator for Warp that reuses returned memory by size.
+    """A memory allocator for Warp that keeps freed memory and reuses it for allocations of the same size.
 
-    In a recording each allocation of Warp's own becomes two nodes of the graph, about 150 pairs per control step. Here
-    an allocation adds no node if enough memory of its size was allocated before the recording.
+    While a CUDA graph is recorded, each allocation by Warp's own allocator adds two nodes to the graph. A control step
+    has about 150 such allocations. This allocator adds no node if it already holds enough free memory of that size.
 
-    Kernels that were launched or recorded earlier may still read returned memory. So users must launch all work
-    on one stream, on which the next user of the memory runs later, and must keep this object as long as the graphs.
-    Arrays that live on are safe: they keep their memory and this object until Python frees them.
+    Kernels that were launched or recorded earlier may still read freed memory. So callers must launch all work on one
+    stream, where the next kernel that uses the memory runs later, and must keep this object as long as the graphs.
+    Arrays that are still referenced in Python are safe: they keep their memory and this object alive.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -39,7 +39,7 @@ class Scratch:
         return memory.data_ptr()
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Take memory back, at any time, also during a recording."""
+        """Take back the memory of an array and keep it for reuse; this is also possible while a graph is recorded."""
         if ptr in self._memory:
             self._free[size_in_bytes].append(ptr)
         else:

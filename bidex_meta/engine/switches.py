@@ -1,4 +1,7 @@
-"""Switches of the physics that are on trial: all are off unless a text such as ``pyramids,impratio=3`` names them."""
+"""Experimental changes of the physics ("switches"), each off by default.
+
+A text such as ``pyramids,impratio=3`` switches them on.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -15,12 +18,15 @@ from bidex_meta.utils.validation import Positive
 @checked_arguments
 @dataclass(frozen=True)
 class Switches:
-    """The switches of an engine.
+    """Experimental changes of the physics, each off by default.
 
     Attributes:
-        pyramids: Replace elliptic friction cones by pyramids, on both engines, with rules of version 2 only.
-        impratio: Replace the classes' stiffness of friction relative to the normal force (``Solver.impratio``).
-        incremental: Let mujoco_warp update the Hessian of elliptic cones between Newton iterations (``newton.py``).
+        pyramids: Replace elliptic friction cones by pyramidal ones, on both engines. Tasks of version 1 do not allow
+            this.
+        impratio: MuJoCo's ``impratio`` for all task classes, in place of the value that each class sets. It is the
+            stiffness of friction relative to that of the normal force. Tasks of version 1 do not allow this.
+        incremental: Let mujoco_warp update the Hessian of elliptic cones between Newton iterations instead of
+            rebuilding it (``newton.py``).
     """
 
     pyramids: bool = False
@@ -29,7 +35,10 @@ class Switches:
 
     @staticmethod
     def of(text: str) -> "Switches":
-        """Return the switches in a text, separated by commas; raise BidexError for unknown switches or bad numbers."""
+        """Parse a list of switches separated by commas, such as ``pyramids,impratio=3``.
+
+        Raises BidexError for unknown switches or bad numbers.
+        """
         if not isinstance(text, str):
             raise BidexError(f"switches: expected text such as 'pyramids,impratio=3', got {shortened(text)}.")
         kinds = {field.name: field.default for field in fields(Switches)}
@@ -49,7 +58,7 @@ class Switches:
         return self.pyramids or self.impratio is not None
 
     def models(self, models: Sequence[mujoco.MjModel]) -> list[mujoco.MjModel]:
-        """Return the models, or changed copies of them."""
+        """Return copies of the models with the changed friction options, or the models if no switch changes them."""
         if not self.changes_contacts:
             return list(models)
         changed = [copy.copy(model) for model in models]
@@ -61,7 +70,11 @@ class Switches:
         return changed
 
     def room(self, model: mujoco.MjModel, room: Capacity) -> Capacity:
-        """Return the buffer sizes for a model's contacts: a pyramid has up to 2 (n - 1) rows instead of a cone's n."""
+        """Return buffer sizes that suffice for a model after the switches were applied.
+
+        ``room`` holds the sizes without switches. If pyramids replace elliptic cones, more constraint rows are needed:
+        a contact of dimension n has up to 2 (n - 1) rows with a pyramid, and n with an elliptic cone.
+        """
         if not self.pyramids or model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
             return room
         most = max(3, int(model.geom_condim.max(initial=0)), int(model.pair_dim.max(initial=0)))

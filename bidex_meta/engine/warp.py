@@ -1,8 +1,8 @@
-"""MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
+"""Physics engine for accelerators: mujoco_warp, with all substeps of a control step in one captured graph.
 
-It differs from C MuJoCo on purpose in four ways: single precision, sparse constraint Jacobians (mujoco_warp refuses
-dense ones above 60 degrees of freedom), a solver tolerance of 1e-6 (its minimum), and contact buffers of fixed size.
-Tests use the Warp CPU device.
+This engine differs from C MuJoCo on purpose in four ways: single precision, sparse constraint Jacobians (mujoco_warp
+refuses dense ones above 60 degrees of freedom), a solver tolerance of 1e-6 (its minimum), and contact buffers of fixed
+size. Tests use the Warp CPU device.
 """
 # ruff: noqa: D102 (``Engine`` says what the methods do)
 
@@ -44,14 +44,16 @@ _SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SEN
 
 
 class WarpEngine(Engine):
-    """Simulations of models of equal structure, in single precision. See ``Engine`` for the tensors of the state.
+    """A batch of mujoco_warp simulations of models with equal structure, in single precision.
 
-    ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after any other change of the model. On CUDA graphs run on the engine's own stream,
-    between the work that torch's current stream got before the call and the work it gets afterwards.
+    ``Engine`` describes the tensors of the state. ``step`` and ``reset`` replay recorded graphs and never wait for the
+    device. Graphs hold pointers, so write into arrays in place, and call ``recapture`` after any other change of the
+    model. On a CUDA device, graphs run on the engine's own stream. They start after all work that was queued on torch's
+    current stream before the call, and later work on that stream waits for them.
 
-    ``unstable`` reports a world with a bad number. The world stands at the model's reference pose until its reset.
-    Otherwise its NaNs would pass every broadphase test and fill the buffers that other worlds' contacts need.
+    If a number of a world is not finite or too large, ``unstable`` reports the world, and the world is kept at the
+    model's reference pose until its reset. Without this measure, its NaNs would pass every broadphase test and fill
+    the buffers that other worlds' contacts need.
     """
 
     masked = True
@@ -61,10 +63,10 @@ class WarpEngine(Engine):
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], capacity: Capacity,
         device: str | torch.device = "cpu", deterministic: bool = False, incremental: bool = False
     ) -> None:  # fmt: skip
-        """Put the distinct models on the device and compile the kernels; ``rows``: each simulation's model.
+        """Put the models on the device and compile the kernels; ``rows`` gives the index of each simulation's model.
 
-        ``deterministic`` orders contacts, constraints and sums, so that simulations on a GPU repeat bit for bit.
-        ``incremental`` updates the Hessian of elliptic cones between iterations (``newton.py``).
+        ``deterministic`` orders contacts, constraints and sums, so that simulations on a GPU are reproducible bit for
+        bit. ``incremental`` lets the solver update the Hessian of elliptic cones between iterations (``newton.py``).
         """
         if deterministic and incremental:
             raise BidexError("incremental: expected it without deterministic, got both. Leave one of them out.")
@@ -148,7 +150,11 @@ class WarpEngine(Engine):
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
-        """Return which worlds broke: all worlds if the shared contact pool is full, as any may have lost contacts."""
+        """Return which worlds broke since their reset, bool (num,).
+
+        If the contact buffer, which all worlds share, is full, all worlds count as broken, because any of them may have
+        lost contacts.
+        """
         lost = (self._overflow & _LOST) != 0
         return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
 
@@ -189,7 +195,7 @@ class WarpEngine(Engine):
         return found
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore a state, also of the C engine, and refresh position and velocity sensors."""
+        """Restore a state that this engine or ``CpuEngine`` saved, and refresh position and velocity sensors."""
         state = checked_state(state, self._state)
         self._mask_view.fill_(True)
         self._play("reset", self._begin)
@@ -221,7 +227,11 @@ class WarpEngine(Engine):
         return 0.0
 
     def demand(self) -> tuple[int, int]:
-        """Return how many candidate pairs and contacts of the convex collider all worlds have at present."""
+        """Return two counts over all worlds in their present state, which help to choose buffer sizes.
+
+        The first counts the pairs of geoms that the broadphase passes on. The second counts the contacts of ellipsoids
+        and cylinders that the convex collider computes.
+        """
         self._play("position", lambda: mjw.fwd_position(self._m, self._d, factorize=False))
         d = self._d
         candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
@@ -260,7 +270,10 @@ class WarpEngine(Engine):
         self._refresh()
 
     def _play(self, name: str, work: Callable[[], None]) -> None:
-        """Run recorded work on the engine's stream, between torch's earlier and later work."""
+        """Run ``work`` as a recorded graph on the engine's stream, after torch's earlier and before its later work.
+
+        The graph is recorded at the first call and stored under ``name``.
+        """
         with self._on_device():
             if name not in self._graphs:
                 self._graphs[name] = self._record(work)
@@ -330,9 +343,10 @@ def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _is_slow(model: mujoco.MjModel) -> bool:
-    """Return whether a group of this model is slow: it has many substeps, or kernels with one thread per matrix.
+    """Return whether simulations of a model are slow, so that their engine's stream should have a high priority.
 
-    Launching these groups first cuts a step of MT20's 8,192 rows from 42.3 to 38.6 ms.
+    They are slow with many substeps, or with kernels that have only one thread per matrix (implicit integrator).
+    When slow simulations get the GPU first, a step of MT20 with 8,192 environments takes 38.6 instead of 42.3 ms.
     """
     return model.opt.timestep < 1.0 / 200.0 or model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT
 

@@ -19,7 +19,7 @@ _MEASURES = 2  # success and return
 
 @dataclass(frozen=True)
 class Agreement:
-    """One class in both evaluations."""
+    """Comparison of one class's results in a recorded evaluation and in its repetition."""
 
     name: str  # name of the class; for a meta-test, with split and shot
     outcome: str
@@ -29,7 +29,7 @@ class Agreement:
     again: ClassSummary
 
     def to_json(self) -> Json:
-        """Return the outcome and both results, ready for JSON."""
+        """Return the outcome of the comparison, and success and return of both evaluations, ready for JSON."""
         return {
             "outcome": self.outcome,
             "success": [self.recorded.success, self.again.success],
@@ -38,13 +38,13 @@ class Agreement:
 
 
 def agreements(recorded: Mapping[str, ClassSummary], again: Mapping[str, ClassSummary]) -> list[Agreement]:
-    """Compare two evaluations of one policy on the same tasks and starts, by class.
+    """Compare, for each class, two evaluations of one policy on the same tasks and start states.
 
-    At worst, the two evaluations are independent samples. Their means may therefore differ by the root of the sum of
-    the squares of both half intervals. This limit is widened (Bonferroni) so that in only one of twenty correct
-    repetitions some measure of some class exceeds it. In simulations of twenty classes, the rate was one in eighteen
-    with 200 episodes per class, one in fourteen with 60, and one in seven with 20. Raises BidexError if the classes
-    differ.
+    At worst, the two evaluations are independent samples. Their means may therefore differ by sqrt(a² + b²), where a
+    and b are the half-widths of their 95 % intervals. This limit is widened (Bonferroni) so that nominally only one in
+    twenty correct repetitions exceeds it in any measure of any class. We simulated twenty classes: the rate was one in
+    eighteen with 200 episodes per class, one in fourteen with 60, and one in seven with 20. Raises BidexError if the
+    two evaluations have different classes.
     """
     if set(recorded) != set(again):
         raise BidexError(

@@ -29,7 +29,10 @@ _POINTS = 200  # number of points of a curve over several runs
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ only in the seed; single-task runs of several classes are one group."""
+    """Results of runs that differ only in the seed.
+
+    Runs that each train on a single class may together form one group: a seed then has one run per class.
+    """
 
     label: str  # the algo, and the settings that differ from other groups with the same algo
     seeds: list[int]  # in rising order; rows of the arrays below
@@ -43,7 +46,7 @@ class Group:
     paths: list[Path]  # the runs' folders, or JSON files
 
     def steps_text(self) -> str:
-        """Return the mean number of steps, with its range if seeds differ."""
+        """Return, as text, the mean number of environment steps over seeds, with the range if seeds differ."""
         low, high = self.steps_range
         if low == high:
             return f"{self.steps:,}"
@@ -51,7 +54,7 @@ class Group:
 
 
 def read_groups(runs: Sequence[Run]) -> list[Group]:
-    """Return evaluated runs by group, in the order they are named.
+    """Group evaluated runs that differ only in the seed; groups are in the order of their first runs.
 
     Raises BidexError if a run is not evaluated, two runs are the same, or a group's seeds cover different classes.
     """
@@ -77,7 +80,11 @@ def run_kind(config: AnyConfig, split: str = "train") -> Json:
 
 
 def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
-    """Return the names of data sets without the prefix of the run's own class: the rest is equal within a group."""
+    """Return the names of a run's data sets, joined by " + ", or None if there are none.
+
+    If a name begins with the class that the run trains on, this prefix is removed, so that single-class runs on data
+    sets of the same kind fall into one group.
+    """
     if config.task is None:
         own = ""
     else:
@@ -86,10 +93,11 @@ def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
 
 
 def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
-    """Return the labels and runs of groups of one kind, in the order in which they are named.
+    """Group runs with equal settings (``kinds``), and return each group's label and runs, in the order of first runs.
 
-    A label is the name of a study's arm if all runs of the group, and of no other group, come from this arm; otherwise
-    it consists of the settings that differ. Runs on different worlds form separate groups, whose labels name the
+    Runs of a study have an arm, the name of their configuration in the study. If all runs of a group, and no other
+    runs, come from one arm, the group's label is the arm. Otherwise the label lists the settings that differ between
+    groups. Runs whose worlds differ, for example in a version, form separate groups, and their labels name the
     difference.
     """
     _check_copies(runs)
@@ -113,12 +121,18 @@ def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list
 
 
 def _arms_of(runs: Sequence[Run]) -> set[str | None]:
-    """Return the arms of studies that runs come from; run folders have the arm None."""
+    """Return the set of arms (names of configurations in a study) that the runs come from.
+
+    A run folder belongs to no study, so its arm is None.
+    """
     return {run.arm if isinstance(run, StoredRun) else None for run in runs}
 
 
 def _differing_settings(kind: Json, kinds: Iterable[Json]) -> str:
-    """Return the learner's name and the settings that are not the same in all kinds with this learner."""
+    """Return a label: the learner's name, and the settings in which groups of runs with this learner differ.
+
+    ``kind`` holds the settings of the group that is labelled, ``kinds`` those of all groups.
+    """
     others = [other for other in kinds if other["algo"] == kind["algo"]]
     texts = [kind["algo"]]
     for name in sorted(set().union(*others) - {_MADE}):
@@ -137,7 +151,10 @@ def _check_copies(runs: Sequence[Run]) -> None:
 
 
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
-    """Return the content of a picture of groups, by title: label, interquartile mean and interval of each group."""
+    """Return the data of a plot that compares groups of runs, by the title of the panel.
+
+    A panel shows success or normalised score. It has a label, an interquartile mean and its interval for each group.
+    """
     pictured: dict[str, list[tuple[str, float, Interval | None]]] = {}
     for group in groups:
         for title, values, factor in (("success, IQM (%)", group.success, 100.0), ("score, IQM", group.scores, 1.0)):
@@ -153,9 +170,9 @@ def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Inter
 
 
 def success_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in success from the first group.
+    """Return the interquartile mean of a group's success minus that of the first group, with an interval over seeds.
 
-    The result is None for the first group, and for groups with other classes.
+    The result is None if ``group`` is the first group, or if the two groups have different classes.
     """
     if not _comparable(group, first):
         return None
@@ -163,9 +180,10 @@ def success_over(group: Group, first: Group) -> Estimate | None:
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Return the difference in normalised score from the first group.
+    """Return the interquartile mean of a group's normalised score minus that of the first group, with an interval.
 
-    The result is None in the same cases as in :func:`success_over`, and if either score is unknown.
+    The result is None if ``group`` is the first group, if the groups have different classes, or if either group has no
+    scores.
     """
     if not _comparable(group, first) or group.scores is None or first.scores is None:
         return None
@@ -241,7 +259,10 @@ class History:
 
 
 def read_histories(runs: Sequence[Run]) -> list[History]:
-    """Return runs, evaluated or not, by group, in the order they are named; raise BidexError if no run has metrics."""
+    """Group runs that differ only in the seed, and return the training curves of each group.
+
+    The runs need not be evaluated. Raises BidexError if no run has metrics.
+    """
     groups = _by_kind([run_kind(run.config()) for run in runs], runs)
     histories = [History(label, members, curves_of(members)) for label, members in groups]
     if not any(history.curves for history in histories):
@@ -267,10 +288,11 @@ def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
 
 
 def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """Return the mean over runs and its 95 % bootstrap interval from steps and values (points,); None without points.
+    """Return the mean curve over runs, with its 95 % bootstrap interval; None if no run has points.
 
-    Several runs are interpolated to 200 steps. The steps lie between the latest first point and the earliest last
-    point of the runs, so that every run has a value there. A run without points is left out.
+    ``series`` holds the steps (points,) and values (points,) of each run. The curves of several runs are interpolated
+    to 200 steps between the latest first point and the earliest last point, so that every run has a value there. A run
+    without points is left out. With a single run, its own points are returned without an interval.
     """
     known = [(steps, values) for steps, values in series if len(steps)]
     if not known:
@@ -286,6 +308,9 @@ def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
 
 
 def series(rows: list[Json], tag: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps and values (points,) of a tag from the rows of a run's metrics that have the tag."""
+    """Return the steps (points,) and values (points,) of one metric, ``tag``, from the rows of a run's metrics.
+
+    Rows without a value for this tag are left out.
+    """
     rows = [row for row in rows if row.get(tag) is not None]
     return np.array([row["step"] for row in rows], float), np.array([row[tag] for row in rows], float)

@@ -28,7 +28,11 @@ from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 @dataclass(frozen=True)
 class Control:
-    """The arms of one run: the same episodes in the same order."""
+    """Results of the control experiment on one run's agent, on the same episodes in the same order.
+
+    The agent was evaluated before adaptation, after adaptation to the tasks' own data, and after adaptation to data of
+    each train task.
+    """
 
     before: Evaluation
     own: Evaluation  # adapted to data of the tasks themselves
@@ -41,12 +45,16 @@ def control(
     load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, *, protocol: Protocol = DEFAULT,
     references: Mapping[str, Reference] | None = None, say: Callable[[str], None] = lambda line: None
 ) -> Control:  # fmt: skip
-    """Play all arms with ``meta_evaluate``, and raise its errors.
+    """Run the control experiment of a meta-test, which compares adaptation to a task's own data and to other data.
 
-    ``load`` makes a new MetaLearningAgent for each arm, so that all arms draw the same numbers. Both worlds must be in
-    autoreset mode DISABLED and have the same classes (else BidexError) and the same number of environments; the pools
-    of ``train_world`` are replaced. ``say`` receives the mean returns of each arm after the arm was played, which may
-    take minutes.
+    An agent is evaluated on test tasks before adaptation, after adaptation to their own data, and after adaptation to
+    data of each train task. Each of these evaluations is called an arm and is run by ``meta_evaluate``. ``load`` makes
+    a new MetaLearningAgent for each adaptation, so that all arms draw the same random numbers. ``say`` receives the
+    mean returns of each arm when the arm is finished, which may take minutes.
+
+    Both worlds must be in autoreset mode DISABLED and have the same number of environments. The task pools of
+    ``train_world`` are replaced. Raises BidexError if the worlds have different classes, and the errors of
+    ``meta_evaluate``.
     """
     if list(test_world.task_names) != list(train_world.task_names):
         raise BidexError(
@@ -76,12 +84,15 @@ def _returns(evaluation: Evaluation) -> str:
 
 
 def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, Json]:
-    """Return the results of each arm in a class over all runs (one run per seed), and the gain from own data.
+    """Summarise the results of the control experiment in one class over several runs, one per seed.
 
-    Arms are ``before``, ``own``, ``foreign`` (the mean over the train tasks), and each train task by its name in
-    ``names``. Each arm has ``return`` and ``success``, means over runs, and ``runs``, the mean return of each run.
-    Every arm but ``own`` has ``own_minus``: for each measure, the Difference of ``own`` and this arm over runs,
-    adaptations and episodes, or None if the measure is missing.
+    The result has an entry for each arm, that is, each condition of the experiment: ``before`` adaptation, after
+    adaptation to the task's ``own`` data, and after adaptation to data of each train task, by its name in ``names``.
+    The entry ``foreign`` is the mean over the train tasks.
+
+    Each entry has ``return`` and ``success``, which are means over runs, and ``runs``, the mean return of each run.
+    Every entry except ``own`` also has ``own_minus``. For each measure, it holds the paired difference ``own`` minus
+    this arm, with an interval over runs, adaptations and episodes, or None if the measure is missing.
     """
     by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
     by_arm["foreign"] = [run.foreign for run in runs]
@@ -102,7 +113,11 @@ def _own_minus(
     runs: Sequence[Control], others: Sequence[Sequence[ClassResult]], class_name: str,
     of: Callable[[ClassResult], np.ndarray | None]
 ) -> Difference | None:  # fmt: skip
-    """Return the paired difference between adaptation to own data and the mean of the other arms."""
+    """Return the result of adaptation to the tasks' own data minus the mean of other results, paired by episode.
+
+    ``others`` holds, for each run, the results to average. ``of`` selects the measure. The difference has an interval;
+    it is None if a measure is missing.
+    """
     differences = []
     for run, of_run in zip(runs, others, strict=True):
         own = of(run.own.classes[class_name])

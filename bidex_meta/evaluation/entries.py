@@ -44,7 +44,7 @@ Classes = Annotated[dict[str, ClassRow], Meta(min_length=1)]
 
 @dataclass(frozen=True)
 class Part:
-    """The results on one kind of tasks: new tasks or the runs' own tasks."""
+    """The part of a leaderboard entry that holds results on new tasks, or on the tasks that the runs trained on."""
 
     trials: Few  # adaptations to each task, each followed by the entry's ``episodes``
     rollouts: Whole  # exploration episodes of each task in a shot; 0 for a policy that does not adapt
@@ -52,7 +52,11 @@ class Part:
     """Results after 0, 1, ... shots; for a transfer, results from scratch and then from the run."""
 
     def tables(self, episodes: int, shot: int = -1) -> list[np.ndarray]:
-        """Return success (runs, units) in each class after a shot; ``episodes`` is the number per adaptation."""
+        """Return a table of success for each class, computed from ``shots[shot]``, by default the last item.
+
+        A table has the shape (runs, units). Units are tasks, or episodes if the class has few tasks. ``episodes`` is
+        the number of evaluation episodes of a task after each adaptation.
+        """
         return [row_table(row.solved, episodes * self.trials) for row in self.shots[shot].values()]
 
 
@@ -72,7 +76,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Tuning:
-    """The submitter's statement of the search for settings."""
+    """The extent of the hyperparameter search, as stated by the submitter."""
 
     trials: Count  # settings that were tried
     seeds: Count  # seeds of each setting
@@ -100,7 +104,7 @@ class Stated:
 
 @dataclass(frozen=True, kw_only=True)
 class _Listed(ABC):
-    """The fields of every entry."""
+    """The fields that all entries of the leaderboard have."""
 
     verified: ClassVar[bool]
     """True if ``submit`` has played the episodes."""
@@ -123,16 +127,22 @@ class _Listed(ABC):
 
     @property
     def result(self) -> list[np.ndarray]:
-        """Return the success that ranks entries: a table (runs, units) per class, on new tasks, after the last shot."""
+        """Return the success by which entries are ranked: success on new tasks, from the last item of ``shots``.
+
+        The list has one table (runs, units) per class. Units are tasks, or episodes if the class has few tasks.
+        """
         return self.new.tables(self.episodes)
 
     @property
     def parts(self) -> dict[str, Part]:
-        """Return the parts by name."""
+        """Return the entry's results by name of the part: only ``new``, the results on new tasks."""
         return {"new": self.new}
 
     def summaries(self) -> dict[str, ClassSummary]:
-        """Return the success of each run, part, shot and class, for the comparison with a repetition."""
+        """Return a summary of success for each combination of run, part, shot and class.
+
+        The summaries can be compared with those of a repeated evaluation; their returns are set to 0.
+        """
         found = {}
         for where, part, shot, name, row in self._rows():
             episodes = self.episodes * part.trials
@@ -170,7 +180,7 @@ class _Listed(ABC):
             yield from (f"{where}.{fault}" for fault in self._faults_of(part, self._pools(where)))
 
     def _faults_of(self, part: Part, pools: Mapping[str, int]) -> Iterator[str]:
-        """Yield the contradictions within a part; ``pools`` has the number of tasks by class."""
+        """Yield messages about contradictions within a part; ``pools`` has the number of tasks of each class."""
         adapts = self.track in ADAPTATION
         shots = _ITEMS.get(self.track, SHOTS + 1)
         if len(part.shots) != shots:
@@ -192,7 +202,7 @@ class _Listed(ABC):
                 yield from (f"shots[{shot}].{name}.{fault}" for fault in faults)
 
     def _pools(self, where: str) -> dict[str, int]:
-        """Return the number of tasks of each class in the part ``where``."""
+        """Return the number of tasks that each class has in a part of the entry, ``where`` ("new" or "own")."""
         suite = _suite(self.suite)
         if self.track == TRANSFER:
             return held_out(suite)
@@ -207,17 +217,17 @@ class _Listed(ABC):
         return {slot: len(tasks) for slot, tasks in suite.task_names(split).items()}
 
     def _train_tasks(self) -> int | None:
-        """Return the number of train tasks per class; None if it is that of the suite."""
+        """Return the number of train tasks per class, or None for the number that the suite file gives."""
         return None
 
     @abstractmethod
     def _tasks(self, pool: int) -> range:
-        """Return the allowed numbers of evaluated tasks, if a class has ``pool`` tasks."""
+        """Return the allowed numbers of evaluated tasks, as a range, for a class that has ``pool`` tasks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _OfRuns(_Listed):
-    """An entry of runs, which `submit` has evaluated."""
+    """A leaderboard entry whose results the command `submit` measured by evaluating the policies of runs."""
 
     verified = True
     algorithm: _Name
@@ -248,7 +258,7 @@ class Entry(_OfRuns):
 
     @property
     def parts(self) -> dict[str, Part]:
-        """Return the parts by name."""
+        """Return the entry's results by name of the part: on ``new`` tasks, and on the runs' ``own`` train tasks."""
         return {"new": self.new, "own": self.own}
 
     def _tasks(self, pool: int) -> range:
@@ -270,10 +280,10 @@ class Entry(_OfRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class TransferEntry(_OfRuns):
-    """A run whose policy learned each held-out class, compared with policies that learned it from scratch.
+    """A leaderboard entry that compares learning each held-out class from a run's policy and from scratch.
 
-    The lists of ``steps`` and ``stated`` have one item, for the run. The first item of ``new.shots`` holds the results
-    of training from scratch, the second those of training that began with the run's policy.
+    The lists of ``steps`` and ``stated`` have one item, for the run. ``new.shots`` has two items: the results of
+    training from scratch, and the results of training that began with the run's policy.
     """
 
     start: _Digest
@@ -285,7 +295,7 @@ class TransferEntry(_OfRuns):
 
     @property
     def runs(self) -> int:
-        """Return the number of policies that learned each class from the run's policy."""
+        """Return the number of policies per class that were trained from the run's policy, one per seed."""
         return len(self.seeds)
 
     def _tasks(self, pool: int) -> range:
@@ -312,7 +322,11 @@ class TransferEntry(_OfRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry(_Listed):
-    """A meta-test of an agent that is not a run, in the entries' folder ``trials/``. Its results are not verified."""
+    """A leaderboard entry with the meta-test of a user's own agent, which this package did not train.
+
+    Its file is in the folder ``trials/`` of the entries. The results are those that the user submitted; nobody has
+    verified them.
+    """
 
     verified = False
     track: AdaptationTrack

@@ -60,9 +60,10 @@ def _mean(table: np.ndarray) -> Estimate:
 
 
 def faults_of_row(row: ClassRow, runs: int, tasks: range, episodes: int) -> Iterator[str]:
-    """Yield the contradictions in a class's results of ``runs`` runs with ``episodes`` episodes of each task.
+    """Yield a message for each contradiction in the results of one class.
 
-    ``tasks`` has the allowed numbers of tasks.
+    The results should hold ``runs`` runs. Each run should have played ``episodes`` episodes of each task. ``tasks`` is
+    the range of allowed numbers of tasks.
     """
     counts = {len(of_run) for of_run in row.solved}
     if len(row.solved) != runs or len(counts) != 1 or min(counts) not in tasks:

@@ -99,7 +99,10 @@ def film_tiles(
 
 
 def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, look: Look) -> np.ndarray:
-    """Return a tile of the given height with the same aspect ratio; its width is even, as films require."""
+    """Return an enlarged tile of one environment, ``height`` pixels high, with its name as label.
+
+    The picture has the same aspect ratio as in ``look``, and its width is even, as video codecs require.
+    """
     inner = height - LABEL
     width = 2 * round(inner * look.get("width", 640) / look.get("height", 480) / 2)
     picture = world.render(row, width, inner, look.get("camera"))
@@ -107,7 +110,10 @@ def _large(world: RenderedWorld, row: int, name: str, done: bool, height: int, l
 
 
 def with_clouds(world: PooledWorld) -> PooledWorld:
-    """Return a world whose pictures also show point clouds; raise BidexError unless it is a world of hands."""
+    """Wrap a world so that its pictures also show the point cloud of the environment.
+
+    Raises BidexError unless the world is a ``World``; for example, Meta-World's classes have no point clouds.
+    """
     if not isinstance(world, World):
         raise BidexError("Only bidex-meta's own scenes have point clouds, not Meta-World's. Leave --points out.")
     count = (world.points or PointsRule()).count
@@ -117,7 +123,7 @@ def with_clouds(world: PooledWorld) -> PooledWorld:
 class CloudView(PooledWorldWrapper):
     """A world whose pictures also show the environment's point cloud, from the class's camera and from the side.
 
-    The cloud has ``count`` points and shows the state of the physics, whatever observations show.
+    The cloud has ``count`` points. It shows the true state of the physics, even if observations hide a part of it.
     """
 
     def __init__(self, world: World, count: int) -> None:

@@ -25,10 +25,11 @@ MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
 
 
 def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str, np.ndarray]) -> Gains:
-    """Return ``after`` minus ``before`` of two policies that played the same tasks and starts in the same order.
+    """Return the gains of adaptation: the results ``after`` adaptation minus the results ``before``.
 
-    ``adaptations`` holds, per class, the number of each episode's adaptation, ``(episodes,)``; all adaptations have the
-    same number of episodes.
+    Both policies must have played the same tasks and start states in the same order. ``adaptations`` holds, for each
+    class, the number of the adaptation that each episode belongs to, ``(episodes,)``. All adaptations have the same
+    number of episodes.
     """
     classes: dict[str, dict[str, Difference | None]] = {name: {} for name in after.classes}
     aggregate: dict[str, Difference | None] = {}

@@ -1,4 +1,4 @@
-"""The leaderboard: reading and sealing the files of entries, and the statistics that rank entries.
+"""The leaderboard: files of entries, digests that protect them from changes, and the statistics that rank entries.
 
 Interquartile mean, performance profile and probability of improvement are those of Agarwal et al. 2021 (arXiv
 2108.13264). Intervals resample runs and the tasks of each class, so that a single run also has an interval.
@@ -37,9 +37,9 @@ def entry_name(suite: str, name: str) -> str:
 
 
 def sealed(content: Json, kind: type[AnyEntry], where: str) -> Json:
-    """Return the content of a new entry with the digest of its evaluation.
+    """Check the content of a new entry, and return it with the digest that shows later changes.
 
-    Raises BidexError, which begins with ``where``, if the leaderboard does not accept the entry.
+    Raises BidexError if the leaderboard does not accept the entry; the message begins with ``where``.
     """
     content = {**content, "receipt": {**content["receipt"], "evaluation": "0" * 32}}
     entry = parse(content, kind, where, exact=True)
@@ -68,7 +68,7 @@ def read_entry(path: Path) -> AnyEntry:
 
 
 def _check(entry: AnyEntry, where: str) -> None:
-    """Raise BidexError, which begins with ``where``, for the first contradiction in an entry."""
+    """Raise BidexError for the first contradiction in an entry; the message begins with ``where``."""
     try:
         fault = next(entry.faults(), None)
     except BidexError as error:  # the suite of the entry may be unknown here, or may have changed
@@ -85,7 +85,10 @@ def read_entries(folder: Path) -> dict[Path, AnyEntry]:
 
 
 def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
-    """Raise BidexError if two entries, of any suites, have the same policy, or transfer the same policy."""
+    """Raise BidexError if two entries, even of different suites, contain the same policy or transfer the same policy.
+
+    A policy may have both an entry with its own results and an entry for transfer from it to other classes.
+    """
     known: dict[str, Path] = {}
     for path, entry in entries.items():
         weights = [*entry.receipt.weights]
@@ -98,9 +101,10 @@ def check_apart(entries: Mapping[Path, AnyEntry]) -> None:
 
 
 def agent_part(evaluation: MetaTestEvaluation, where: str) -> tuple[int, Part]:
-    """Return the evaluation episodes of each task, and the results on test tasks, of an agent's meta-test.
+    """Extract the contents of a leaderboard entry from the meta-test of a user's own agent.
 
-    Raises BidexError, which begins with ``where``, for a meta-test that the leaderboard does not accept.
+    Returns the number of evaluation episodes per task, and the results on the test tasks. Raises BidexError for a
+    meta-test that the leaderboard does not accept; the message begins with ``where``.
     """
     again = 'Write it by meta_test(agent, "SUITE").save(FILE).'
     if evaluation.agent is None or evaluation.suite is None:
@@ -139,12 +143,18 @@ def content_digest(content: Json) -> str:
 
 
 def success_iqm(tables: Sequence[np.ndarray]) -> Estimate:
-    """Return the interquartile mean of success over runs and classes of tables (runs, units), one per class."""
+    """Return the interquartile mean of success rates over all pairs of a run and a class.
+
+    ``tables`` has one table of success (runs, units) per class; units are tasks or episodes.
+    """
     return crossed_estimate(lambda tables: float(iqm(success_rates(tables).ravel())), tables)
 
 
 def profile(tables: Sequence[np.ndarray], rate: float) -> float:
-    """Return the share of runs and classes that succeed in more than ``rate`` of their tasks."""
+    """Return the share of pairs of a run and a class whose success rate is greater than ``rate``.
+
+    The result is one point of a performance profile. ``tables`` has one table of success (runs, units) per class.
+    """
     return share_above(success_rates(tables), rate)
 
 
@@ -154,5 +164,5 @@ def improvement(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> Estimate:
 
 
 def success_rates(tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Return success rates (runs, classes)."""
+    """Return success rates (runs, classes), computed from one table of success (runs, units) per class."""
     return np.stack([table.mean(axis=1) for table in tables], axis=1)

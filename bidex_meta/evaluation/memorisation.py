@@ -68,7 +68,11 @@ def _standardised(starts: np.ndarray) -> np.ndarray:
 
 
 def _guesses(seen: np.ndarray, targets: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both probes' predictions of ``targets`` (episodes, n, k), each learned from the groups of other folds."""
+    """Return the cross-validated predictions of ``targets`` (episodes, n, k) by both probes.
+
+    The probes are the nearest neighbour and a ridge regression on the observations ``seen`` (episodes, n, d). Samples
+    with the same number in ``groups`` (episodes, n) are in the same fold. A fold is predicted from all other folds.
+    """
     x = seen.reshape(-1, seen.shape[-1])
     y = targets.reshape(-1, targets.shape[-1])
     fold = groups.reshape(-1) % _FOLDS

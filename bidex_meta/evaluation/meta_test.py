@@ -45,7 +45,7 @@ class MetaEvaluation:
 
     @property
     def rollouts(self) -> int:
-        """Return the number of episodes of each task that a shot adapted to."""
+        """Return the number of exploring episodes that the agent played of each task in a shot."""
         return self.protocol.rollouts or 1
 
     @property
@@ -59,7 +59,7 @@ class MetaEvaluation:
         return self.by_shot[-1]
 
     def gains(self, shot: int = -1) -> Gains:
-        """Return the gains from no adaptation to a shot, by default the last one."""
+        """Return the gains: results after a shot (by default the last one) minus results without adaptation."""
         return paired_gains(self.by_shot[shot], self.before, self.adaptations)
 
     def summary(self) -> SplitSummary:
@@ -152,13 +152,20 @@ def meta_evaluate(
 
 
 def _seed(seed: int, *key: object) -> int:
-    """Return a seed for a key; different keys and different seeds of the protocol give different starts."""
+    """Derive a seed for start states from the protocol's seed and a key, such as the portion and the shot.
+
+    Different keys and different protocol seeds give different seeds.
+    """
     digest = hashlib.sha256("/".join(map(str, ("meta-test", seed, *key))).encode()).digest()
     return int.from_bytes(digest[:4], "little")
 
 
 def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgent:
-    """Return the agent in its meta-learned state, after assigning the environments that share a task."""
+    """Reset the agent to its meta-learned state, tell it which environments share a task, and return it.
+
+    ``field`` is the world in which the agent will adapt. Raises BidexError if the environments of ``field`` are not
+    distributed over the tasks like those of ``world``.
+    """
     shared = task_of_row(world)
     if not torch.equal(shared, task_of_row(field)):
         raise BidexError(
@@ -220,7 +227,10 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
 
 
 def checked_outputs(agent: object, given: object) -> tuple[Tensor, Info]:
-    """Return the result of ``adapt_action``: actions and other outputs; raise BidexError for a result without both."""
+    """Check the value ``given`` that an agent's ``adapt_action`` returned, and return it unchanged.
+
+    Raises BidexError unless ``given`` is a tuple of the actions and a dict of the policy's other outputs.
+    """
     if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], dict):
         raise BidexError(
             f"{type(agent).__name__}.adapt_action: expected actions and a dict of the policy's other outputs, got "

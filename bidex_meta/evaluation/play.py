@@ -37,10 +37,10 @@ def evaluate(
     """Play every task of ``world`` equally often, with starts from the protocol's seed, and return results per class.
 
     The world must be in autoreset mode DISABLED and have at least one environment for each task. Environments that
-    share a task share its episodes. If given, ``episodes_per_task`` and ``seed`` replace those of ``protocol``, which
-    are 4 and ``EVALUATION_SEED`` by default, as in the commands. ``references``, by class, define the normalised score
-    and the return of broken episodes; the default is the references that the installation stores for the world's
-    classes.
+    share a task share its episodes. If ``episodes_per_task`` or ``seed`` is given, it replaces the value of
+    ``protocol``. By default, ``protocol`` has 4 episodes per task and the seed ``EVALUATION_SEED``, like the commands.
+    ``references`` holds each class's reference returns, which define the normalised score and the return of episodes
+    whose physics broke. By default they are those that the installation stores for the world's classes.
 
     Raises BidexError if the world resets by itself or has too few environments, if a number is out of range, if the
     protocol limits the number of tasks, or if torch's default precision is not single.
@@ -64,11 +64,13 @@ def play_tasks(
 ) -> Episodes:  # fmt: skip
     """Play ``episodes_per_task`` episodes of every task, as ``evaluate`` does, and return arrays ``(episodes,)``.
 
-    If the agent has ``observe``, it is called after each step with the reward, unless ``hidden_rewards`` is set.
+    If the agent has a method ``observe``, it is called after each step with the transition and its reward, unless
+    ``hidden_rewards`` is set.
 
-    The arrays are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule),
-    ``once`` (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world
-    and seed give the same slots, tasks and starts in the same order.
+    The arrays are ``slot`` (index of the class in the world), ``task`` (index in the class's pool of tasks),
+    ``return``, ``success`` (by the suite's rule), ``once`` (solved at any step), ``at_end`` (solved in the last steps),
+    ``length`` in steps, and ``unstable`` (whether the physics broke). The same world and seed give the same classes,
+    tasks and start states in the same order.
     """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()

@@ -17,17 +17,21 @@ from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
 def task_of_row(world: TaskWorld) -> Tensor:
-    """Return each environment's task, numbered over all slots, int64 ``(num_envs,)``."""
+    """Return the number of each environment's task, int64 ``(num_envs,)``.
+
+    The tasks of all classes are numbered consecutively, in the order of the classes.
+    """
     before = torch.tensor([0, *world.num_slot_tasks[:-1]], device=world.task_id.device).cumsum(0)
     return world.task_index + before[world.task_id]
 
 
 class Portions:
-    """Groups of adaptations that are played together.
+    """Division of a meta-test into portions, groups of tasks that are played together.
 
-    Each of the first ``tasks`` of each pool (None: all) has one adaptation in each trial. ``rollouts`` is the number of
-    episodes of each task in a shot; None stands for one episode in each environment of the task, with all tasks played
-    at once. All numbers are at least 1. The world is not changed.
+    Each task is adapted to once in each of ``trials`` trials. ``tasks`` limits the test to the first tasks of each
+    class's pool; None stands for all tasks. ``rollouts`` is the number of exploring episodes of a task in a shot. If it
+    is None, as many tasks as possible are played at once, and each environment of a task plays one episode. All numbers
+    are at least 1. The constructor does not change the world.
     """
 
     def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
@@ -43,10 +47,11 @@ class Portions:
 
     @contextmanager
     def applied_to(self, worlds: Sequence[TaskWorld]) -> Iterator[Iterator[int]]:
-        """Yield an iterator over the portions' numbers; each of its steps sets a portion's tasks in all worlds.
+        """Provide, for a ``with`` block, an iterator over the numbers of the portions.
 
-        Afterwards all worlds have their own pools again. Raises BidexError for a world whose tasks cannot be set, or
-        whose pools have other lengths.
+        Each step of the iterator gives all worlds the tasks of the next portion. When the block ends, all worlds get
+        their original pools of tasks back. Raises BidexError for a world whose tasks cannot be set, or whose pools
+        differ in length from those of the constructor's world.
         """
         for world in worlds:
             if list(world.num_slot_tasks) != self._pool_sizes:
@@ -72,9 +77,10 @@ class Portions:
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
     def labelled(self, episodes: Episodes, portion: int) -> Episodes:
-        """Return a portion's episodes without repetitions, with the number of each one's ``adaptation``.
+        """Return the episodes of a portion with an added entry ``adaptation``, the number of each episode's adaptation.
 
-        ``task`` becomes the index of the task in the pool.
+        Episodes that only fill up the last portion are left out. The entry ``task``, which is an index in the portion,
+        becomes the task's index in the original pool.
         """
         parts = []
         for slot, adaptations in enumerate(self._adaptations):

@@ -1,9 +1,9 @@
 """Reference returns, which define the normalised score and the return of episodes with broken physics.
 
-References were measured with moving bases, as in every suite. ``assets/references/`` holds mean returns of random
-actions, of zero actions, of experts, of witnesses in open-loop replay and of scripted policies. The better of random
-and zero actions scores 0. ``python -m tools.experts`` writes the returns of experts; ``bidex-meta baseline`` measures
-the others.
+References were measured with moving hand bases, as in every suite. ``assets/references/`` holds mean returns of random
+actions, zero actions, experts (the best known policies), recorded reference solutions in open-loop replay (called
+``witness``) and scripted policies. The better of random and zero actions scores 0. ``python -m tools.experts`` writes
+the returns of experts. ``bidex-meta baseline`` measures the others.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ class _File(TypedDict):
 
 @dataclass(frozen=True)
 class Reference:
-    """References of a class."""
+    """Mean returns of baseline and expert policies in a class, which define its normalised score."""
 
     random: float  # mean return of uniform actions
     expert: float | None = None  # mean return of the best known policy; None if no policy is above the floor
@@ -45,7 +45,10 @@ class Reference:
         return max(self.random, self.zero)
 
     def scores(self, returns: np.ndarray) -> np.ndarray | None:
-        """Return 100 · (R − R_floor) / (R_expert − R_floor) of returns R; None without an expert above the floor."""
+        """Return the normalised scores of ``returns``: 100 · (R − R_floor) / (R_expert − R_floor) for each return R.
+
+        The result is None if the expert's return is unknown or not greater than the floor.
+        """
         if self.expert is None or self.expert <= self.floor:
             return None
         return 100 * (returns - self.floor) / (self.expert - self.floor)
@@ -70,7 +73,10 @@ def counted_returns(
 
 
 def load(kind: Kind) -> dict[str, Json]:
-    """Read the installed references by class, each like ``{"return": 0.49, "source": ...}``; empty without a file."""
+    """Read, for each class, the installed reference return of one kind of policy, such as scripted policies.
+
+    A class has an entry like ``{"return": 0.49, "source": ...}``. The dict is empty if the file does not exist.
+    """
     return load_from(paths.assets_dir() / "references" / f"{kind}.json")
 
 
@@ -103,7 +109,10 @@ def load_from(path: Path) -> dict[str, Json]:
 
 
 def references() -> dict[str, Reference]:
-    """Return the references of each class that has a return of random actions; experts below the floor are left out."""
+    """Return the installed reference returns of each class for which a return of random actions is stored.
+
+    An expert return is left out unless it is greater than the floor, the better return of random and zero actions.
+    """
     experts = _returns("expert")
     zero = _returns("zero")
     known = {}
@@ -121,7 +130,10 @@ def _returns(kind: Kind) -> dict[str, float]:
 
 
 def references_of(world: object) -> dict[str, Reference]:
-    """Return the references of a world's classes; empty for other libraries' classes, version 2, and fixed bases."""
+    """Return the reference returns of all classes if they apply to a world, otherwise an empty dict.
+
+    References do not apply to classes of other libraries, to classes of version 2, or to hands with fixed bases.
+    """
     classes = [slot.task_class for slot in getattr(world, "slots", ())]
     if classes and all(task.moving_base and task.rules.as_printed for task in classes):
         return references()
@@ -129,10 +141,11 @@ def references_of(world: object) -> dict[str, Reference]:
 
 
 def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, ClassSummary]:
-    """Return an evaluation's results by class, with scores computed from the installed references.
+    """Compute the normalised scores in an evaluation's results again, from the installed reference returns.
 
-    This makes runs comparable. References exist for classes with moving bases. The bases moved if the run's config says
-    so, or if the evaluation has a score. Other results are returned unchanged.
+    This makes the scores of different runs comparable. References hold only for moving hand bases. The bases are known
+    to have moved if the run's config says so, or if any class has a score already. Otherwise all results are returned
+    unchanged.
     """
     if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes

@@ -59,9 +59,10 @@ class ClassResult:
         return self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
-        """Return the sample to resample: task means of ``values`` (episodes,), or ``values`` if tasks are few.
+        """Return the sample that a bootstrap of ``values`` (episodes,) should resample.
 
-        Episodes of one task are alike, so resampling them separately would make intervals too narrow.
+        The sample holds the mean of each task, because episodes of one task are alike, so that resampling them
+        separately would make intervals too narrow. With fewer than ``MANY_TASKS`` tasks, it is ``values`` itself.
         """
         means = self.task_means(values)
         if len(means) < MANY_TASKS:
@@ -127,9 +128,10 @@ def results_by_class(
     names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None,
     compared: Sequence[dict[str, np.ndarray]] = ()
 ) -> dict[str, ClassResult]:  # fmt: skip
-    """Return results by slot name for episodes of ``play_tasks``; ``counted_returns`` corrects broken episodes.
+    """Group by class the episodes that ``play_tasks`` returned, and compute the result of each class.
 
-    ``compared`` holds the episodes of the policies with which this policy is compared.
+    ``names`` are the names of the world's classes. ``counted_returns`` corrects the returns of episodes whose physics
+    broke. ``compared`` holds the episodes of the policies with which this policy is compared.
     """
     classes = {}
     for slot, name in enumerate(names):
@@ -149,7 +151,11 @@ def results_by_class(
 
 
 def _share(episodes: dict[str, np.ndarray], name: str, broken: np.ndarray) -> float | None:
-    """Return the share of episodes that are solved and not broken; None if ``name`` was not recorded."""
+    """Return the share of episodes that are solved and whose physics did not break.
+
+    ``name`` is the array of successes to use, such as ``once`` (solved at any step). The result is None if ``episodes``
+    has no such array.
+    """
     if name not in episodes:
         return None
     return float((episodes[name] & ~broken).mean())

@@ -100,7 +100,10 @@ def estimate(statistic: Statistic, *samples: np.ndarray) -> Estimate:
 
 
 def mean(sample: np.ndarray) -> np.ndarray:
-    """Return the mean of each resample in ``(resamples, n)``, a statistic of :func:`estimate`."""
+    """Return the mean of each resample in ``sample`` ``(resamples, n)``.
+
+    This function can be the ``statistic`` of :func:`estimate`.
+    """
     return sample.mean(axis=-1)
 
 
@@ -113,7 +116,10 @@ def mean_difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def mean_of_means(*samples: np.ndarray) -> np.ndarray:
-    """Return the mean over samples of their means for each resample, a statistic of :func:`estimate`."""
+    """Return, for each resample, the unweighted average of the means of all samples, each ``(resamples, n)``.
+
+    This function can be the ``statistic`` of :func:`estimate`.
+    """
     return np.asarray(sum(mean(sample) for sample in samples) / len(samples))
 
 
@@ -137,7 +143,10 @@ def iqm_over_seeds(values: np.ndarray) -> Estimate:
 
 
 def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
-    """Return the interquartile mean of ``a`` minus that of ``b``, both (seeds, classes), with their seeds resampled."""
+    """Return the interquartile mean of ``a`` minus that of ``b``, with an interval over the seeds of both.
+
+    Both arrays have the shape (seeds, classes).
+    """
     return estimate(lambda a, b: _iqm_of_tables(a) - _iqm_of_tables(b), a, b)
 
 
@@ -181,7 +190,7 @@ def paired_difference(differences: np.ndarray) -> Estimate:
 
 
 def estimate_from(value: float, resampled: np.ndarray | None) -> Estimate:
-    """Return a value with the interval of its resamples ``(resamples,)``, or without one if they are None."""
+    """Return a value with the 95 % interval of its resamples ``(resamples,)``; None gives no interval."""
     return Estimate(value, None if resampled is None else interval_of(resampled))
 
 
@@ -200,11 +209,12 @@ def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossed_estimate(statistic: Callable[..., float], *entries: Sequence[np.ndarray]) -> Estimate:
-    """Return ``statistic`` of entries with an interval over seeds and over the tasks of each class.
+    """Return ``statistic(*entries)``, with a bootstrap interval over seeds and over the tasks of each class.
 
-    An entry is a list that holds a table of shape (seeds, tasks) for each class. A seed is one run over all classes, so
-    the seeds of all tables of an entry are resampled together. All seeds play the same tasks of a class. ``statistic``
-    takes such entries. The interval is None if no class has more than one value.
+    An entry is a list with one table (seeds, tasks) per class, for example the results of one learner. A seed stands
+    for one run over all classes, so seeds are resampled for all tables of an entry together. All seeds play the same
+    tasks of a class, so tasks are resampled for all seeds together. The interval is None if every table has only one
+    value.
     """
     value = float(statistic(*entries))
     if all(table.size < 2 for table in chain.from_iterable(entries)):

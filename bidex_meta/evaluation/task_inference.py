@@ -1,9 +1,10 @@
-"""Validity of a task class: the best success without knowing its hidden parts, and whether rewards identify them.
+"""Measures of whether a task class with hidden parts, such as its goal, is a valid test of adaptation.
 
-The blind ceiling (the best success of a policy that does not know the hidden parts) and identifiability need no policy.
-They assume that the hidden parts are drawn independently and uniformly, as in ``TaskClass.variation_space``;
-``listed_ceiling`` is for suites that list their tasks. The alignment of return and success is computed from policies'
-results.
+The blind ceiling is the best success of a policy that does not know the hidden parts. Identifiability says whether
+rewards are enough to infer the hidden parts. Neither needs a trained policy. Both assume that the hidden parts are
+drawn independently and uniformly, as in ``TaskClass.variation_space``. For suites that list their tasks, use
+``listed_ceiling`` instead of ``blind_ceiling``. The alignment of return and success is computed from the results of
+policies.
 """
 
 import math
@@ -48,9 +49,10 @@ class Alignment:
 
 
 def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
-    """Compute the alignment in one class from results by policy.
+    """Measure how well return and success agree in one class, from the results of several policies.
 
-    The result is None if no episode succeeds, or if no policy always fails.
+    ``results`` holds the results by name of the policy. The measure needs at least one successful episode and at least
+    one policy that never succeeds. If either is missing, the result is None.
     """
     returns = np.concatenate([result.returns for result in results.values()])
     solved = np.concatenate([result.successes for result in results.values()])
@@ -179,7 +181,11 @@ def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, T
 
 
 class _EachWith(TaskState):
-    """States of T steps (T, s), each combined with each of k variations; values are (T k, ...), ordered by step."""
+    """Task state that combines the recorded sensors of T steps with each of k candidate variations of the task.
+
+    Sensors are (T, s). A value of the state has the shape (T k, ...): all variations of the first step, then all
+    variations of the second step, and so on.
+    """
 
     def __init__(self, sensors: Tensor, scene: Scene, frozen: dict[str, Tensor], k: int) -> None:
         super().__init__(sensors, scene.sensors, {n: v.repeat(len(sensors), 1) for n, v in frozen.items()})
@@ -190,10 +196,12 @@ class _EachWith(TaskState):
 
 
 def _fit(scene: Scene, sensors: Tensor, rewards: Tensor, truth: Tensor, seed: int) -> float:
-    """Return the largest error of a hidden part in units of its tolerance (infinite for a wrong sign).
+    """Infer the hidden values of a task from the rewards of an episode, and return the error of the worst hidden part.
 
-    The fit minimises the sum of squares by Levenberg-Marquardt from the best of many random starts, with derivatives by
-    finite differences.
+    The error is in units of the part's tolerance, and infinite for a wrong sign. ``sensors`` (T, s) and ``rewards``
+    (T,) are those of the episode's steps; ``truth`` is the true variation. The fit minimises the sum of squared
+    differences of the rewards by Levenberg-Marquardt, from the best of many random starts, with derivatives by finite
+    differences.
     """
     task = scene.task
     space = scene.task.variation_space

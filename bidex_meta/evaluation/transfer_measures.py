@@ -52,7 +52,12 @@ def at_the_end(folders: Sequence[RunFolder]) -> Json:
 
 
 def by_reinforcement(folders: Sequence[RunFolder], end: int) -> Json:
-    """Return :func:`at_the_end` and measures of the evaluations during ``end`` environment steps of training."""
+    """Summarise the evaluations of runs that differ only in the seed, during and after training.
+
+    ``end`` is the number of environment steps of training. The result has success and return at the end
+    (:func:`at_the_end`), the success ``curve`` over training, success ``at`` 10,000, 100,000, ... steps, the ``area``
+    under the curve (:func:`area`), and in ``half`` the steps to a success of one half (:func:`steps_to`).
+    """
     curves = [series(folder.metrics(), TAG) for folder in folders]
     at = {}
     for power in range(4, 15):
@@ -77,7 +82,11 @@ def over_seeds(of_seeds: list[float]) -> Json:
 
 
 def add_over_nothing(rows: Sequence[Json], measure: str) -> None:
-    """Add to each row the difference from the corresponding runs from scratch; seeds of both are resampled."""
+    """Add ``over_nothing`` to each row: its ``measure`` minus that of the same training from scratch, with an interval.
+
+    A row holds the results of one class and one initial policy. The interval is over the seeds of both. The entry is
+    None for rows from scratch, and for rows without a counterpart from scratch.
+    """
     alone = {(row["class"], row.get("demonstrations")): row for row in rows if row["from"] == NOTHING}
     for row in rows:
         other = alone.get((row["class"], row.get("demonstrations")), row)

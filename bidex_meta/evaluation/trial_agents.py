@@ -10,14 +10,21 @@ from bidex_meta.errors import BidexError, one_line
 
 
 def adapting(agent: TrialAgent | Agent) -> Agent:
-    """Return an agent with the meta-test's methods: a ``TrialAgent`` as a copy in an adapter, any other unchanged."""
+    """Return an agent that has the methods called by the meta-test.
+
+    A ``TrialAgent`` is copied and wrapped in an adapter. Any other agent is returned unchanged.
+    """
     if isinstance(agent, TrialAgent) and not hasattr(agent, "adapt_action"):
         return AdaptingTrialAgent(_copied(agent))
     return agent  # pyright: ignore[reportReturnType]
 
 
 class AdaptingTrialAgent:
-    """A ``MetaLearningAgent`` made of a ``TrialAgent``: it learns in exploring episodes, copies act in evaluations."""
+    """Adapter that makes a ``MetaLearningAgent`` from a user's ``TrialAgent``.
+
+    The agent itself plays the exploring episodes and learns from them. Each evaluation is played by a copy of the
+    agent, so that evaluations do not change what the agent has learned.
+    """
 
     def __init__(self, agent: TrialAgent) -> None:
         self._agent = agent
@@ -28,7 +35,7 @@ class AdaptingTrialAgent:
         """Do nothing: each environment learns from its own episodes."""
 
     def init(self) -> None:
-        """Forget all trials at the next ``reset``, whose mask has the number of environments."""
+        """Make the next ``reset`` restart the trials in all environments, so that the agent forgets what it learned."""
         self._is_fresh = True
 
     def reset(self, env_mask: Tensor) -> None:
@@ -50,11 +57,11 @@ class AdaptingTrialAgent:
         """Do nothing: the agent has learned from each transition."""
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Return the copy's actions (N, a) for observations (N, d)."""
+        """Return actions (N, a) for observations (N, d), from the copy of the agent that plays the evaluation."""
         return self._playing.act(obs)
 
     def observe(self, timestep: Timestep) -> None:
-        """Show the copy a transition of an evaluation episode."""
+        """Show a transition of an evaluation episode to the copy of the agent that plays the evaluation."""
         self._playing.observe(timestep)
 
 

@@ -1,1 +1,1 @@
-"""The pair of hands: scene part, joints, start poses and angles, units as agents."""
+"""The pair of hands: its models in a scene, joints, start poses, start angles, and division into several agents."""

@@ -28,9 +28,9 @@ DISTAL_PER_MIDDLE = 0.00805 / 0.00705
 
 @dataclass(frozen=True)
 class Hand:
-    """Joint tables of the hand in the order of Table 7: names and limits (rad) of 24 joints.
+    """Names and limits (rad) of the hand's 24 joints, in the order of the observation (the paper's Table 7).
 
-    It also has the indices of the 20 actuated joints and the limits of their position targets, rad.
+    The object also has the indices of the 20 actuated joints, and the limits of their position targets, rad.
     """
 
     joints: tuple[str, ...]
@@ -79,7 +79,10 @@ _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)
 
 
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
-    """Give geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER geoms keep their bits."""
+    """Set MuJoCo's contact bits of geoms, which decide what collides, to those of RIGHT, LEFT, OBJECT or FIXTURE.
+
+    Geoms that are marked INNER keep their bits, and geoms without ``contype`` remain visual.
+    """
     for geom in geoms:
         if geom.contype:  # geoms without a contype are only visual
             own = INNER if geom.contype == INNER else kind

@@ -21,9 +21,10 @@ _Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def loft(sections: Sequence[Section], low: float, high: float, power: float = 2.0) -> _Mesh:
-    """Return a closed skin through sections with ascending z; rounded ends add ``low`` below and ``high`` above, mm.
+    """Return a closed mesh that passes through cross-sections, which are in ascending order of z.
 
-    ``power`` is 2 for ellipses, and larger for rounded rectangles.
+    Rounded ends add ``low`` mm below the first section and ``high`` mm above the last one. ``power`` sets the shape of
+    a section: 2 gives an ellipse, and larger values give a rounded rectangle.
     """
     given = np.array(sections)
     z = np.concatenate([np.linspace(a, b, _ALONG, endpoint=False) for a, b in pairwise(given)])
@@ -72,7 +73,7 @@ def _triangles(rings: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _meshes() -> dict[str, _Mesh]:
-    """Return the skins by name. A palm faces -y, a thumb stands at +x."""
+    """Return the meshes of a hand's visual parts by name. The palm faces -y, and the thumb is at +x."""
     return {
         "proximal": loft([(5, 0, 0, 8.6, 8.8), (20, 0, 0, 7.9, 8.6), (37, 0, 0, 7.2, 7.4)], 3, 3, 2.6),
         "middle": loft([(5, 0, 0, 7.2, 7.4), (13, 0, 0, 6.7, 7.2), (19, 0, 0, 6.5, 6.6)], 2.5, 2.5, 2.6),
@@ -103,7 +104,7 @@ _THUMB_PINS = {"thproximal": (12.4, 11.0), "thmiddle": (10.4, 9.6), "thdistal": 
 
 
 def dress(scene: mujoco.MjSpec) -> None:
-    """Show both hands of a scene by skins and hide their colliding geoms; bodies and joints do not change."""
+    """Add visual meshes to both hands of a scene, and hide their colliding geoms; bodies and joints do not change."""
     for geom in scene.geoms:
         if geom.name.startswith(_OF_HANDS):
             geom.group = _HIDDEN_GROUP

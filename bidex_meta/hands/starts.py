@@ -84,11 +84,11 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
 def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
     """Lift an egg off the palm and open the fingers that noise would push into it.
 
-    ``joints`` (n, 24) are the joint angles, rad; ``position`` and ``axis`` (n, 3) are the egg's centre and the unit
-    vector along its long axis, in the mount frame; ``radius`` and ``half`` are its short and long semi-axes. Returns
-    the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths are in metres. The distances
-    of the egg from the palm's plane and from the fingers' capsules are lower bounds, computed from the extent (support)
-    of the spheroid in their direction.
+    ``joints`` (n, 24) are the joint angles, rad. ``position`` (n, 3) is the egg's centre, and ``axis`` (n, 3) the unit
+    vector along its long axis, both in the mount frame. ``radius`` and ``half`` are the egg's short and long semi-axes.
+    Returns the joint angles with opened fingers (n, 24), and the egg's shift in the mount frame (n, 3). Lengths are in
+    metres. For the distances of the egg from the palm's plane and from the fingers' capsules, lower bounds are used.
+    They are computed from the egg's extent (support) towards the palm or the finger.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
@@ -104,10 +104,12 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
 
 def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """Do the same as ``make_room`` for the convex hull of some balls; also lay the thumb flat and out of the way.
+    """Lift an object off the palm, and open the fingers that noise would push into it; also lay the thumb flat.
 
-    ``position`` (n, 3) is the object's origin in the mount frame. ``points`` (n, k, 3) are the balls' centres relative
-    to the origin, turned with the object. ``radii`` (k,) are the balls' radii, 0 for corners. Lengths are in metres.
+    The object is the convex hull of balls. ``joints`` (n, 24) are the joint angles, rad. ``position`` (n, 3) is the
+    object's origin in the mount frame. ``points`` (n, k, 3) are the balls' centres relative to the origin, turned with
+    the object. ``radii`` (k,) are the balls' radii, 0 for corners. Lengths are in metres. Returns the new joint angles
+    (n, 24) and the object's shift in the mount frame (n, 3). ``make_room`` does the same for an egg.
     """
     joints = joints.clone()
     joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0
@@ -131,10 +133,11 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
 
 
 def meets_box(joints: Tensor, pose: HandPose, box: Tensor, half: tuple[float, float, float]) -> Tensor:
-    """Return for each start whether a finger penetrates a box by more than the slack. Shape (n,), bool.
+    """Return, for each of n starts, whether a finger penetrates a box by more than 2 mm. Shape (n,), bool.
 
-    ``joints`` (n, 24) are the joint angles, rad, of a hand that starts at ``pose``. ``box`` (n, 7) are the box's poses,
-    quaternion (x, y, z, w); ``half`` are its half sizes, metres. Each link is tested at five points of its centre line.
+    ``joints`` (n, 24) are the joint angles, rad, of a hand that starts at ``pose``. ``box`` (n, 7) holds the position,
+    metres, and quaternion (x, y, z, w) of the box in each start. ``half`` are the half sizes of the box, metres. Each
+    link is tested at five points on its centre line.
     """
     start, along, length = _finger_segments(joints)
     share = constant(_SHARES, joints)
@@ -161,7 +164,12 @@ def _wrist_axis(joints: Tensor) -> Tensor:
 
 
 def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:
-    """Return joints with opened fingers and the shift off the palm; ``reach`` is the support towards the palm, (n,)."""
+    """Open the fingers that an object would touch, and compute by how much the object must be lifted off the palm.
+
+    Returns the new joint angles (n, 24), rad, and the object's shift in the mount frame (n, 3), metres. ``centre``
+    (n, 3) is the object's origin in the palm frame. ``reach`` (n,) is the object's extent from its origin towards the
+    palm, metres, and ``support`` gives its extent in any direction.
+    """
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
     start, along, length = _finger_segments(joints)
@@ -177,7 +185,11 @@ def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, suppor
 
 
 def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length: Tensor) -> Tensor:
-    """Return a lower bound of the gap between a body and line segments, by the support towards the nearest point."""
+    """Return a lower bound of the distance between an object and line segments, metres.
+
+    The bound is the distance from the object's origin to the nearest point of the segment, minus the object's extent
+    (support) in that direction. A segment has a ``start``, a unit vector ``along`` and a ``length``.
+    """
     to_centre = centre - start
     t = dot(to_centre, along).clamp(min=0.0).minimum(length)
     gap_vector = to_centre - t[..., None] * along
@@ -186,7 +198,10 @@ def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length
 
 
 def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
-    """Return whether LFJ4 (n,) lifts the little finger's metacarpal into an egg, (n,)."""
+    """Return whether the little finger's metacarpal, lifted by the joint LFJ4, would penetrate the object, bool (n,).
+
+    ``cup`` (n,) is the angle of LFJ4, rad.
+    """
     ends = []
     for x, rise, z in _METACARPAL:
         ends.append(torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1))

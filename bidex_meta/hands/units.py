@@ -31,9 +31,11 @@ class _Partition:
 
 
 def partition_line(agents: Agents) -> str:
-    """Return a partition as one line: a name of :data:`NAMED`, or agents with units, which ``agent_views`` checks.
+    """Return a partition of the hands into agents as one line of text.
 
-    Raises BidexError for a file that cannot be read or has no agents.
+    The line is a name of :data:`NAMED`, or lists the agents with their units (``name=unit+unit;name=unit``). The names
+    of the units are not checked here; ``agent_views`` checks them. Raises BidexError for a line of another form, or a
+    file that cannot be read or has no agents.
     """
     if isinstance(agents, Mapping):
         return _line({"agents": dict(agents)}, "partition")

@@ -149,10 +149,11 @@ class FromMetaWorld:
 
 
 class MetaWorldEnvs(VectorEnv):
-    """A world with NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
+    """Vector environment that gives one of our worlds the interface that Meta-World's evaluation expects.
 
-    Raises BidexError unless the world's autoreset mode is DISABLED, because success may end episodes and this class
-    then starts new ones.
+    It exchanges NumPy arrays, resets an environment in the step in which its episode ends (Gymnasium's mode SAME_STEP),
+    and has the attributes and methods that Meta-World calls. Raises BidexError unless the world's own autoreset mode is
+    DISABLED, because success may end episodes and this class then starts new ones.
     """
 
     @checked_arguments
@@ -184,9 +185,11 @@ class MetaWorldEnvs(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Advance every environment by actions (num_envs, a) in [-1, 1].
 
-        Returns observations (num_envs, d), which are of the next episode if one ended; rewards, terminated, truncated,
-        and info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``). If success counts
-        at the end of an episode, ``success`` is false before the last step and ``terminate_on_success`` has no effect.
+        Returns observations (num_envs, d), rewards, terminated, truncated and info. If an environment's episode ended,
+        its observation is the first one of the next episode. ``info`` has ``success``, ``final_obs`` and
+        ``final_info``, which has ``success`` and, in ``episode``, the return ``r`` and the length ``l``. If the suite
+        judges success at the end of an episode, ``success`` is false before the last step, and
+        ``terminate_on_success`` has no effect.
         """
         obs, reward, terminated, truncated, info = self.world.step(actions)  # type: ignore[arg-type]
         success = info["success"]

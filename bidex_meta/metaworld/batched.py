@@ -31,16 +31,16 @@ from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 
 
 class MetaWorldWorld(ForeignWorld):
-    """A world that runs one of Meta-World's suites on the CPU; each class is a slot.
+    """A world that runs one of Meta-World's suites on the CPU.
 
-    ``suite`` is a key of ``suite.METAWORLD_SUITES``.
+    ``suite`` is a key of ``suite.METAWORLD_SUITES``. Observations are Meta-World's 39 numbers, which include the goal,
+    followed by the one-hot of the class. Rewards are Meta-World's "v2" rewards in [0, 10]. An episode has 500 steps and
+    ends only at the time limit. Start states are part of Meta-World's tasks, so an episode depends only on its task and
+    the actions. The variation of a task is its number among the class's fifty tasks.
 
-    Observations are Meta-World's 39 numbers (goal visible) followed by the class's one-hot; rewards are Meta-World's
-    "v2" rewards in [0, 10]; an episode has 500 steps and ends only at the time limit. Starts are part of Meta-World's
-    tasks: an episode depends only on its task and actions. A task's variation is its number among the class's fifty
-    tasks. ``seed`` determines Meta-World's tasks, and which tasks are drawn until ``reset(seed=...)`` is called; other
-    keywords are those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments than
-    classes, or if Meta-World is not installed.
+    ``seed`` determines Meta-World's tasks. Until ``reset(seed=...)`` is called, it also determines which tasks are
+    drawn. Other keywords are those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments
+    than classes, or if Meta-World is not installed.
     """
 
     def __init__(
@@ -64,7 +64,11 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replace pools by task numbers, (n,) or (n, 1), from the next full reset; raise BidexError for bad numbers."""
+        """Replace the sets of tasks ("pools") of some classes, from the next full reset on.
+
+        ``pools`` holds the numbers of the new tasks by class, each (n,) or (n, 1). Raises BidexError for an unknown
+        class, or for numbers that are not tasks.
+        """
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:

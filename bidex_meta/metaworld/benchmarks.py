@@ -48,7 +48,10 @@ class CustomMT(Benchmark):
 
 
 class CustomML(Benchmark):
-    """Different classes for training and testing (else BidexError), with hidden goals and 50 tasks each."""
+    """Several classes for training and other classes for testing, with hidden goals and 50 tasks each.
+
+    Raises BidexError if a class is in both lists.
+    """
 
     @checked_arguments
     def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:

@@ -34,7 +34,11 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Envs, *args: in
 
 @contextmanager
 def known_to_metaworld(envs: Envs) -> Iterator[None]:
-    """Add the classes of ``envs`` to the names in `metaworld.evaluation`, in a copy, because modules share the dict."""
+    """Make the class names of ``envs`` known to `metaworld.evaluation` within the ``with`` block.
+
+    Meta-World's dict of classes is replaced by a larger copy and restored afterwards. The dict itself is not changed,
+    because Meta-World's modules share it.
+    """
     before = vars(library)[_CLASSES]
     ours = {str(name): type(str(name), (), {}) for name in envs.get_attr("task_name")}
     setattr(library, _CLASSES, {**before, **ours})

@@ -76,7 +76,10 @@ class Single:
         return self._env.reset()[0]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """Advance 1/80 s by an action (4,); returns observation (39,), reward in [0, 10], success, broken physics."""
+        """Apply an action (4,) for 1/80 s.
+
+        Returns the observation (39,), the reward in [0, 10], whether the task is solved, and whether the physics broke.
+        """
         obs, reward, _, _, info = self._env.step(action)
         # After an invalid number MuJoCo continues from its default state, and only its counters show this.
         broken = bool(np.any(self._env.data.warning.number[_BROKEN]))

@@ -32,11 +32,13 @@ _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 def make_mt_envs(
     name: str, seed: int | None = None, num_tasks: Few | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
-    """Make environments that show goals and draw a task at each reset: one for a class, or one per class for a suite.
+    """Make one environment of a class, or a vector environment with one environment per class of a suite.
 
-    `seed` chooses the tasks (None: 0), the starts and the task draws (None: random); `num_tasks` is the size
-    of the one-hot that `use_one_hot=True` appends, by default the number of classes. Options: `vector_strategy`,
-    `autoreset_mode` and those of `make_env`. Raises BidexError for an unknown name, or a suite that hides its goals.
+    The environments show their goals and draw a task at each reset. `seed` chooses the set of tasks, the start states
+    and the order in which tasks are drawn. If `seed` is None, the tasks are those of seed 0, and the rest is random.
+    `num_tasks` is the size of the one-hot that `use_one_hot=True` appends, by default the number of classes. `options`
+    are `vector_strategy`, `autoreset_mode` and those of `make_env`. Raises BidexError for an unknown name, or a suite
+    that hides its goals.
     """
     if _is_class(name):
         benchmark = MT1(name, seed)
@@ -58,10 +60,10 @@ def make_ml_envs(
 ) -> VectorEnv:
     """Make environments of a class or meta suite with hidden goals, each with an equal share of its class's tasks.
 
-    `meta_batch_size` is the number of environments, split evenly over the classes, by default one per class;
-    `total_tasks_per_cls` is the number of each class's tasks that they share, by default all. `seed` and options are as
-    in `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or a size that does not
-    divide evenly.
+    `meta_batch_size` is the number of environments, which are split evenly over the classes; by default each class has
+    one. `total_tasks_per_cls` is the number of tasks of each class that its environments share, by default all. `seed`
+    and `options` are as in `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or
+    environments or tasks that cannot be split evenly.
     """
     if _is_class(name):
         benchmark = ML1(name, seed)
@@ -80,9 +82,10 @@ def make_split(
 ) -> VectorEnv:
     """Make the environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
-    `task_seed` chooses the tasks, `seed` the starts and the task draws. With the ids of ML1, `env_name` is the class to
-    use, in the id's version, as in Meta-World. With another suite, BidexError is raised if `env_name` is given. Options
-    are those of `make_mt_envs` or `make_ml_envs`.
+    `task_seed` chooses the tasks. `seed` determines the start states and the order in which tasks are drawn. With the
+    ids of ML1, `env_name` is the class to use, as in Meta-World; the class is taken in the version that the id has.
+    Raises BidexError if `env_name` is given with another suite. `options` are those of `make_mt_envs` or
+    `make_ml_envs`.
     """
     if env_name is None:
         benchmark = Benchmark(suite, task_seed)
@@ -95,9 +98,10 @@ def make_split(
 
 
 def _of_one_class(suite: str, env_name: str, seed: int) -> Benchmark:
-    """Make the benchmark of `env_name`: ML1 of a class in the version of the suite.
+    """Make the benchmark ML1 of the class `env_name`, in the version (1 or 2) that `suite` has.
 
-    Raises BidexError for a suite other than ML1, and for a class name of another version.
+    Raises BidexError if `suite` is not ML1 (`"ML1"` or `"ML1-v2"`), or if it has version 1 and `env_name` names a class
+    of version 2.
     """
     rules = load_suite(suite).rules
     given = registry.resolve(env_name)
@@ -195,12 +199,15 @@ def make_env(
     reward_alpha: float = 0.001,
     **options: Option,
 ) -> gymnasium.Env:
-    """Make one environment in Meta-World's wrappers, from Meta-World's keywords; it draws its tasks from ``tasks``.
+    """Make one environment of this benchmark, wrapped in Meta-World's wrappers according to Meta-World's keywords.
 
-    `seed` determines starts and task draws (None: random); `use_one_hot` appends the one-hot of `env_id` among
-    `num_tasks`. `recurrent_info_in_obs` appends the last action, the last reward (divided by 10 if normalised) and
-    whether the episode ended. With `task_select="random"` a task is drawn at each reset. With `"pseudorandom"` each
-    call of `sample_tasks()` takes the next task of a shuffled list. Other options are those of `SuiteEnv`.
+    The environment plays the given `tasks`. With `task_select="random"` a task is drawn at each reset. With
+    `"pseudorandom"` each call of `sample_tasks()` takes the next task of a shuffled list. `seed` determines the start
+    states and the order of tasks, which are random if it is None.
+
+    `use_one_hot` appends the one-hot of `env_id` among `num_tasks` to observations. `recurrent_info_in_obs` appends the
+    last action, the last reward and whether the episode ended. The reward is divided by 10 if
+    `normalize_reward_in_recurrent_info` is True. `options` are those of `SuiteEnv`.
     """
     wrappers = mended().wrappers  # the package's other names do not need these wrappers
     single = recipe.make_class()(**options)

@@ -197,7 +197,7 @@ def _members(protocol: type) -> list[str]:
 
 
 def _expected(hint: object) -> str:
-    """Return an annotation in words."""
+    """Describe in words the values that an annotation allows, for error messages."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:

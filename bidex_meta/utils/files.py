@@ -76,9 +76,10 @@ def exists(path: Path) -> bool:
 
 
 def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
-    """Open a regular file of at most ``most`` bytes for reading; messages call it ``what``: ``"a run's config"``.
+    """Open a regular file of at most ``most`` bytes for reading.
 
-    Raises BidexError if the file is missing, unreadable or too large, or is no regular file.
+    ``what`` describes the file in error messages, for example ``"a run's config"``. Raises BidexError if the file is
+    missing, unreadable or too large, or is not a regular file.
     """
     try:
         # Opening a pipe would wait until somebody writes to it.

@@ -1,7 +1,7 @@
 """Choice of MuJoCo's drawing backend before the first picture: a screen, otherwise EGL, otherwise OSMesa.
 
-MuJoCo itself chooses when it is imported, only by the environment variable ``MUJOCO_GL``. The import fails if the
-variable names a missing library. Most runs draw nothing and must not fail for that reason.
+MuJoCo itself chooses its backend when it is imported, and looks only at the environment variable ``MUJOCO_GL``. The
+import fails if the variable names a missing library. Most runs draw nothing and must not fail for that reason.
 """
 
 import os

@@ -99,7 +99,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def rotation_angle(q: Tensor) -> Tensor:
     """Return the angle of a unit quaternion (x, y, z, w) in [0, pi]: 2 atan2(|v|, |w|).
 
-    Equals the paper's 2 arcsin(min(|v|, 1)), but its slope stays finite near pi.
+    The result equals 2 arcsin(min(|v|, 1)), the formula of the paper, but its slope stays finite near pi.
     """
     return 2.0 * torch.atan2(norm(q[..., :3]), q[..., 3].abs())
 

@@ -55,7 +55,7 @@ def check_memory(needed: float, what: str, mend: str) -> None:
 
 
 def _free_of_groups() -> Iterator[int]:
-    """Yield the bytes that each memory limit leaves free.
+    """Yield, for each memory limit of this process's control groups, the number of bytes that are still free.
 
     Inactive pages of files count as free, because the kernel gives them back before it kills a process.
     """
@@ -71,7 +71,7 @@ def _free_of_groups() -> Iterator[int]:
 
 
 def _cpu_quotas() -> Iterator[float]:
-    """Yield, for each quota, the number of cores whose time it allows."""
+    """Yield, for each CPU quota of this process's control groups, the number of cores whose time it allows."""
     for group in _groups("cpu"):
         version_1 = _numbers(group / "cpu.cfs_quota_us") + _numbers(group / "cpu.cfs_period_us")
         for quota in (_numbers(group / "cpu.max"), version_1):
@@ -80,10 +80,10 @@ def _cpu_quotas() -> Iterator[float]:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups of a controller, and of their parent groups.
+    """Yield the cgroup folders that may limit this process: those of its control groups and of their parent groups.
 
-    Inside a container, the path of a group may be its path on the host. Then only the last group of the path exists, as
-    the root folder.
+    ``controller`` is the resource, such as ``"cpu"``. Inside a container, the path of a group may be its path on the
+    host. Then only one of the yielded folders exists: the root folder, which stands for the last group of the path.
     """
     root = _ROOT / "sys" / "fs" / "cgroup"
     for line in _text(_ROOT / "proc" / "self" / "cgroup").splitlines():
@@ -107,7 +107,7 @@ def _numbers(path: Path) -> list[int]:
 
 
 def _entries(path: Path) -> dict[str, int]:
-    """Read a file of lines ``name number``."""
+    """Read a file whose lines each have a name and a number; return the numbers by name."""
     pairs = [line.split() for line in _text(path).splitlines()]
     return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2 and pair[1].isdigit()}
 

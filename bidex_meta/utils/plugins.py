@@ -25,7 +25,11 @@ def short_name(name: str) -> str:
 
 
 def name_with_object(name: str, thing: str | None) -> str:
-    """Return the name of a task class with another object, ``CatchUnderarm-block``; a file's ``.xml`` is left out."""
+    """Return the name of a task class whose object is replaced, such as ``CatchUnderarm-block``.
+
+    ``thing`` is the name of an object, or an MJCF file of which the name without ``.xml`` is used. If it is None, the
+    class name is returned unchanged.
+    """
     # Names of the shelf are taken in any case, and written in one.
     if thing is None:
         return name

@@ -79,7 +79,10 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
 
 
 def check_rising(settings: object, name: str, *fields: str) -> None:
-    """Raise BidexError for the first of the named fields, pairs of numbers, whose second number is the smaller one."""
+    """Raise BidexError if a field that holds a pair of numbers has a second number smaller than the first.
+
+    ``fields`` are the names of the fields that are checked; ``name`` begins the message.
+    """
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -240,7 +243,7 @@ _STEP = re.compile(r"\.([^.\[]+)|\[([^\]]*)\]")
 
 
 def _at(content: object, path: str) -> object:
-    """Return the value at a path, or MISSING if the path does not say which."""
+    """Return the value at one of msgspec's paths, such as ``.runs[0].name``; MISSING if the path leads to no value."""
     try:
         for name, number in _STEP.findall(path):
             content = content[name] if name else content[int(number)]  # type: ignore[index]

@@ -17,7 +17,7 @@ _SECONDS = 14.0
 
 
 class _Watch:
-    """The command's activity, when it began, and when the last line was printed."""
+    """State of a command's signs of life: its current activity, when that began, and when a line was last printed."""
 
     def __init__(self, what: str, clock: Callable[[], float]):
         self.clock = clock
