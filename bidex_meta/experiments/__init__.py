@@ -1,1 +1,1 @@
-"""Functions for what a person does with runs: train, evaluate, meta-test, verify, plot."""
+"""Commands on runs as Python functions: train, evaluate, meta-test, verify, compare and plot."""

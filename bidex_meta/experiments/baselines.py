@@ -1,4 +1,8 @@
-"""Measure the references of the normalised score: untrained policies, and the best known policies."""
+"""Measure reference returns for the normalised score.
+
+The references are returns of untrained policies, of witnesses (stored action sequences that solve a task) and of
+scripted policies.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,15 +32,16 @@ _STORED = ("return", "return_interval", "success", "episodes", "unstable")
 def baseline(
     policy: str, suite: str, *, episodes: int = 4, seed: int = 0, threads: int | None = None, out: Path | None = None
 ) -> Evaluation:
-    """Measure a policy of ``POLICIES`` on a suite's train tasks, and store the figures in ``out`` if it is given.
+    """Measure the returns and success of a simple reference policy on the train tasks of a suite.
 
     Args:
-        policy: Name of the policy.
-        suite: Suite whose classes have moving bases.
+        policy: Name of the policy, a key of ``POLICIES``, such as ``random`` or ``script``.
+        suite: Name or file of a suite in which the bases of the hands move.
         episodes: Episodes of each task.
-        seed: Seed of tasks, starts and actions.
+        seed: Seed of the tasks, the start states and the random actions.
         threads: Threads of the physics; None: one per core.
-        out: JSON file that the figures are written to; figures of other classes in it are kept.
+        out: JSON file to which the results are written. Results of other classes in this file are kept. None: the
+            results are not written.
 
     Raises BidexError for bad input, before anything is measured.
     """
@@ -75,7 +80,7 @@ def _played(policy: str, worlds: Worlds, episodes: int, seed: int) -> Evaluation
 
 
 def _scripted(worlds: Worlds, episodes: int) -> Evaluation:
-    """Evaluate the scripts of all classes that have one."""
+    """Evaluate the scripted policy of each class that has one; other classes are left out of the result."""
     scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
     names = [name for name in worlds.task_classes() if name in scripts]
     if not names:

@@ -1,4 +1,8 @@
-"""Cards of published runs and data sets: README.md with the hub's header in YAML, made only from the folder's files."""
+"""Make the model card of a published run, and the data card of a published data set.
+
+A card is the README.md of a repository on the Hugging Face Hub. It begins with the Hub's metadata in YAML. All its
+content comes from the files of the published folder.
+"""
 
 import json
 
@@ -13,7 +17,10 @@ from bidex_meta.utils.files import portable
 
 
 def run_card(folder: RunFolder, name: str) -> str:
-    """Return the card of a run's policy: the hub's header in YAML, then facts and results."""
+    """Return the text of the README.md that describes a run's policy on the Hugging Face Hub.
+
+    It has the Hub's metadata in YAML, commands, facts about the run, and results.
+    """
     config = folder.config()
     versions = versions_of(folder)
     subject = portable(config.suite or str(config.task))
@@ -41,7 +48,10 @@ def run_card(folder: RunFolder, name: str) -> str:
 
 
 def data_card(dataset: Dataset, name: str) -> str:
-    """Return the card of a data set."""
+    """Return the text of the README.md that describes a data set on the Hugging Face Hub.
+
+    It has the Hub's metadata in YAML, commands, and facts about the data set.
+    """
     ours = portable(dataset.metadata)
     tasks = ours["tasks"]
     header = {
@@ -73,7 +83,10 @@ def _card(header: Json, title: str, use: str, facts: Json) -> str:
 
 
 def _cell(value: object) -> str:
-    """Format a value as a cell of a Markdown table; strangers may have chosen the names in metadata."""
+    """Format a value as a cell of a Markdown table, on one line and with escaped vertical bars.
+
+    Without this, names from other people's metadata could break the table.
+    """
     return one_line(value).replace("|", "\\|")
 
 

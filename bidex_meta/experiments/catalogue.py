@@ -1,4 +1,7 @@
-"""Rows of the lists of tasks, hidden parts, learners and objects. Learners are read without torch and MuJoCo."""
+"""Rows of the tables that ``bidex-meta list`` prints: task classes, what tasks hide, learners and objects.
+
+Task classes and learners are read from their source code, so that their rows need neither torch nor MuJoCo.
+"""
 
 import ast
 import importlib.util
@@ -14,7 +17,7 @@ from bidex_meta.utils.files import JsonObject as Json
 
 
 def task_rows() -> list[Json]:
-    """Return a row per task class."""
+    """Return the rows of ``bidex-meta list tasks``, one per task class: its sizes, episode length and summary."""
     rows = []
     for name in registry.names():
         place = registry.module_of(name), name
@@ -31,13 +34,16 @@ def task_rows() -> list[Json]:
 
 
 def hidden_rows() -> list[Json]:
-    """Return a row per task class of version 2: what its tasks hide."""
+    """Return the rows of ``bidex-meta list hidden``, one per task class of version 2.
+
+    A row lists the parts of a task, such as its goal, that observations do not show.
+    """
     tasks = [registry.get(f"{name}-v2") for name in registry.names()]
     return [{"name": t.name, "hides": [part.described(t.variation_space) for part in t.hides()]} for t in tasks]
 
 
 def algo_rows() -> list[Json]:
-    """Return a row per learner."""
+    """Return the rows of ``bidex-meta list algos``, one per learner: its name, presets and summary."""
     rows = []
     for name, path in ALGOS.items():
         module, _, class_name = path.partition(":")
@@ -121,7 +127,10 @@ def _keys(module: str, node: ast.AST | None) -> list[str]:
 
 
 def object_rows() -> list[Json]:
-    """Return a row per object that the throwing classes throw: mass (g), box (mm), number of geoms."""
+    """Return the rows of ``bidex-meta list objects``, one per object that the throwing classes throw.
+
+    A row has the object's mass (g), the size of its bounding box (mm) and the number of its geoms.
+    """
     from bidex_meta.tasks.objects.held import held_object, shelf
 
     # docs/figures.md lists the sources of the egg's figures.

@@ -11,7 +11,10 @@ from bidex_meta.runs.atomic import Json
 
 
 def group_row(group: Group, first: Group) -> Json:
-    """Return the measures of a group of runs, each compared with the first group, ready for JSON."""
+    """Return the results of a group of runs that differ only in the seed, ready for JSON.
+
+    Success and score are also compared with those of the group ``first``.
+    """
     row: Json = {
         "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
         "hours": round(group.hours, 3),
@@ -44,7 +47,10 @@ def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 
 
 def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
-    """Return columns and rows of a table with one row per class and group: mean over seeds, and range of seeds."""
+    """Return the columns and rows of a table that has one row for each class and group of runs.
+
+    A row gives success and return: the mean over the group's seeds, and the lowest and highest value of a seed.
+    """
     rows = []
     for name in dict.fromkeys(chain.from_iterable(group.classes for group in groups)):
         for group in groups:
@@ -58,5 +64,5 @@ def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
 
 
 def _spread(values: np.ndarray, form: str) -> str:
-    """Format the mean, the least and the largest of values."""
+    """Format the mean, the minimum and the maximum of the values as one text."""
     return f"{values.mean():{form}} [{values.min():{form}} to {values.max():{form}}]"

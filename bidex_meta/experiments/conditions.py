@@ -32,15 +32,20 @@ def conditions(worlds: Worlds, num_envs: int | None = None) -> Conditions:
 
 
 def differences_of(folder: RunFolder, worlds: Worlds | None = None) -> list[Difference]:
-    """Return the differences between a run's record and this installation with the run's worlds.
+    """Return the versions that have changed since a run was made.
 
-    ``worlds`` are the run's worlds; None: they are opened from the run's config.
+    The function compares package versions, the physics, and the version and content of the run's suite. ``worlds`` is
+    this suite as the installation has it now; None: the function opens it from the run's config.
     """
     return differences(versions_of(folder), conditions(worlds or open_worlds(folder.config().to_json())))
 
 
 def say_differences(folder: RunFolder) -> None:
-    """Log in one line how a run's record differs from this installation and the run's suite, if it does."""
+    """Log one line if a run was made with other versions than those of this installation.
+
+    The line lists differences in packages, physics and the run's suite. Nothing is logged if the suite cannot be
+    opened.
+    """
     try:
         found = differences_of(folder)
     except BidexError:
@@ -50,7 +55,11 @@ def say_differences(folder: RunFolder) -> None:
 
 
 def check_worlds_of(folder: RunFolder, worlds: Worlds, mend: str) -> None:
-    """Log how a run's record differs; raise BidexError, with the advice ``mend``, if the run's worlds have changed."""
+    """Raise BidexError if the suite or the physics of a run has changed since the run was made.
+
+    Other differences, such as those in the version of torch, are only logged. ``mend`` is the advice at the end of the
+    error message.
+    """
     found = differences_of(folder, worlds)
     of_worlds = [difference for difference in found if difference.is_of_worlds]
     if of_worlds:

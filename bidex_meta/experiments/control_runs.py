@@ -48,7 +48,10 @@ def control_runs(
     folders: Sequence[RunFolder], *, shots: int, rollouts: int | None, episodes: int, trials: int, num_envs: int,
     seed: int, device: str, engine: str
 ) -> ControlResult:  # fmt: skip
-    """Play all arms of the control, own data and data of other tasks, for runs that differ only in the seed.
+    """Test whether adapting to a task's own data helps more than adapting to data of other tasks.
+
+    For each held-out task, a policy is evaluated before adaptation, after it has adapted to the task's own data, and
+    after it has adapted to data of each train task. The runs differ only in the seed.
 
     Args:
         folders: Runs of a learner that adapts, on a suite whose classes are in both splits.

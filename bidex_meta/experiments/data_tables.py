@@ -9,7 +9,7 @@ from bidex_meta.runs.atomic import Json
 
 
 def list_rows() -> tuple[list[Json], list[str]]:
-    """Return a row for each data set, and a line for each that cannot be read."""
+    """Return a row of the table for each data set, and an error message for each data set that cannot be read."""
     rows: list[Json] = []
     errors = []
     for name in dataset_names():
@@ -42,7 +42,10 @@ def description(dataset: Dataset) -> Json:
 
 
 def origin_lines(found: Json) -> list[str]:
-    """Return lines of text about sizes and origin, from the result of :func:`description`."""
+    """Return lines of text about a data set's sizes and origin.
+
+    ``found`` is the result of :func:`description`.
+    """
     policies = found.get("policies", [])
     acted = ", ".join(f"{policy.get('algo') or 'uniform'} ({policy.get('actions')} actions)" for policy in policies)
     left_out = found.get("left_out", {})
@@ -71,7 +74,10 @@ def class_row(slot: Json) -> Json:
 
 
 def coverage_lines(spread: Json) -> list[str]:
-    """Return lines of text about the entry ``coverage`` of :func:`description`."""
+    """Return lines of text about how widely the states and actions of a data set are spread.
+
+    ``spread`` is the entry ``coverage`` of :func:`description`.
+    """
     groups = ", ".join(f"{name} {value:.3g}" for name, value in spread["observation_std"].items())
     at_bounds = f"{100 * spread['action_at_bounds']:.1f} % at a bound"
     return [

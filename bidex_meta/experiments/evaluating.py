@@ -57,7 +57,11 @@ class PlayedTasks:
         return self.policy.success
 
     def entries(self) -> dict[str, Any]:
-        """Return the entries that :class:`PolicyEvaluation` and :class:`OtherTasks` have in common."""
+        """Return the fields that both kinds of evaluation records have, by name.
+
+        The kinds are :class:`PolicyEvaluation`, for tasks that the run was trained on or test tasks, and
+        :class:`OtherTasks`, for tasks that the run was not trained on.
+        """
         entries = {"split": self.split, "seed": self.seed, "policy": self.policy.summary()}
         if self.random is not None:
             differences = compare(self.policy, self.random)
@@ -209,20 +213,22 @@ def evaluate(
 
     Args:
         run: The run's folder.
-        split: ``train``: the tasks that the run was trained on (with ``tasks_per_class`` 0, tasks that training never
-            draws); ``test``: the test tasks of a meta suite.
+        split: ``train``: the tasks that the run was trained on; if ``tasks_per_class`` is 0, training drew a new
+            task in each episode, and the evaluation uses tasks that training never draws. ``test``: the test tasks of a
+            meta suite.
         checkpoint: ``last``, ``best`` or a file.
         random: Whether a random policy is also evaluated on the same tasks.
         other_tasks: Whether the policy is also evaluated on the same number of tasks that no run was trained on.
         episodes: Episodes of each task; None: 4, or 1 if a task has a fixed start.
         num_envs: Environments stepped together, a multiple of the number of tasks; None: one per task.
-        seed: Seed of the episodes' starts; training does not use the default.
+        seed: Seed of the start states of the episodes. Training never uses the default seed.
         randomisation: A TOML file with the randomisation of the worlds (docs/randomisation.md).
         device: ``auto``, ``cpu`` or ``cuda:N``.
         engine: ``auto``, ``c`` or ``warp``.
         save: Whether the result is written to the run's ``evaluation.json``.
 
-    Raises BidexError for a run without such a checkpoint or split, and for learners that adapt: call :func:`meta_test`.
+    Raises BidexError if the run has no such checkpoint or split, or if its learner adapts to tasks; for these learners,
+    call :func:`meta_test`.
     """
     folder = _opened(run)
     config, worlds = _set_up(folder, device, engine, randomisation)
@@ -274,17 +280,18 @@ def meta_test(
     Args:
         agent: The folder of a run whose learner adapts; or your own agent, a ``TrialAgent`` or ``MetaLearningAgent``.
         suite: For an agent: name or file of a suite that hides its goals. A run has its own suite.
-        split: ``train``, ``test``, ``others`` (tasks of the train classes that no run was trained on), ``unseen`` for
-            others and test, or ``auto`` for train and test.
+        split: ``train``; ``test``; ``others``, tasks of the train classes that no run was trained on; ``unseen``,
+            others and test; or ``auto``, train and test tasks.
         checkpoint: For a run: ``last``, ``best`` or a file.
         shots: Adaptation rounds, one after the other; None: 2.
-        rollouts: Episodes of each task in a shot; None: as in training, but at most 40; 10 for an agent.
+        rollouts: Episodes of each task in a shot. None: for a run, the number in training, but at most 40; for an
+            agent, 10.
         episodes: Evaluation episodes of each task; None: the number of rollouts.
         tasks: Number of tasks of each class, the first ones of the class's pool; None: 5.
         trials: Number of adaptations to each task, each from the unadapted agent and with new episodes; None: enough
             for five adaptations per class.
         num_envs: Maximum number of environments stepped together; None: 1024.
-        seed: Seed of the episodes' starts; training does not use the default.
+        seed: Seed of the start states of the episodes. Training never uses the default seed.
         task_seed: For an agent: seed that draws the tasks, as in ``Benchmark(suite, task_seed)``; None: 0.
         hidden_rewards: Whether the evaluation episodes are also played with their rewards hidden.
         randomisation: A TOML file with the randomisation of the worlds (docs/randomisation.md).
@@ -333,7 +340,7 @@ def meta_test(
 
 
 def _worlds_of(suite: str, seed: int, device: str, engine: str, randomisation: str | Path | None) -> Worlds:
-    """Return the worlds of a suite for an agent."""
+    """Open the suite on which a user's own agent is evaluated, with the device and engine to use."""
     config: Json = {"suite": suite, "seed": seed, "engine": engine}
     config["randomisation"] = None if randomisation is None else str(randomisation)
     on_gpu = open_worlds(config).on_gpu

@@ -70,11 +70,14 @@ def export(run: str | Path, out: Path | None = None, *, checkpoint: str = "last"
 
 
 def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes, float, float]:
-    """Return a policy as the bytes of an ONNX file, which computes in float32, and two largest differences of actions.
+    """Export a policy to ONNX and compare the exported actions with those of torch.
 
-    The first difference is to torch's actions in float32. The second difference is to the actions of the policy as it
-    was given, which may compute in bfloat16. ``shape`` is as in a checkpoint. BidexError is raised if torch cannot
-    export the policy or the first difference is larger than TOLERANCE.
+    Returns the content of the ONNX file, which computes in float32, and two numbers. The first is the largest
+    difference between an action of the file and torch's action in float32. The second is the largest difference to the
+    actions of ``policy`` as it was given, which may compute in bfloat16. ``shape`` is the entry ``shape`` of the
+    policy's checkpoint, and ``metadata`` are texts to store in the file.
+
+    Raises BidexError if torch cannot export the policy, or if the first difference is larger than TOLERANCE.
     """
     import onnxruntime
 
@@ -140,7 +143,7 @@ def _observations(rows: int, shape: Json) -> torch.Tensor:
 
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
-    """Return the file's metadata: texts by name, lists and tables as JSON."""
+    """Return the metadata of the ONNX file, each a text; numbers, lists and dicts are written as JSON."""
     worlds = open_worlds(config.to_json())
     versions = folder.versions()
     facts = {

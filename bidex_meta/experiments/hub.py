@@ -1,4 +1,7 @@
-"""Helpers of ``bidex-meta push`` and ``pull``: names, the files of a folder, their checks, and the hub's library."""
+"""Helpers of ``bidex-meta push`` and ``pull``, which publish and fetch folders on the Hugging Face Hub.
+
+They choose and check the files of a folder, remove local paths from them, and call ``huggingface_hub``.
+"""
 
 import contextlib
 import json
@@ -30,10 +33,10 @@ Files = Mapping[str, Path | bytes]
 
 
 def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) -> dict[str, Path]:
-    """Return the files of a folder that are published, by their path within it.
+    """Return the files of a folder that match ``patterns``, by their path relative to the folder.
 
-    Raises BidexError for a link that leads out of ``root`` (by default the folder itself), because it would publish or
-    fetch a file that nobody named.
+    These files are published or fetched. Raises BidexError if one is a link to a file outside ``root`` (by default the
+    folder itself), because such a file does not belong to the folder that the user named.
     """
     root = absolute(root or folder)
     files = {}
@@ -47,9 +50,10 @@ def files_of(folder: Path, patterns: tuple[str, ...], root: Path | None = None) 
 
 
 def checked(folder: Path) -> RunFolder | Dataset:
-    """Return the run or the data set in a folder, after reading all files that are published.
+    """Check a folder before it is published, and return the run or data set that it holds.
 
-    Raises BidexError if ``bidex-meta evaluate`` or ``bidex-meta data info`` would raise it.
+    All files that would be published are read. Raises BidexError if one cannot be read by ``bidex-meta evaluate`` (for
+    a run) or ``bidex-meta data info`` (for a data set).
     """
     if is_file(folder / _METADATA):
         from bidex_meta.data.checking import coverage, summary
@@ -70,7 +74,11 @@ def checked(folder: Path) -> RunFolder | Dataset:
 
 
 def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes]:
-    """Return a checked folder's files for publication, without paths of this machine and with a user's suite file."""
+    """Prepare the files of a checked folder for publication; return their paths or new content by name.
+
+    Paths of this machine are removed from JSON files. If the run was trained on a user's suite file, this file is
+    added.
+    """
     content: dict[str, Path | bytes] = dict(files)
     for name in files.keys() & {"config.json", "versions.json", "evaluation.json"}:
         found = read_json(files[name], "a file of a run")
@@ -87,9 +95,10 @@ def published(folder: Path, files: Mapping[str, Path]) -> dict[str, Path | bytes
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder next to ``path``, and rename it to ``path`` when the block has succeeded.
+    """Yield an empty temporary folder next to ``path``; if the block succeeds, rename this folder to ``path``.
 
-    Files that a killed process left there are deleted. Raises BidexError if ``path`` is not empty.
+    If an earlier process was killed in such a block, the temporary folder that it left is deleted. Raises BidexError if
+    ``path`` exists and is not empty, or if another process is writing it.
     """
     if exists(path) and not (path.is_dir() and not any(path.iterdir())):
         raise BidexError(f"{path} exists and is not empty. Name another, or delete it.")
@@ -141,9 +150,10 @@ def library() -> Any:
 
 
 def called(function: str, name: str, **options: Any) -> Any:
-    """Call a function of ``huggingface_hub`` for a repository; raise errors as one line.
+    """Call a function of ``huggingface_hub`` on a repository; turn its errors into a BidexError of one line.
 
-    Names of data sets begin with ``datasets/``.
+    ``name`` is the repository; names of data sets begin with ``datasets/``. ``options`` are further arguments of the
+    function.
     """
     if name.startswith(DATASETS):
         kind = "dataset"

@@ -1,4 +1,4 @@
-"""The learners by name, and their loading; :mod:`bidex_meta.training.learner` defines learners."""
+"""Find a learner by its name, and choose its preset and device; :mod:`bidex_meta.training.learner` defines learners."""
 
 import dataclasses
 import importlib
@@ -61,7 +61,10 @@ class LearnerKind:
     presets: Mapping[str, Any]  # configs by name, all of the same dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
-        """Return the autoreset mode of the learner's training world; ``config`` has fields of the learner's config."""
+        """Return the autoreset mode of the world that the learner trains on.
+
+        ``config`` maps fields of the learner's config to values; other fields have their defaults.
+        """
         config_type = type(next(iter(self.presets.values())))
         return self.make.autoreset_mode(config_type(**config))
 
@@ -72,9 +75,10 @@ def learner_class(name: str) -> type[Learner]:
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
-    """Return a learner by its name in ``ALGOS``, ignoring case, or by ``package.module:Class``; else raise BidexError.
+    """Return a learner and its presets by name; raise BidexError if there is no such learner.
 
-    A learner may have special presets for a single ``task``.
+    ``name`` is a key of ``ALGOS`` in any case, or ``package.module:Class`` for a user's own learner. If a single task
+    class ``task`` is given, presets that the learner has for this class are included.
     """
     if is_outside(name):
         make = _from_elsewhere(name)
@@ -118,10 +122,10 @@ def _from_elsewhere(name: str) -> type[Learner]:
 
 
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
-    """Return the preset's name and, in words, the reason for this preset.
+    """Choose a learner's preset; return its name and the reason for the choice as a text.
 
-    If ``asked`` is ``auto``, ``first`` (``Worlds.preset``: a preset and the reason) takes precedence over the preset
-    that fits the device.
+    ``asked`` is the requested preset. If it is ``auto``, the preset ``first`` is chosen if the learner has it,
+    otherwise one that fits the device. ``first`` is a preset and the reason, as in ``Worlds.preset``.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"

@@ -1,4 +1,4 @@
-"""The meta-test of an agent that adapts: its size and its worlds."""
+"""Run a meta-test, which evaluates an agent before and after it adapts, and choose its number of environments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,7 +74,10 @@ class Adaptation:
 
     @staticmethod
     def of(worlds: Worlds, config: RunConfig) -> "Adaptation":
-        """Return the facts about a run's learner: shots as large as in training, at most 40 episodes."""
+        """Return the facts about a run's learner that determine the size of its meta-test.
+
+        The number of episodes per task in a shot is the number in training, but at most 40.
+        """
         rollouts = _ROLLOUTS
         of_batch = config.learner_values.get("tasks_per_class")
         if of_batch is not None:
@@ -124,7 +127,10 @@ def meta_test(
 
 
 def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list[int], limit: int) -> Protocol:
-    """Return the protocol for a split whose classes have ``counts`` tasks, with at most ``limit`` environments."""
+    """Return the protocol of a meta-test on one split: numbers of tasks, episodes and adaptations.
+
+    ``counts`` has the number of tasks of each class, and ``limit`` is the maximum number of environments.
+    """
     rollouts = rollouts_of(adaptation, options.rollouts, max(1, limit // len(counts)))
     tasks = min(options.tasks or TASKS, max(counts))
     protocol = Protocol(
@@ -137,10 +143,10 @@ def _protocol(adaptation: Adaptation, options: Options, split: str, counts: list
 
 
 def rollouts_of(adaptation: Adaptation, asked: int | None, most: int) -> int:
-    """Return the number of episodes of each task in a shot: the requested number, or the default.
+    """Return the number of episodes of each task in a shot: ``asked``, or the agent's default if ``asked`` is None.
 
-    ``most`` is the largest number of environments of a class. An environment that adapts only from its own episodes
-    plays one episode in a shot, so there are no more episodes than environments.
+    If each environment adapts only from its own episodes, it plays one episode per shot. The number of episodes is then
+    limited to ``most``, the largest number of environments per class.
     """
     rollouts = asked or adaptation.rollouts
     if adaptation.is_per_environment:
@@ -164,7 +170,10 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
 
 
 def check_worlds(worlds: Worlds, name: str) -> None:
-    """Refuse worlds that show their tasks: those of Meta-World, of multi-task suites and of single classes."""
+    """Raise BidexError if observations show the task, so that there is nothing to adapt to.
+
+    This is true of Meta-World, multi-task suites and single classes. ``name`` is the agent's name for the message.
+    """
     if not worlds.hides_goals:
         raise BidexError(
             f"{name} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite (ML1-v2, ML5-v2, ML20-v2, "

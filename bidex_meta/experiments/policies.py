@@ -24,11 +24,11 @@ from bidex_meta.worlds import Worlds, open_worlds
 def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> tuple[Json, int]:
     """Return the state and the environment steps of a run's checkpoint; raise BidexError if there is none.
 
-    Differences between the run's record and this installation or the run's suite are printed, unless they were
-    ``noted`` before.
-
     ``which`` is ``last`` (the newest), ``best`` (its state has only the policy), or a file: a path, or a name in the
     run's folder of checkpoints.
+
+    A line is logged if the run was made with other versions than those of this installation. The caller sets ``noted``
+    if such a line was logged before; it is then left out.
     """
     loaded = _loaded(folder, which)
     if not noted:
@@ -57,9 +57,10 @@ def _loaded(folder: RunFolder, which: str) -> tuple[Json, int]:
 
 @contextlib.contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Turn errors while a checkpoint is loaded into a BidexError: the checkpoint does not fit the run's config.
+    """Turn errors in the block into a BidexError that says that a checkpoint does not fit its run's config.
 
-    A checkpoint may come from another version or another author, so its tensors and texts can be anything.
+    The block loads the checkpoint; ``path`` is the run's folder. The checkpoint may come from another version or
+    another author, so its tensors and texts can be anything.
     """
     try:
         yield
@@ -96,16 +97,21 @@ def policy_of(folder: RunFolder, state: Json, device: str) -> Agent:
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
-    """Return a function that makes a new policy from a run's checkpoint at each call, and the checkpoint's steps.
+    """Return a function that makes the policy of a run's checkpoint, and the checkpoint's environment steps.
 
-    The checkpoint is read only once, so all calls return the same policy even if the run is still training.
+    Each call of this function makes a new copy of the policy. The checkpoint is read only once, so all calls return the
+    same policy even if the run is still training.
     """
     state, step = checkpoint(folder, which)
     return lambda: policy_of(folder, state, device), step
 
 
 def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
-    """Say in one line how the rules under which a run trained differ from the rules of some worlds, if they differ."""
+    """Log one line if a run was trained under other rules than those of ``worlds``.
+
+    Rules are the suite's choices of reward, success condition, goal range and start states. Nothing is logged if the
+    run's suite cannot be opened.
+    """
     with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
         learned = open_worlds(folder.config().to_json())
         if learned.rules and worlds.rules and (apart := rules_apart(vars(learned.rules), worlds.rules)):
@@ -113,5 +119,9 @@ def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
 
 
 def slots_of(worlds: Worlds) -> list[str]:
-    """Return the class of each slot of some worlds; a slot of listed tasks is named Class/task."""
+    """Return the class name of each slot in the train split of ``worlds``.
+
+    A slot is a class with its tasks. If a suite lists the tasks of a class by name, each listed task has its own slot,
+    named Class/task; this function returns only the class.
+    """
     return [name.split("/")[0] for name in worlds.tasks("train")]

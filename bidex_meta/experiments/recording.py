@@ -100,7 +100,7 @@ class RecordConfig:
 
 @dataclass(frozen=True)
 class _Collection:
-    """A data set to collect."""
+    """Description of a data set to record: its source, its policies, and functions that make the world and act."""
 
     source: Worlds
     name: str  # kind in the data set's name
@@ -216,7 +216,10 @@ def _announce(collection: _Collection, world: PooledWorld, name: str) -> int:
 
 
 def _episodes(settings: RecordConfig, kind: str) -> _Collection:
-    """Return the collection of episodes with uniform actions, or with the policies of runs."""
+    """Return the description of a data set to record, of episodes with random actions or with policies of runs.
+
+    ``kind`` is ``random`` for uniform actions, and otherwise a kind whose policies are those of ``settings.runs``.
+    """
     config = _source_config(settings)
     source = open_worlds(config)
     # Sums depend on how torch splits them over threads, so a resumed collection keeps its number of threads.
@@ -248,9 +251,10 @@ def _episodes(settings: RecordConfig, kind: str) -> _Collection:
 
 
 def _report(size: int, before: int, now: Progress, seconds: float) -> None:
-    """Print a line after each round.
+    """Log the progress of a recording, after each round of episodes.
 
-    ``before`` is the number of transitions when this process began, ``seconds`` the time since then.
+    ``size`` is the requested number of transitions, and ``before`` the number of transitions when this process began.
+    ``seconds`` is the time since then.
     """
     done = sum(now.steps)
     speed = (done - before) / max(seconds, 1e-9)
@@ -263,7 +267,10 @@ def _report(size: int, before: int, now: Progress, seconds: float) -> None:
 
 
 def _source_config(settings: RecordConfig) -> Json:
-    """Return the config of the source: that of the runs or, without a run, one built from the recording's settings."""
+    """Return the config of the suite or class to record in.
+
+    This config is part of the config of the runs whose policies act. Without runs, it is built from ``settings``.
+    """
     if settings.runs:
         configs = []
         for run in settings.runs:
@@ -304,9 +311,10 @@ def _actor(settings: RecordConfig, path: Path, device: str) -> tuple[Actor, Json
 
 
 def _demonstrations(settings: RecordConfig) -> _Collection:
-    """Return the collection of successful replays of a class's witness or scripted policy.
+    """Return the description of a data set to record, of successful demonstrations on one class with moving bases.
 
-    Bases move, as in suites.
+    A demonstration replays the class's witness (a stored action sequence that solves a task), or runs its scripted
+    policy.
     """
     if settings.base == "fixed" or settings.engine == "warp" or settings.device not in ("auto", "cpu"):
         raise BidexError(

@@ -103,7 +103,11 @@ def _run(run: Run, name: str) -> Json:
 
 
 def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
-    """Return tables of final evaluations, or why there are none; ``short`` maps runs' paths to names of groups."""
+    """Return the final evaluations for the page: tables, a picture, and the number of runs that have none.
+
+    If the evaluations cannot be compared, the result has no tables but the reason. ``short`` maps the path of each run
+    to the short name of its group.
+    """
     evaluated = [run for run in runs if run.evaluated]
     found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
     try:
@@ -123,7 +127,10 @@ def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
 
 
 def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str]]:
-    """Yield name and picture of each run that ended with a meta-test."""
+    """Yield, for each run that ended with a meta-test, the run's name and a picture of its adaptation.
+
+    The picture is a data URL.
+    """
     for run in filter(lambda run: run.evaluated, runs):
         with suppress(BidexError):  # the final table reports the error
             found = run.evaluation()
@@ -151,9 +158,10 @@ def _cell(value: object) -> str:
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
-    """Yield run, file and content of the newest film of each kind (the file's name before ``_<step>``).
+    """Yield, for the newest film of each kind in each run, the run's name, the file's name and the content.
 
-    The content is a data URL of a video (of an image for WebP), or None if the film is too large.
+    Films are of one kind if their file names before ``_<step>`` are equal. The content is a data URL of a video (of an
+    image for WebP), or None if the film is too large for the page.
     """
     room = FILM_BYTES
     for run in runs:

@@ -23,11 +23,12 @@ _WIDTH = 1200
 
 
 def resolve(config: AnyConfig, where: str = "run") -> AnyConfig:
-    """Return a config with every value filled in, as ``config.json`` holds it.
+    """Return a run's config in which every value is filled in; ``config.json`` stores this config.
 
-    A value that is None, ``"auto"`` or left out of ``learner`` gets a value that suits the suite, the learner and the
-    device. Paths become absolute, because a run may be resumed from another folder. Resolving a config again changes
-    nothing. ``where`` names the config in messages. Raises BidexError for unknown names, devices and settings.
+    Values that are None or ``"auto"``, and fields that ``learner`` does not set, get values that suit the suite, the
+    learner and the device. Paths become absolute, because a run may be resumed from another folder. Resolving a
+    resolved config changes nothing. ``where`` names the config in error messages. Raises BidexError for unknown names,
+    devices and settings.
     """
     dataset = run_data.whole_paths(config.dataset)
     datasets = run_data.open_datasets(dataset)
@@ -98,7 +99,11 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
 
 
 def check_resumed(folder: RunFolder, config: AnyConfig) -> None:
-    """Raise BidexError if a run cannot go on with a resolved config, or its worlds are no longer the same."""
+    """Raise BidexError if a run cannot be resumed with a resolved config.
+
+    The config must equal the run's, apart from fields that may change. The number of processes, the physics and the
+    suite must be the same as when the run was made.
+    """
     stored = resolve(folder.config(), str(folder.config_path))
     processes = folder.config().processes
     if processes != config.processes:

@@ -25,19 +25,20 @@ _FORM = ("suite", "task", "base", "object", "points", "touch")
 
 
 def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
-    """Return our entry in a data set's metadata, with the items of ``more``, ready for JSON.
+    """Return this package's entry in the metadata of a data set, ready for JSON; ``more`` are further items.
 
-    ``policies`` describe the policies that acted, in the order of ``Episode.policy``. The entry has:
+    ``policies`` describes the policies that acted; ``Episode.policy`` is an index into it. The entry has:
 
     - ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``; the others are None
-    - ``points``: number of points of a cloud; ``touch``: whether observations show touch sensors
-    - ``tasks``: names of the slots; ``instructions``: instruction of each slot's class
+    - ``points``: number of points of the observed point cloud; ``touch``: whether observations show touch sensors
+    - ``tasks``: names of the world's slots (classes, or listed tasks as Class/task)
+    - ``instructions``: instruction of each slot's class
     - ``reward_scales``: factor of the reward by slot; ``rules``: the suite's rules; ``hides_goals``
     - ``observation_groups``: name and index ranges of each group
     - ``kind`` (``random``, ``medium``, ...), ``policies``, and ``seed`` of the tasks
     - ``references``: {class: {random, zero, expert}}, unscaled returns
     - ``versions`` and ``commit``
-    - ``gymnasium_id`` of the same environment; None for a suite or an altered class
+    - ``gymnasium_id``: id of the same environment in Gymnasium; None for a suite or a class with changed options
     """
     alone = source.class_name
     versions = collect_versions()
@@ -86,7 +87,11 @@ def open_datasets(names: Sequence[str]) -> list[Dataset]:
 
 
 def implied(datasets: Sequence[Dataset]) -> Json:
-    """Return suite (or task, base, object), points and touch that all data sets share; empty without metadata."""
+    """Return the settings of the world in which all data sets were recorded.
+
+    The settings are ``suite``, or ``task``, ``base`` and ``object``; and ``points`` and ``touch``. The dict is empty if
+    there are no data sets, or if the first has no metadata of this package. Raises BidexError if the settings differ.
+    """
     forms = [tuple(dataset.metadata.get(name) or None for name in _FORM) for dataset in datasets]
     if not forms or forms[0][:2] == (None, None):
         return {}
@@ -117,7 +122,11 @@ def task_seed(datasets: Sequence[Dataset]) -> int | None:
 
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
-    """Refuse a learner and data sets that do not fit each other."""
+    """Raise BidexError if a learner cannot train on the given data sets.
+
+    This is the case if an offline learner has no data, or another learner has some; if ``record`` is set for an offline
+    learner; if several processes share an offline run; or if the data's observations do not fit ``source``.
+    """
     if Capability.OFFLINE not in kind.make.capabilities:
         if datasets:
             names = ", ".join(name for name in ALGOS if Capability.OFFLINE in learner_kind(name).make.capabilities)
@@ -136,7 +145,11 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
 
 
 def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
-    """Refuse demonstrations of other classes or bases, or with other goals; only metadata are read."""
+    """Raise BidexError if a learner cannot imitate the given demonstrations; only their metadata are read.
+
+    The demonstrations must be of classes of ``source``, with the same number of actions (that is, the same kind of
+    bases) and fitting observations.
+    """
     if names and Capability.IMITATES not in kind.make.capabilities:
         takers = ", ".join(name for name in ALGOS if Capability.IMITATES in learner_kind(name).make.capabilities)
         raise BidexError(f"{kind.name} does not imitate; --demonstrations goes with {takers}. Leave one of them out.")
@@ -158,9 +171,10 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
 
 
 def _check_shown(dataset: Dataset, source: Worlds) -> None:
-    """Refuse data that hide the goals if the source shows them, or that differ from it in touch sensors.
+    """Raise BidexError if the observations of a data set do not fit those of ``source``.
 
-    Data may show goals that the source hides.
+    Both must have the same touch sensors. If ``source`` shows the goals, the data must show the goals too. If
+    ``source`` hides the goals, the data may still show the goals, unless the observations contain point clouds.
     """
     check_touch(dataset, source.touch)
     about = dataset.metadata
@@ -173,7 +187,10 @@ def _check_shown(dataset: Dataset, source: Worlds) -> None:
 
 
 def announced(names: Sequence[str], what: str, source: Worlds) -> list[Dataset]:
-    """Open data sets; print their size after the text ``what``, and a note for each set recorded under other rules."""
+    """Open data sets, log their total size after the text ``what``, and return the data sets.
+
+    A note is logged for each data set that was recorded under other rules than those of ``source``.
+    """
     datasets = open_datasets(names)
     steps = sum(dataset.num_steps for dataset in datasets)
     episodes = sum(dataset.num_episodes for dataset in datasets)

@@ -14,10 +14,11 @@ from bidex_meta.worlds import Worlds
 
 
 def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollector:
-    """Wrap the world in a collector with the number of environments that yields ``config.record`` transitions.
+    """Wrap the world of a run in a collector, which stores the transitions of some environments.
 
-    ``folder`` is the run's folder. Raises BidexError if the disk is too small for the transitions, or memory for the
-    running episodes.
+    The collector stores the share ``config.record_share`` of the environments, so that it collects about
+    ``config.record`` transitions in the whole run. ``folder`` is the run's folder. Raises BidexError if the disk is too
+    small for the transitions, or the memory for the running episodes.
     """
     rows = spread_environments(world, config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
@@ -33,9 +34,9 @@ def recorded(config: AnyConfig, folder: Path, world: PooledWorld) -> RunCollecto
 
 
 def begin(collector: RunCollector, folder: Path, fresh: bool) -> None:
-    """Set the data set's folder within the run's folder.
+    """Tell the collector to write its data set into the folder ``replay`` of the run.
 
-    A ``fresh`` run opens the folder here; otherwise loading the checkpoint opens it.
+    If the run is ``fresh``, writing begins at once. In a resumed run it begins when the checkpoint is loaded.
     """
     collector.folder = folder / "replay"
     if fresh:
@@ -43,7 +44,7 @@ def begin(collector: RunCollector, folder: Path, fresh: bool) -> None:
 
 
 def complete(config: AnyConfig, worlds: Worlds, collector: RunCollector) -> None:
-    """Make a data set of what all processes collected."""
+    """Turn the transitions that all processes have stored into a data set, which can then be opened."""
     policy = {"algo": config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
     about = dataset_metadata(worlds, collector, "replay", [policy])
     name = writer.default_name(worlds.name, "replay")

@@ -30,7 +30,10 @@ def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None:
-    """Refuse teachers that do not fit the learner or its worlds, before anything is built."""
+    """Raise BidexError if the teachers in a config do not fit its learner or ``source``.
+
+    The check is made before any world or learner is built. ``source`` is the suite or class to train on.
+    """
     if not config.teacher:
         if Capability.TAUGHT in kind.make.capabilities:
             raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
@@ -54,9 +57,11 @@ def _takes(kind: LearnerKind) -> bool:
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
-    """Return the first teacher that knows each class, by the class's name in ``source.task_classes()``.
+    """Choose the teacher of each class; return it by the class's name in ``source.task_classes()``.
 
-    Raises BidexError for a run that cannot teach here.
+    ``names`` are runs, or ``scripts`` for scripted policies. The first of these that has learned (or has a script for)
+    a class teaches it. Classes without a teacher are left out. Raises BidexError if a run has learned none of the
+    classes.
     """
     knows = {name: _scripted(source) if name == SCRIPTS else _known_to(name, source) for name in names}
     teachers = {}
@@ -68,7 +73,7 @@ def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
 
 
 def _scripted(source: Worlds) -> set[str]:
-    """Return the classes that have a script; raise BidexError if bases do not move."""
+    """Return the names of the classes that have a scripted policy; raise BidexError if the hands' bases are fixed."""
     if not source.moving_bases:
         raise BidexError(
             f"--teacher scripts moves the hands' bases, which are fixed in {source.name}. Add --base moving."
@@ -77,7 +82,11 @@ def _scripted(source: Worlds) -> set[str]:
 
 
 def _known_to(name: str, source: Worlds) -> set[str]:
-    """Return the classes of ``source`` that a run's policy has learned, with equal observations and actions."""
+    """Return the names of the classes in ``source`` that the policy of a run can teach.
+
+    The run must have learned the class, with the same observations and actions. ``name`` is the run's folder. Raises
+    BidexError if there is no such class, or if the run's policy adapts to tasks.
+    """
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
         raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that does not adapt.")
@@ -140,6 +149,6 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
 
 
 def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:
-    """Return the environments of some classes, int64 (k,)."""
+    """Return the indices of the environments that belong to the classes ``tasks``, int64 (k,)."""
     chosen = torch.tensor([i for i, task in enumerate(slots) if task in tasks], device=world.device)
     return torch.isin(world.task_id, chosen).nonzero().squeeze(1)

@@ -76,7 +76,10 @@ class Check:
 
     @property
     def outcome(self) -> str:
-        """Return the worst outcome over all fields, one of those of ``bidex_meta.evaluation.agreement``."""
+        """Return ``equal``, ``within`` or ``differs``: the worst agreement over all classes and other fields.
+
+        :mod:`bidex_meta.evaluation.agreement` defines these three outcomes.
+        """
         outcomes = {each.outcome for each in self.classes}
         if self.different or DIFFERS in outcomes:
             return DIFFERS
@@ -87,10 +90,11 @@ def submit(
     folders: Sequence[RunFolder], out: Path, *, name: str | None, tuning: tuple[int, int], episodes: int | None,
     device: str
 ) -> Path:  # fmt: skip
-    """Evaluate runs on their own and on new tasks, write the leaderboard's entry, and return the entry's path.
+    """Evaluate runs on their train tasks and on new tasks, and write the result as an entry of the leaderboard.
 
-    Runs of learners that adapt play a meta-test of three episodes per trial. The seed of all starts and of the new
-    tasks comes from the digests of the policies.
+    Runs of learners that adapt play a meta-test with two adaptation rounds, so that a trial has three episodes. The
+    seed of all start states and of the new tasks is computed from the digests of the policies. Returns the path
+    of the entry.
 
     Args:
         folders: Runs that differ only in the seed.
@@ -101,7 +105,8 @@ def submit(
             that adapt.
         device: ``auto``, ``cpu`` or ``cuda:N``.
 
-    Raises BidexError for runs that cannot form one entry, and if there is an entry of this name or of equal weights.
+    Raises BidexError if the runs cannot form one entry, or if there is already an entry of this name or with the
+    weights of one of the runs.
     """
     runs = read_runs(folders)
     config = runs[0].config
@@ -195,7 +200,11 @@ def submit_agent(
 
 
 def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
-    """Return the track of runs, from their learner's class and their sources; None if it cannot be known."""
+    """Return the leaderboard's track to which runs belong; None if it cannot be known.
+
+    Runs whose learner does not adapt are in the multi-task track. The others are ``reward-only`` or ``privileged``,
+    depending on what they learned from.
+    """
     if Capability.ADAPTS not in learner_class(runs[0].config.algo).capabilities:
         return MULTI_TASK
     privileged = [_was_privileged(run.config) for run in runs]
@@ -207,10 +216,11 @@ def _track_of(runs: Sequence[SubmittedRun]) -> Track | None:
 
 
 def _was_privileged(config: RunConfig) -> bool | None:
-    """Return whether a run, or the run that it started from, had more than the rewards of its own episodes.
+    """Return whether a run was trained with more information than the rewards of its own episodes.
 
-    Such further information comes from teachers, demonstrations, data sets, a suite that shows its goals, or the
-    ``privileges`` of the learner's class. The result is None if the run that it started from cannot be found.
+    Further information comes from teachers, demonstrations, data sets, a suite that shows its goals, or the
+    ``privileges`` of the learner's class. If the run started from the policy of another run, that run counts too. The
+    result is None if that run cannot be found.
     """
     seen = set[str]()
     while True:
@@ -271,7 +281,10 @@ def read_runs(folders: Sequence[RunFolder], *, shipped: bool = True) -> list[Sub
 
 
 def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, device: str) -> Json:
-    """Evaluate runs and return the content of their entry, without name, tuning and seal."""
+    """Evaluate runs and return the content of their leaderboard entry.
+
+    The caller adds the entry's name, the facts about tuning, and the digest of the evaluation.
+    """
     first = runs[0].config
     if episodes is None:
         episodes = _EPISODES if track == MULTI_TASK else _EPISODES_OF_TRIALS
@@ -298,7 +311,10 @@ def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, de
 
 
 def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
-    """Return worlds of a run's own tasks, and worlds of the same number of new tasks, which ``seed`` draws."""
+    """Open the suite of a run twice: with the tasks that the run was trained on, and with as many new tasks.
+
+    ``seed`` draws the new tasks.
+    """
     config = stored.to_json()
     config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
     return open_worlds(config), open_worlds({**config, "task_seed": seed, "tasks_per_class": None})
@@ -306,7 +322,7 @@ def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
 
 @dataclass(frozen=True)
 class _Played:
-    """The episodes of a run on tasks of one kind."""
+    """Results of one run, either on the tasks that it was trained on or on new tasks."""
 
     by_shot: Sequence[Evaluation]
     trials: int = 1
@@ -336,7 +352,7 @@ def _adapted(
 
 
 def _part(played: Sequence[_Played], episodes: int) -> Json:
-    """Return the results of all runs on tasks of one kind, ready for JSON."""
+    """Return the results of all runs on their train tasks or on new tasks, by shot and class, ready for JSON."""
     first = played[0]
     shots = []
     for evaluations in zip(*(of_run.by_shot for of_run in played), strict=True):
@@ -367,12 +383,15 @@ def receipt(runs: Sequence[SubmittedRun]) -> Json:
 
 
 def _config_digest(folder: RunFolder) -> str:
-    """Return the digest of a run's config as its file has it: without options that bidex-meta gained since then."""
+    """Return the digest of a run's config, computed from the file ``config.json`` without local paths.
+
+    The file is used because it has no options that were added to this package later; these would change the digest.
+    """
     return content_digest(portable(read_json(folder.config_path, "a run's config")))
 
 
 def _facts(run: SubmittedRun) -> tuple[float, str, str | None]:
-    """Return the hours of training, the device, and the commit that trained."""
+    """Return a run's hours of training, its device, and the commit of the code that trained it."""
     versions = run.folder.versions()
     config = run.config
     if config.device.startswith("cuda"):

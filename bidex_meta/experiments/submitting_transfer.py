@@ -41,7 +41,11 @@ _FACTS = ("suite", "algorithm", "train_tasks", "steps", "start", "scratch", "see
 
 @dataclass(frozen=True)
 class _Transfer:
-    """A run, and the runs that learned the held-out classes; both dictionaries map a class to runs, sorted by seed."""
+    """A pretrained run, and the runs that then learned the held-out classes of its suite.
+
+    ``transferred`` holds the runs that started from the pretrained policy, and ``scratch`` the runs that started from
+    scratch. Both map a class to its runs, sorted by seed.
+    """
 
     run: SubmittedRun
     seeds: list[int]
@@ -50,7 +54,7 @@ class _Transfer:
 
     @property
     def played(self) -> list[SubmittedRun]:
-        """Return the runs that started from the run's policy, class by class."""
+        """Return the runs that started from the pretrained policy, class by class."""
         return _in_order(self.transferred)
 
 
@@ -150,7 +154,10 @@ def _policies(of_seeds: Mapping[int, RunFolder]) -> list[SubmittedRun]:
 
 
 def _played(found: _Transfer, episodes: int, device: str) -> Json:
-    """Evaluate all policies and return the content of the entry, without name, tuning and seal."""
+    """Evaluate all policies of a transfer and return the content of its leaderboard entry.
+
+    The caller adds the entry's name, the facts about tuning, and the digest of the evaluation.
+    """
     stored = found.run.config
     seed = evaluation_seed(run.weights for run in found.played)
     config = stored.to_json()
@@ -184,7 +191,11 @@ def _on_new_tasks(run: SubmittedRun, file: Path, config: Json, episodes: int, se
 
 
 def _solved(evaluation: Evaluation) -> list[int]:
-    """Return the number of successes of each task of the only class, with all of the class's objects."""
+    """Return the number of successful episodes of each task, in the order of the tasks.
+
+    The evaluation is of a single class. If it has several objects, the tasks of all objects are listed one after
+    another.
+    """
     solved = []
     for row in evaluation.classes.values():
         solved += row.solved

@@ -1,4 +1,7 @@
-"""Measures of whether there is something to learn about the tasks of a suite."""
+"""Measure whether a suite tests adaptation.
+
+This requires, for example, that a policy fails if it does not know the task, and that rewards reveal the task.
+"""
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
@@ -28,9 +31,10 @@ _NOTHING = ("uniform", "zero", "held")  # untrained policies
 
 
 def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
-    """Measure whether there is something to learn about the tasks of ``worlds``; return a row per class.
+    """Measure, for each class, whether a policy must and can find out the task; return a row per class.
 
-    ``runs`` are folders of runs whose policies know the tasks. Raises BidexError for worlds without hands.
+    For example, a row has the success of policies that do not know the task, and of policies that know it. ``runs`` are
+    folders of runs whose policies know the tasks. Raises BidexError for suites without hands (Meta-World).
     """
     rows: dict[str, Json] = {}
     for split in worlds.splits:
@@ -46,7 +50,7 @@ def blind_share(slot: Slot, worlds: Worlds) -> float:
 
 
 def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Json]:
-    """Return the row of each class of a split."""
+    """Return the results of :func:`validity_rows` for the classes of one split."""
     world = worlds.world(split)
     if not isinstance(world, World):
         raise BidexError(f"Expected a suite of hands, got {worlds.name}.")
@@ -76,7 +80,10 @@ def _of_split(worlds: Worlds, split: str, runs: Sequence[Path]) -> dict[str, Jso
 
 
 def _witnesses(world: World) -> OpenLoopReplay:
-    """Return an agent that replays each class's witness, which was found for task 0 of version 1, in all tasks."""
+    """Return an agent that replays a stored action sequence, the class's witness, in every task of a class.
+
+    The sequence solves task 0 of version 1 of the class; in other tasks it need not succeed.
+    """
     known = {name: load_witness(plain_name(name)) for name in _with_witness(world)}
     return OpenLoopReplay(known, list(world.task_names), world.task_id, world.action_size)
 
@@ -92,7 +99,11 @@ def _scripted(world: World) -> list[str]:
 
 
 def _identified(slot: Slot, worlds: Worlds) -> Json:
-    """Measure how well the best exploring episode identifies the hidden parts of a class."""
+    """Measure how well the rewards of one exploring episode reveal the hidden values of a class's tasks.
+
+    Several exploring policies are tried, and the best result is returned: the share of tasks whose hidden values were
+    identified, and the 90 % quantile of the errors in units of the task's tolerance.
+    """
     say(f"{slot.name}: what rewards tell")
     world = World([slot], WorldConfig(len(slot.tasks), engine="c", threads=worlds.threads, autoreset_mode="DISABLED"))
     explorers: list[Agent | None] = [None]
@@ -104,7 +115,10 @@ def _identified(slot: Slot, worlds: Worlds) -> Json:
 
 
 def _results(worlds: Worlds, world: World, runs: Sequence[Path]) -> dict[str, dict[str, ClassResult]]:
-    """Return the results by class and policy, for each class that a policy can act in."""
+    """Evaluate simple policies, scripted policies and the policies of ``runs`` on the classes of a split.
+
+    Returns the results by class and then by policy; a class has only results of policies that can act in it.
+    """
     scripted = _scripted(world)
     agents: dict[str, tuple[Agent, Collection[str]]] = {
         "uniform": (RandomAgent(world.action_space, worlds.seed), world.task_names),

@@ -60,9 +60,10 @@ class _File(_Shared):
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a plan.
+    """One run of a sweep.
 
-    It trains in a separate process, which is the command ``bidex-meta`` with the words of ``begin`` or ``resume``.
+    It trains in a separate process. ``begin`` and ``resume`` are the command-line arguments of ``bidex-meta`` that
+    start this process.
     """
 
     path: Path
@@ -105,16 +106,20 @@ class PlannedRun:
 
     @property
     def begin(self) -> list[str]:
-        """Return the words of the command line that begin the run."""
+        """Return the command-line arguments of ``bidex-meta`` that start the run."""
         return ["run", *self._words(), f"--run-dir={self.path}"]
 
     @property
     def resume(self) -> list[str]:
-        """Return the words of the command line that resume the run."""
+        """Return the command-line arguments of ``bidex-meta`` that resume the run."""
         return ["run", f"--resume={self.path}", *self._words(may_change=True)]
 
     def _words(self, may_change: bool = False) -> list[str]:
-        """Return a flag for each given value; with ``may_change`` also for values that a resumed run may change."""
+        """Return the command-line flags that set the values of this run.
+
+        Values that equal their defaults have no flag, except the learner and the seed. With ``may_change``, values that
+        a resumed run may change get a flag even if they equal their defaults.
+        """
         content = self.given.to_json()
         learner = content.pop("learner")
         words = []
@@ -168,10 +173,14 @@ class SweepPlan:
     @classmethod
     @checked_arguments
     def read(cls, file: str | Path, root: str | Path = "runs") -> "SweepPlan":
-        """Read a study file (docs/sweeps.md); the plan has all arms with the first seed, then with the second, etc.
+        """Read a plan from a study file (docs/sweeps.md).
+
+        The plan lists the runs of all arms (learners with settings) with the first seed, then those with the second
+        seed, and so on.
 
         ``root`` is the folder that contains the study's folder. Raises BidexError if the file is wrong, or if two of
-        its runs have the same name. Values that ``bidex-meta run`` refuses are refused by ``bidex_meta.sweep``.
+        its runs have the same name. ``bidex_meta.sweep`` later raises an error for
+        values that ``bidex-meta run`` does not accept.
         """
         return _read(Path(file), expanded(root))
 
@@ -245,9 +254,10 @@ def _runs(path: Path, file: _File, arms: Sequence[_Arm], folder: Path) -> Iterat
 
 
 def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, JsonObject]]:
-    """Yield the label and all values of every combination of the grid for an arm.
+    """Yield all combinations of the values in the grid that apply to an arm.
 
-    Fields that the arm itself sets are left out of the grid.
+    An arm is a learner with its settings. Each combination comes as a label and the values of all fields, including
+    those that the file or the arm sets. Fields that the arm sets are left out of the grid.
     """
     shared = _by_field(file.overrides)
     own = _by_field(arm.overrides)
@@ -259,12 +269,19 @@ def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, JsonObject]]:
 
 
 def _by_field(flags: JsonObject) -> JsonObject:
-    """Return values in a flat dict by field name; a file may write names with hyphens, as flags are written."""
+    """Flatten nested tables of settings into one dict whose keys are field names.
+
+    A study file may write names with hyphens, like flags; these become underscores.
+    """
     return {flag.replace("-", "_"): value for flag, value in flat(flags).items()}
 
 
 def _parsed(where: str, values: JsonObject, called: str) -> tuple[RunConfig[JsonObject], FinalEvaluation]:
-    """Return values as a config and an evaluation; ``called`` replaces ``{subject}`` in texts."""
+    """Return the run's config and its final evaluation, from values by field name.
+
+    ``called`` is the short name of the suite or class; it replaces ``{subject}`` in texts. ``where`` begins the error
+    messages.
+    """
     parts: dict[str, JsonObject] = {"config": {}, "learner": {}, "final": {}}
     of_final = {entry.name for entry in fields(FinalEvaluation)}
     of_config = {entry.name for entry in fields(RunConfig)}.difference(_OWN, _NO_FLAGS, ["start_from"])
@@ -294,7 +311,7 @@ def _filled(value: Json, called: str) -> Json:
 
 
 def words_of(name: str, value: Json) -> list[str]:
-    """Return a field of the config of ``bidex-meta run`` with its value, as words of the command line."""
+    """Return the command-line arguments of ``bidex-meta run`` that set the field ``name`` to ``value``."""
     flag = name.replace("_", "-")
     if isinstance(value, bool):
         before, dot, last = flag.rpartition(".")

@@ -366,7 +366,12 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
-    """Return a core per worker, from those in ``asked`` (``0,2-3``); None for each if processes cannot be bound."""
+    """Return the core of each worker.
+
+    ``asked`` lists the cores to choose from, such as ``0,2-3``; None: all usable cores. ``workers`` is the number of
+    workers; None: one, or one for each core in ``asked``. If processes cannot be bound to cores on this system, each
+    entry of the result is None. Raises BidexError for unknown cores, or if there are fewer cores than workers.
+    """
     linux = sys.platform == "linux"
     usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable

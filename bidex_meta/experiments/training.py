@@ -1,6 +1,6 @@
-"""Training from a config to a run folder: config, folder, world, learner, training, in this order.
+"""Train a learner: resolve the config, lock the run's folder, build the world and the learner, and train.
 
-With several processes (torchrun), each has its own world and learner. Only process 0 writes, logs and calls
+If torchrun started several processes, each has its own world and learner. Only process 0 writes, logs and calls
 ``on_event``.
 """
 
@@ -161,7 +161,10 @@ def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: cont
 
 
 def _agree(config: AnyConfig, loaded: Checkpoint | None) -> AnyConfig:
-    """Return process 0's config; refuse processes that have another config, or see other checkpoints."""
+    """Return the config of process 0, which all processes then use.
+
+    Raises BidexError if a process has another config (apart from the number of threads), or sees another checkpoint.
+    """
     everyone = distributed.share((config, loaded and loaded[1]))
     first, step = everyone[0]
 
@@ -222,7 +225,11 @@ def _begin(
 
 
 def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
-    """Return the learner with data and teachers; a ``fresh`` one gets the policy of ``config.start_from``, if any."""
+    """Return the learner of a config, with its data sets, demonstrations and teachers.
+
+    If the training is ``fresh``, that is, not resumed, the learner starts from the policy of ``config.start_from``, if
+    that is set.
+    """
     sources = _sources(config, worlds, world)
     # A learner of another package that takes no sources may lack this argument.
     if sources == NO_SOURCES:
@@ -338,7 +345,10 @@ def _nothing_left(config: AnyConfig, steps: int, minutes: float) -> str:
 
 
 def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | None:
-    """Return a function that says if an iteration's metrics end the training; None if the config sets no such limit."""
+    """Return a function that checks whether the metrics of an iteration reach a limit that ends the training early.
+
+    Returns None if the config sets no limit of return, success or score.
+    """
     if config.stop_at_return is None and config.stop_at_success is None and config.stop_at_score is None:
         return None
 

@@ -1,4 +1,7 @@
-"""Plan a transfer: a suite file and demonstrations per held-out class, and a run per cell of the tables."""
+"""Plan a transfer experiment, which trains on held-out classes from a run's policy and from scratch.
+
+The plan consists of a suite file and demonstrations for each held-out class, and of the runs to train.
+"""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -38,7 +41,7 @@ _PATIENCE = 3  # maximum number of rounds in which a script plays
 
 @dataclass(frozen=True)
 class Cell:
-    """One run, which belongs to a cell of a table."""
+    """One run of a transfer experiment: a class, an initial policy, a number of demonstrations, and a seed."""
 
     run: PlannedRun
     task: str  # the held-out class
@@ -55,7 +58,11 @@ class Arm(NamedTuple):
 
 
 def arms_of(folders: Sequence[RunFolder]) -> list[Arm]:
-    """Return the arms: the first run, a fresh policy with the first run's network, and the other runs."""
+    """Return the initial policies that a transfer experiment compares.
+
+    They are the policy of the first run, untrained weights with the network of the first run, and the policies of the
+    other runs, in this order. Raises BidexError if two runs' folders have the same name.
+    """
     arms = []
     for folder in folders:
         values = folder.config().learner_values
@@ -222,10 +229,11 @@ def cells_of(
     config: AnyConfig, final: FinalEvaluation, file: Path, name: str, arms: Sequence[Arm], out: Path, steps: int,
     counts: Sequence[int], dataset: Dataset | None
 ) -> Iterator[Cell]:  # fmt: skip
-    """Yield the cells of a class, with the seed of ``config``.
+    """Yield the runs of a transfer experiment on one class, with the seed of ``config``.
 
-    There is a cell per arm for each count of demonstrations, and then for learning by reinforcement. Without a data
-    set, counts above 0 are left out. With 0 steps, learning by reinforcement is left out.
+    For each entry of ``counts`` there is a run per arm (initial policy) that learns from this number of demonstrations.
+    After these there is a run per arm that trains by reinforcement learning for ``steps`` steps; none if ``steps`` is
+    0. Without a data set, counts above 0 are left out.
     """
     preset = replace(config, learner=learner_kind(config.algo).presets[config.preset]).learner_values
     changed = {key: value for key, value in config.learner_values.items() if value != preset[key]}

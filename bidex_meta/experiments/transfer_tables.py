@@ -7,7 +7,7 @@ from bidex_meta.runs.atomic import Json
 
 
 def reinforcement_table(rows: Sequence[Json], end: int) -> tuple[list[str], list[list[str]]]:
-    """Return columns and rows of a table of runs that learned by reinforcement for ``end`` steps."""
+    """Return columns and rows of a table of runs that trained by reinforcement learning for ``end`` steps."""
     columns = [*(f"at {int(at):,} (%)" for at in rows[0]["at"]), "at the end (%)", "return", "area (%)"]
     table = []
     for row in rows:

@@ -1,4 +1,8 @@
-"""Measure how much a run's policy helps on unseen classes: by reinforcement, and from a few demonstrations."""
+"""Measure how much the policy of a run helps on unseen classes.
+
+Training that starts from the policy is compared with training from scratch: by reinforcement learning, and from a few
+demonstrations.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -70,13 +74,15 @@ def transfer(
     Args:
         run: A run on a suite with held-out classes, whose policy is measured.
         out: The folder of the runs, the tables and the figures.
-        start_from: Other runs to start from; their observations must have the same form.
+        start_from: Further runs whose policies training also starts from; their observations must have the same
+            form.
         classes: Held-out classes; empty: all held-out classes of the run's suite.
-        steps: Environment steps of each run that learns by reinforcement; 0: no such runs.
+        steps: Environment steps of each run that trains by reinforcement learning; 0: no such runs.
         demonstrations: Numbers of demonstrated episodes that runs learn from; empty: no such runs.
-        data: Data sets of demonstrations, which replace episodes of the classes' scripts.
+        data: Data sets of demonstrations. For other classes, the class's scripted policy records demonstrations.
         seeds: Number of runs of each kind; their seeds are 0, 1, ...
-        config: The config of every run, whose learner is ``ppo``; suite, seed, steps and initial policy are set here.
+        config: The config of every run, whose learner is ``ppo``; ``transfer`` sets suite, seed, steps and
+            initial policy.
         final: The evaluation at the end of every run.
         workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
         cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
@@ -126,7 +132,10 @@ def _cells(
     config: AnyConfig, final: FinalEvaluation, worlds: Worlds, classes: Sequence[str], arms: Sequence[Arm], out: Path,
     steps: int, counts: Sequence[int], data: Sequence[str], seeds: int
 ) -> list[Cell]:  # fmt: skip
-    """Return all runs, those of the first seed first; write suite files, and record missing demonstrations."""
+    """Prepare a transfer experiment and return all its runs, ordered by seed.
+
+    This writes a suite file for each class. It also records the demonstrations that are missing.
+    """
     for folder in ("suites", "data", "runs"):
         (out / folder).mkdir(exist_ok=True)
     files = {name: suite_file(worlds, name, out / "suites") for name in classes}
@@ -145,7 +154,11 @@ def _cells(
 
 
 def _rows(cells: Sequence[Cell], steps: int) -> tuple[list[JsonObject], list[JsonObject]]:
-    """Return the rows of the runs that are done: by reinforcement, and by demonstrations."""
+    """Return the rows of ``transfer.json`` for runs that are finished.
+
+    The first list is for reinforcement learning and has a row per class and initial policy. The second list is for
+    learning from demonstrations and has a row per class, initial policy and number of demonstrations.
+    """
     groups: dict[tuple[str, str, int | None], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.task, cell.arm, cell.demonstrations), []).append(cell)

@@ -46,16 +46,19 @@ class Verification:
     classes: Sequence[Agreement]
 
     def count(self, outcome: str) -> int:
-        """Return the number of classes with an outcome of ``bidex_meta.evaluation.agreement``."""
+        """Return the number of classes with the given outcome: ``equal``, ``within`` or ``differs``.
+
+        :mod:`bidex_meta.evaluation.agreement` defines these outcomes.
+        """
         return sum(each.outcome == outcome for each in self.classes)
 
     @property
     def agrees(self) -> bool:
-        """Return whether no class differs beyond its intervals."""
+        """Return True if no class differs by more than the confidence intervals of the two evaluations allow."""
         return self.count(DIFFERS) == 0
 
     def to_json(self) -> Json:
-        """Return everything, ready for JSON."""
+        """Return the verification as a dict, ready for JSON: run, steps, conditions and results by class."""
         report: Json = {"run": str(self.run.path), "steps": self.steps, "conditions": list(self.conditions)}
         report |= {outcome: self.count(outcome) for outcome in (EQUAL, WITHIN, DIFFERS)}
         return report | {"classes": {each.name: each.to_json() for each in self.classes}}

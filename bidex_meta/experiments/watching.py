@@ -38,7 +38,10 @@ _MOST_FILM_STEPS = 300
 
 
 def check(config: AnyConfig, worlds: Worlds) -> None:
-    """Refuse settings that would fail in the middle of training: films that cannot be made, or a missing logger."""
+    """Raise BidexError for settings that would fail in the middle of training.
+
+    Such settings are a logger that is not installed, and films on a machine that cannot make them.
+    """
     check_logger(config.logger)
     if config.video_every is not None:
         worlds.task_classes()
@@ -47,7 +50,11 @@ def check(config: AnyConfig, worlds: Worlds) -> None:
 
 
 class Watch:
-    """Function to call after each iteration; it evaluates or films every N iterations, counted over all resumes."""
+    """Evaluates and films the learner during training; the training loop calls it after each iteration.
+
+    It acts in every N-th iteration. Iterations are counted from the beginning of the run, including those before a
+    resume.
+    """
 
     def __init__(
         self, config: AnyConfig, kind: LearnerKind, worlds: Worlds, folder: RunFolder, learner: Learner,
@@ -84,7 +91,11 @@ class Watch:
         return every is not None and self._iterations % every == 0
 
     def _policy(self, device: str) -> Agent:
-        """Copy the policy: evaluations change the memory of recurrent policies, and adapting policies learn in them."""
+        """Return a copy of the learner's policy.
+
+        A copy is needed because an evaluation changes the memory of a recurrent policy and the weights of a policy that
+        adapts.
+        """
         return self._kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
@@ -113,7 +124,11 @@ class Watch:
         return evaluate(policy, world, episodes, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
-        """Return the results on train tasks, because test tasks must not select the policy that they evaluate."""
+        """Run a meta-test on train tasks, and return its metrics.
+
+        Test tasks are not used, because the best policy is selected by this result and later evaluated on the test
+        tasks.
+        """
         load = partial(self._policy, self._device)
         adaptation = metatest.Adaptation.of(self._source, self._config)
         found = metatest.meta_test(self._source, adaptation, load, metatest.Options(), ["train"])["train"]
@@ -147,7 +162,10 @@ def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
 
 @contextmanager
 def undisturbed(device: torch.device) -> Iterator[None]:
-    """Restore the random generators afterwards, so that draws inside the block do not affect draws outside."""
+    """Run the block without gradients, and afterwards restore all random number generators.
+
+    Random draws inside the block therefore do not affect later draws outside the block.
+    """
     python = random.getstate()
     legacy = np.random.get_state()
     with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():

@@ -15,11 +15,12 @@ def world_speed(
     suite: str, *, num_envs: int, steps: int, repeats: int, threads: int | None, device: str, engine: str, seed: int,
     deterministic: bool = False, switches: str = ""
 ) -> Json:  # fmt: skip
-    """Measure environment steps per second of a suite's world and of bare engines, alternating within one process.
+    """Measure environment steps per second, for a suite's complete world and for its physics engines alone.
 
-    The results are medians; ``ratio`` is the median of ratios. The bare engines are those of a second world, with the
-    same states, controls, threads, sensors and substeps. Outside the timed region the bare engines follow the first
-    world's resets, so both do the same physics. ``groups`` has the number of environments in each engine batch.
+    Both are measured in turns within one process, ``repeats`` times. The results are medians over these; ``ratio`` is
+    the median of the ratios. The bare engines belong to a second world, with the same states, controls, threads,
+    sensors and substeps. When the first world resets environments, the bare engines are reset to the same states,
+    outside the timed region. ``groups`` has the number of environments in each engine batch.
     """
     options = {"device": device, "num_envs": num_envs, "threads": threads, "engine": engine}
     options |= {"deterministic": deterministic, "switches": switches}
@@ -40,7 +41,11 @@ def world_speed(
 
 
 def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
-    """Return the seconds that a world takes for random steps, and those that an equal world's engines take alone."""
+    """Step two identical worlds with the same random actions, and return the seconds that each took.
+
+    The world ``full`` takes complete steps. In the world ``bare``, only the physics engines are stepped, and only their
+    steps are timed.
+    """
 
     def now() -> float:
         if full.device.type == "cuda":

@@ -54,9 +54,10 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def room(self, size: int) -> Iterator[None]:
-        """Reserve ``size`` bytes for the first checkpoint until it is saved, so that saving cannot fail.
+        """Reserve disk space for the first checkpoint, so that saving it cannot fail for lack of space.
 
-        Raises BidexError if there is not enough space.
+        ``size`` is its size in bytes. The space is reserved until the checkpoint is saved. Raises BidexError if there
+        is not enough space.
         """
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)
@@ -64,10 +65,10 @@ class Checkpoints:
             yield
 
     def finish(self, step: int) -> None:
-        """Complete a :meth:`save` that was killed.
+        """Complete a :meth:`save` during which the process was killed.
 
-        ``step`` is the step of the loaded checkpoint. If a newer checkpoint exists, it is damaged, and all files are
-        kept.
+        ``step`` is the step of the checkpoint that was loaded. If there is a checkpoint with a later step, that one
+        could not be loaded because it is damaged; in this case no checkpoint is changed or deleted.
         """
         if not self.folder.is_dir():
             return
@@ -119,7 +120,7 @@ class Checkpoints:
         return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
-        """Return the environment steps of the newest checkpoint, by the file names; None if there is none yet."""
+        """Return the environment steps of the newest checkpoint, read from its file name; None if there is none yet."""
         files = self._step_files()
         if files:
             return int(files[0].stem.removeprefix("step_"))
@@ -180,7 +181,11 @@ def _reason(error: Exception) -> str:
 
 
 def _opened(path: Path) -> State:
-    """Return a file's content, at least ``step`` and ``state``; torch raises many kinds of errors if it is damaged."""
+    """Read and check a checkpoint file; return its content, which has at least ``step`` and ``state``.
+
+    Raises BidexError for another format version, ValueError for wrong content, and many kinds of errors of torch for a
+    damaged file.
+    """
     with open_regular(path, "a checkpoint") as file:
         _check_archive(file)
         # With weights_only, another person's checkpoint cannot run code.
@@ -199,7 +204,10 @@ def _opened(path: Path) -> State:
 
 
 def _check_archive(file: IO[bytes]) -> None:
-    """Refuse an archive that is damaged, or whose parts are larger than the file: torch stores parts uncompressed."""
+    """Raise an error if a checkpoint's zip archive is damaged or has a compressed part.
+
+    torch stores parts uncompressed. A compressed part could be much larger in memory than the file.
+    """
     with zipfile.ZipFile(file) as archive:
         for part in archive.infolist():
             if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:

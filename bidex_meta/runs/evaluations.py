@@ -190,7 +190,10 @@ class MetaTestEvaluation:
 
     @property
     def results(self) -> dict[str, ClassSummary]:
-        """Return the results after adaptation by class and split, because ML1's splits have the same class."""
+        """Return the results after adaptation; the keys are class names followed by the split in brackets.
+
+        The split is needed because in ML1 suites the train and test tasks are of the same class.
+        """
         rows = {}
         for split, part in self.splits.items():
             for name, row in part.after.classes.items():
@@ -199,7 +202,10 @@ class MetaTestEvaluation:
 
     @property
     def all_results(self) -> dict[str, ClassSummary]:
-        """Return the results that a verification compares, by class, split and shot, also those with hidden rewards."""
+        """Return the results that a verification compares; a key is a text that names class, split and shot.
+
+        Results of episodes with hidden rewards are included.
+        """
         rows = {}
         for split, part in self.splits.items():
             for text, shots in (("", part.by_shot), (", rewards hidden", part.hidden_by_shot or ())):
@@ -249,5 +255,5 @@ def evaluation_json(evaluation: Evaluated) -> Json:
 
 
 def _without_none(content: Json) -> Json:
-    """Return the content without those entries of the first level that are None."""
+    """Return the content without those top-level entries whose value is None."""
     return {name: value for name, value in content.items() if value is not None}

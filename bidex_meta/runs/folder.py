@@ -46,7 +46,7 @@ _MOST_LOOKED_AT = 2000  # maximum number of entries that are searched for runs b
 
 
 class _Part:
-    """The path of a part of a run folder."""
+    """Attribute of :class:`RunFolder` that returns the path of a file or subfolder in the run's folder."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -133,7 +133,10 @@ class RunFolder:
 
     @property
     def goal(self) -> int:
-        """Return the steps to train for, or the steps done if time, a return or a score has ended the run."""
+        """Return the environment steps for which the run trains.
+
+        If the run ended early because of a time limit, a return or a score, these are the steps that were done.
+        """
         rows = last_rows(self.metrics_path)
         return self.config().goal(rows[-1] if rows else {"step": 0})
 
@@ -155,13 +158,21 @@ class RunFolder:
 
     @checked_arguments
     def finish(self, step: Whole | None) -> None:
-        """Clean up a locked folder after a killed process; ``step`` is the step of the loaded checkpoint."""
+        """Remove incomplete files that an earlier process left when it was killed; the folder must be locked.
+
+        ``step`` is the step of the loaded checkpoint; None if there is none. An incomplete save of this checkpoint is
+        completed.
+        """
         remove_leftovers(self.path)
         if step is not None:
             self.checkpoints.finish(step)
 
     def check_own(self) -> None:
-        """Raise BidexError, before anything is built, if an entry is a link or the folder cannot be written."""
+        """Raise BidexError if the run cannot write into its folder, or if a file or subfolder in it is a link.
+
+        Writing through a link would change files outside the folder. The check is made before any world or learner is
+        built.
+        """
         refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
         for folder in (self.path, self.checkpoints_path):
             if folder == self.path or folder.exists():

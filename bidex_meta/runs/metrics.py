@@ -1,4 +1,8 @@
-"""Metrics of a run over environment steps: a report is a line of JSON, and a logger receives each of its values."""
+"""Write and read the metrics of a run over environment steps.
+
+Each report of metrics becomes one line of ``metrics.jsonl`` in JSON. A logger, such as TensorBoard, receives the same
+values.
+"""
 
 import json
 import math
@@ -91,10 +95,11 @@ def training_seconds(rows: Sequence[Json]) -> float:
 
 @checked_arguments
 def mend(path: Path, step: Whole) -> list[Json]:
-    """Return the lines up to ``step`` for a run that resumes from this step, even if its metrics are damaged.
+    """Return the rows of metrics up to ``step`` for a run that resumes from this step, and repair the file.
 
-    If the metrics are not a file, or a line before the last cannot be read, they are kept as ``metrics.jsonl.damaged``
-    and reported: damaged metrics must not prevent resuming from a good checkpoint.
+    If the metrics are not a file, or if a line before the last cannot be read, the damaged metrics are kept as
+    ``metrics.jsonl.damaged`` and a message is printed. The readable lines stay in the file. Damaged metrics thus do not
+    prevent a run from resuming.
     """
     try:
         lines = _lines(path)

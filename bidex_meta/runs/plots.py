@@ -87,9 +87,10 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> "Figure":
 def draw_panels(
     panels: Mapping[str, Sequence[Group]], tag: str, title: str, unit: tuple[float, str] = _MILLIONS
 ) -> "Figure":
-    """Draw a metric, labelled ``title``, against environment steps, with one panel per name and a shared vertical axis.
+    """Draw curves of a metric, with one panel for each entry of ``panels`` and a shared vertical axis.
 
-    ``unit`` is the size of one unit of ``Curve.steps``, and the unit's name.
+    ``tag`` selects the metric, and ``title`` is its label. ``unit`` describes the horizontal axis: the number by which
+    ``Curve.steps`` is divided, and the axis's label. By default these are millions of environment steps.
     """
     labels = list(dict.fromkeys(label for label, _ in chain.from_iterable(panels.values())))
     figure = _figure(5.2 * len(panels), 3.6)
@@ -103,7 +104,10 @@ def draw_panels(
 
 
 def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> "Figure":
-    """Draw the values of groups as points with intervals, with one panel per title."""
+    """Draw the value of each group of runs as a point, and its interval as a line.
+
+    ``panels`` maps the title of each panel to the values drawn in it.
+    """
     figure = _figure(5.2 * len(panels), 1.2 + 0.45 * max(len(bars) for bars in panels.values()))
     for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
         for number, (_, value, interval) in enumerate(bars):
@@ -186,7 +190,10 @@ def _figure(width: float, height: float) -> "Figure":
 
 
 def _task_panels(blocks: Sequence[Sequence[str]]) -> "tuple[Figure, list[list[tuple[Axes, Axes]]]]":
-    """Return a figure with, for each name, a panel of return above a panel of success; each block begins a row."""
+    """Return a figure with empty panels, and the panels of each name: one for the return and one below it for success.
+
+    ``blocks`` are lists of names; each list begins in a new row of the figure.
+    """
     columns = [min(_COLUMNS, len(names)) for names in blocks]
     heights = [-(-len(names) // width) for names, width in zip(blocks, columns, strict=True)]
     figure = _figure(3.2 * max(columns), 4.0 * sum(heights))

@@ -35,11 +35,12 @@ class PlainConsole(Console):
 
 
 class Progress:
-    """Displays steps per second, time left, and return and success (mean and per task), on stderr or ``stream``.
+    """Displays the progress of a training on stderr or ``stream``.
 
-    Total steps and seconds are those of the whole run; the run's training time is the metric ``Perf/training_time``. If
-    there is a time limit, progress is shown against it. Speed is measured from ``start_step``, the first step of this
-    process.
+    It shows steps per second, the time left, and return and success, as means and per task. ``total_steps`` and
+    ``total_seconds`` are limits of the whole run, including parts before a resume; the time so far is the metric
+    ``Perf/training_time``. If there is a time limit, progress is shown relative to it. Speed is measured from
+    ``start_step``, the first step of this process.
     """
 
     def __init__(

@@ -32,7 +32,10 @@ class Difference(NamedTuple):
 
     @property
     def is_of_worlds(self) -> bool:
-        """Return whether the worlds differ, so that rewards and successes do not come from one distribution."""
+        """Return True if the difference is in the physics or the suite.
+
+        Rewards and successes from the two records then do not come from the same distribution.
+        """
         return self.name in _ENGINES or self.name.replace(" ", "_") in _WORLD
 
     def __str__(self) -> str:
@@ -50,9 +53,11 @@ def differences(then: Record, now: Record) -> list[Difference]:
 
 
 def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
-    """Return for each run the entries in which runs on the same suite or class differ; usually none.
+    """Return, for each run, the versions that are not equal in all runs on the same suite or class.
 
-    Runs with different entries must not be pooled. Entries of the training and of the evaluation are compared.
+    The result of each run is a dict of its own versions, which is usually empty. The function compares the versions of
+    physics engines and suite, as recorded at training and at the evaluation. Runs with different dicts must not be
+    pooled, because their worlds differ.
     """
     records = [dict(_of_worlds(run)) for run in runs]
     seen: dict[tuple[Subject, str], set[Value]] = defaultdict(set)
@@ -68,7 +73,10 @@ def split_by_worlds(runs: Sequence[Run]) -> list[dict[str, Value | None]]:
 
 
 def check_alike(runs: Sequence[Run]) -> None:
-    """Raise BidexError if runs that are to be seeds of one experiment were made with different worlds."""
+    """Raise BidexError if runs were made with different versions of the physics engines or of the suite.
+
+    The runs are meant to be seeds of one experiment, so they must have the same worlds.
+    """
     records = split_by_worlds(runs)
     for run, record in zip(runs, records, strict=True):
         for name, value in record.items():
@@ -90,14 +98,17 @@ def versions_of(run: Run) -> Versions:
 
 
 def _values(record: Record) -> dict[str, Value]:
-    """Return the known values of a record by name."""
+    """Return the versions in a record by name, without those that are None."""
     values: dict[str, Value | None] = dict(record.packages)
     values |= {name.replace("_", " "): getattr(record, name) for name in _WORLD}
     return {name: value for name, value in values.items() if value is not None}
 
 
 def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
-    """Yield the entries that decide the worlds of a run's training and evaluation."""
+    """Yield names and versions of the physics engines and the suite that a run was made with.
+
+    Those of the training come first, then those of the evaluation, if there is one.
+    """
     config = run.config()
     trained = _values(versions_of(run))
     engines = ["mujoco"]

@@ -66,7 +66,7 @@ class StoredRun:
 
     @property
     def evaluated(self) -> bool:
-        """Return True, because only evaluated runs are collected."""
+        """Return True, because study files contain only evaluated runs."""
         return True
 
     @property
@@ -76,7 +76,7 @@ class StoredRun:
 
     @property
     def arm(self) -> str:
-        """Return the run's arm in its study."""
+        """Return the run's arm: the name that all runs of a study have in common if they differ only in the seed."""
         return self.content["arm"]
 
     def config(self) -> RunConfig[Json]:
@@ -84,13 +84,20 @@ class StoredRun:
         return config_of(self.content["config"], f"{self.path}: config")
 
     def metrics(self) -> list[Json]:
-        """Return rows of metrics: means over intervals of about equal length in steps, at the ends of the intervals."""
+        """Return the run's metrics, averaged over intervals of steps, as rows by tag.
+
+        The intervals have about the same number of steps. The step of a row is the end of its interval.
+        """
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
 
     @property
     def goal(self) -> int:
-        """Return the steps that the run trained for; only finished runs are collected, so all its steps count."""
+        """Return the environment steps for which the run was trained.
+
+        The last iteration may exceed the steps of the config; the result is then the steps of the config, unless the
+        run had a time limit. Study files contain only finished runs.
+        """
         config = self.config()
         steps = self.content["steps"]
         if config.minutes is not None:
@@ -139,7 +146,10 @@ def read_study(file: Path) -> list[StoredRun]:
 
 
 def study_text(contents: Mapping[str, Json]) -> str:
-    """Return the text of a study's file from its runs by name: one entry of a run per line."""
+    """Return the text of a study file, which stores several runs, from the content of each run by its name.
+
+    The text is JSON. Each entry of a run, such as its config or its curves, is on its own line.
+    """
     return "{\n" + ",\n".join(f"{json.dumps(name)}: {_run_text(run)}" for name, run in contents.items()) + "\n}\n"
 
 

@@ -22,11 +22,11 @@ _JOIN_SECONDS = 10.0
 
 
 class Attendance(threading.Thread):
-    """Thread that counts up in torchrun's store twice a second, which shows the other processes that this one is alive.
+    """Thread that tells the other processes of a run that this process is alive.
 
-    ``count`` is the number of processes. This process may hang in a collective operation that waits for a lost process.
-    If a signal has asked this process to end, and after 12 seconds it still hangs and another process is missing, the
-    thread calls ``on_loss`` and ends this process.
+    Twice a second it increases this process's counter in torchrun's store. ``count`` is the number of processes. A
+    process may hang in a collective operation that waits for a lost process. The thread therefore ends this process,
+    after a call of ``on_loss``, if a signal asked it to end, 12 seconds have passed, and another process is missing.
     """
 
     def __init__(self, store: Any, rank: int, count: int):
@@ -46,9 +46,10 @@ class Attendance(threading.Thread):
         self.start()
 
     def report(self) -> list[int] | None:
-        """Report the end of this process to the others.
+        """Tell the other processes that this process ends, so that they do not count it as lost.
 
-        Returns the numbers of the lost processes, or None if another process reports them.
+        The first process that calls this method returns the ranks of the lost processes. The others return None,
+        because the first one reports the loss. The list is empty if torchrun's store is lost too.
         """
         self._closed.set()
         try:
@@ -84,7 +85,7 @@ class Attendance(threading.Thread):
                 os._exit(1)
 
     def _missing(self) -> list[int]:
-        """Return the ranks of the processes that have stopped counting without reporting their end."""
+        """Return the ranks of the processes whose counter has stopped, and that have not reported that they end."""
         before = self._beats()
         time.sleep(_LISTEN_SECONDS)
         silent = [i for i, (a, b) in enumerate(zip(before, self._beats(), strict=True)) if a == b and i != self._rank]
@@ -101,10 +102,10 @@ class Attendance(threading.Thread):
 
 
 def end_patiently() -> None:
-    """Leave ten seconds between SIGTERM and the end of the process, unless another handler is set later.
+    """Install a handler that lets this process run for ten more seconds after SIGTERM.
 
-    As soon as one process is gone, torchrun sends SIGTERM to all others, which need this time to report
-    that a process is gone.
+    When one process of a run dies, torchrun sends SIGTERM to all others. They need this time to report that a process
+    was lost. A handler that is installed later replaces this one.
     """
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -153,10 +153,10 @@ def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tens
 
 
 def sum_gradients(parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
-    """Sum the gradients over the processes, in place, and return the sum of ``numbers`` (n,), in one operation.
+    """Sum the gradients over the processes, in place, and return the sum of ``numbers`` (n,) over the processes.
 
-    For the gradient of a mean over all samples, each process divides its loss by the number of samples of all
-    processes.
+    Both sums use a single collective operation. For the gradient of a mean over all samples, each process divides its
+    loss by the number of samples of all processes.
     """
     if world_size() == 1:
         return numbers

@@ -24,7 +24,7 @@ Parts = dict[str, Any]
 
 @dataclass(frozen=True)
 class LearnerConfig(Checked):
-    """Base of learners' configs. Fields are checked against their annotations; their docstrings are help of flags."""
+    """Base class of learners' configs. Fields are checked against their annotations; --help shows their docstrings."""
 
     @property
     def algo(self) -> str:
@@ -36,7 +36,10 @@ class LearnerConfig(Checked):
         return 0
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Return the maximum bytes of experience (a replay) in a checkpoint; arguments are as in ``bytes_held``."""
+        """Return the maximum size, in bytes, of the experience that a checkpoint stores, such as a replay buffer.
+
+        Arguments are as in ``bytes_held``.
+        """
         return 0
 
 
@@ -128,7 +131,10 @@ class Learner(ABC):
 
     @classmethod
     def bytes_stored(cls, config: Any, num_envs: int, width: int) -> int:
-        """Return the maximum size of experience in a checkpoint, bytes; see :meth:`LearnerConfig.bytes_stored`."""
+        """Return the maximum size, in bytes, of the experience that a checkpoint stores, such as a replay buffer.
+
+        See :meth:`LearnerConfig.bytes_stored`.
+        """
         if isinstance(config, LearnerConfig):
             return config.bytes_stored(num_envs, width)
         return 0
@@ -139,7 +145,10 @@ class Learner(ABC):
 
     @abstractmethod
     def state_dict(self) -> State:
-        """Return all that a resumed run needs besides the world's state; ``policy`` has :meth:`policy_state_dict`."""
+        """Return the learner's part of a checkpoint: everything that a resumed run needs except the world's state.
+
+        Its entry ``policy`` is the result of :meth:`policy_state_dict`.
+        """
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
@@ -152,7 +161,10 @@ class Learner(ABC):
     @classmethod
     @abstractmethod
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
-        """Return the agent of ``learner.policy`` in a checkpoint; it can act in any number of environments."""
+        """Return an agent that plays the policy ``state``, in any number of environments.
+
+        ``state`` is the result of :meth:`policy_state_dict`, which checkpoints hold under ``learner`` and ``policy``.
+        """
 
     def start_from(self, policy: State) -> None:
         """Start from the policy of another run's checkpoint instead of fresh weights."""

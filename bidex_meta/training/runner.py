@@ -132,10 +132,11 @@ def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None
 
 
 def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
-    """Return the state of a run: ``{"learner": ..., "env": ...}``; all processes must call this function.
+    """Return the state of the learner and the world, as a checkpoint stores it; all processes must call this.
 
-    Process 0 gets its own state and, under ``others``, the entries of each other process that may differ from its own.
-    The other processes get None.
+    Process 0 gets ``{"learner": ..., "env": ...}``. If there are several processes, the dict also has ``others``, a
+    list with the state of each other process, without the entries that are equal in all processes. The other processes
+    get None.
     """
     state = {"learner": learner.state_dict(), "env": world.state_dict()}
     if world_size() == 1:
@@ -201,10 +202,11 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator["_Stop"]:
-    """Yield an event that is set by signals that ask the process to end.
+    """Yield an event that is set when a signal asks the process to end.
 
-    The first SIGINT or SIGTERM restores the old handlers of these two, so that the second acts at once. The other
-    signals never break off an iteration, because they may come twice, or be followed by SIGTERM, for the same reason.
+    After the first SIGINT or SIGTERM, the old handlers of these two signals are restored, so that another SIGINT or
+    SIGTERM acts at once. The other signals never break off an iteration: a single cause may send the same signal twice,
+    or send SIGTERM after it.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():

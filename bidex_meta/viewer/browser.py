@@ -16,7 +16,10 @@ _SHOWN_GROUPS = 3  # geom groups from this number on are hidden, as in MuJoCo's 
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
-    """Return the geoms that a viewer shows, without planes."""
+    """Return the ids of the geoms that a viewer shows.
+
+    Planes, fully transparent geoms and geoms in MuJoCo's hidden groups are left out.
+    """
     geoms = []
     for geom in range(model.ngeom):
         in_shown_group = model.geom_group[geom] < _SHOWN_GROUPS
@@ -33,9 +36,10 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
+    """Return the triangle mesh of a geom: points (n, 3) in the geom's frame, metres, and triangles (m, 3).
 
-    Raises BidexError for types of geoms that the browser cannot show, e.g. height fields.
+    A triangle has the indices of its three points. Raises BidexError for types of geoms that the browser cannot show,
+    such as height fields.
     """
     make = import_module("trimesh.creation")  # trimesh is a dependency of viser
     kind = model.geom_type[geom]
@@ -70,9 +74,9 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Browser:
-    """A ``Screen`` that a browser shows, served on the first free port from ``port`` upwards.
+    """Viewer in a web browser. It implements ``Screen``, the interface of viewers.
 
-    With ``host`` 0.0.0.0, other machines can connect.
+    The page is served on the first free port from ``port`` upwards. With ``host`` 0.0.0.0, other machines can connect.
     """
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
@@ -105,7 +109,7 @@ class Browser:
         return True
 
     def obey(self, stage: Stage) -> None:
-        """Apply the state of the controls to the stage."""
+        """Read the controls on the page, and apply them to the stage, which plays the shown episodes."""
         self.paused = bool(self._pause.value)
         self.speed = float(self._pace.value)
         stage.tour = bool(self._tour.value)

@@ -18,7 +18,7 @@ KEYS = "Space pauses, Enter begins another episode, Right goes to the next task,
 
 
 class Desktop:
-    """A ``Screen`` as a window; its keys are ``KEYS``."""
+    """Viewer in a window of MuJoCo. It implements ``Screen``, the interface of viewers; ``KEYS`` describes its keys."""
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
         """Open the window; raise BidexError if this is not possible."""
@@ -69,7 +69,7 @@ class Desktop:
                 self.speed = min(4.0, max(1.0 / 16.0, self.speed * (2.0 if key == _EQUAL else 0.5)))
 
     def show(self, stage: Stage) -> None:
-        """Show state, goals and status; open a new window for another class."""
+        """Show the current state, the goals and the status; open a new window if another class is to be shown."""
         if stage.row != self._row:
             self._viewer.close()
             self._open(stage)

@@ -14,9 +14,10 @@ from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 
 
 class Stage:
-    """Episodes in all environments of a world in mode DISABLED, one environment per slot.
+    """The episodes that a viewer shows: a policy acts in all environments of a world, and one is shown.
 
-    ``row`` is the environment that is shown, and may be set. On a ``tour`` the next environment is shown after each
+    The world must be in autoreset mode DISABLED and have one environment per slot (class or listed task). ``row`` is
+    the index of the shown environment; callers may change it. On a ``tour`` the next environment is shown after each
     episode.
     """
 
@@ -79,7 +80,7 @@ class Stage:
         self._begin()
 
     def model(self) -> mujoco.MjModel:
-        """Return the model that draws the shown environment, with hands that look as in pictures."""
+        """Return the model that draws the shown environment, with skins in place of the hands' collision shapes."""
         return simulation(self._world, self.row)[2].dressed
 
     def data(self) -> mujoco.MjData:
@@ -126,7 +127,7 @@ class Screen(Protocol):
         ...
 
     def obey(self, stage: Stage) -> None:
-        """Apply the user's requests since the last call to the stage."""
+        """Apply to the stage what the user has requested since the last call of this method."""
 
     def show(self, stage: Stage) -> None:
         """Show the stage's present state."""
@@ -136,7 +137,10 @@ class Screen(Protocol):
 
 
 def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
-    """Play until the viewer is closed, or for ``seconds``, at the viewer's speed or slower."""
+    """Play until the viewer is closed, or for ``seconds``.
+
+    The viewer sets the speed. Playing is slower if the steps cannot be computed in time.
+    """
     began = shown = due = time.monotonic()
     screen.show(stage)
     try:
