@@ -31,9 +31,10 @@ _EXACT = 0.02
 def beliefs(
     run: tyro.conf.Positional[Path], shots: int = 2, tasks: int = 50, split: str = "test", out: Path | None = None
 ) -> None:
-    """Measure success per class of an icl run's actor with better beliefs about the goal, and of the run's teachers.
+    """Measure the success per class that a run of icl could reach if it inferred hidden goals better.
 
-    The actor acts with a belief that knows the reward formulas, and with a belief that knows the goal.
+    The policy of the run acts with a belief that is computed from the classes' own reward formulas, and then with a
+    belief that is certain of the true goal. The run's teachers, which see the goal, act too.
 
     Example: python -m tools.beliefs runs/ML20-v2/icl/RUN
 
@@ -86,7 +87,10 @@ class _KnownRewards:
         self.candidates = spread(_CANDIDATES, world.hidden_size)
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return log-likelihoods (N, candidates) of the rewards of the world's last step."""
+        """Return log-likelihoods (N, candidates) of the rewards of the world's last step.
+
+        They are 0 in environments whose reward is not ``known``.
+        """
         paid = self._world.rewards_if(self.candidates[:, None].expand(-1, len(obs), -1))
         off = (reward[:, None] - paid.T) / _EXACT
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)

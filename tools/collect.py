@@ -112,7 +112,10 @@ def arm_of(path: Path, config: Json) -> str:
 
 
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
-    """Return a run folder without an arm; for a sweep file, return folder and arm of each run that has ended."""
+    """Return the folders of the runs that a path names, each with its arm (its name in tables).
+
+    A run folder has the arm None. From a sweep file, all runs that have ended are returned, with the arms of the sweep.
+    """
     if path.suffix != ".toml":
         return [(path, None)]
     runs = SweepPlan.read(path, out).runs
@@ -190,7 +193,10 @@ def _engine(config: Json) -> str:
 
 
 def _evaluation(evaluation: Evaluated) -> Json:
-    """Return the content of an evaluation, with only some measures of random actions and of each shot."""
+    """Return the content of an evaluation, rounded to five significant digits and without some measures.
+
+    Only a few measures are kept of random actions and of each shot of a meta-test.
+    """
     content = evaluation_json(replace(evaluation, run=None))
     if "random" in content:
         content["random"] = _only(content["random"], ("success", "return"))
@@ -200,7 +206,7 @@ def _evaluation(evaluation: Evaluated) -> Json:
 
 
 def _only(summary: Json, measures: Sequence[str]) -> Json:
-    """Return some measures of the classes of a summary."""
+    """Return a summary in which each class has only the given measures."""
     classes = {}
     for name, row in summary["classes"].items():
         classes[name] = {measure: row[measure] for measure in measures}
@@ -208,7 +214,11 @@ def _only(summary: Json, measures: Sequence[str]) -> Json:
 
 
 def _curves(rows: Sequence[Json]) -> dict[str, list[float | None]]:
-    """Return columns by tag: means over intervals of about equal length, step and training time at interval ends."""
+    """Return learning curves of at most ``POINTS`` points, by tag.
+
+    The run is divided into intervals of about equal length, one for each point. A point is the mean over its interval,
+    but step and training time are those at the interval's end.
+    """
     count = min(POINTS, len(rows))
     edges = [len(rows) * i // count for i in range(count + 1)]
     parts = [rows[low:high] for low, high in pairwise(edges)]

@@ -122,7 +122,10 @@ def check(page: str, text: str) -> Iterator[Finding]:
 
 
 def check_all(rules: dict[str, Any] = RULES, root: Path = ROOT) -> list[str]:
-    """Return messages for findings on the listed pages that are no exception, and for exceptions without a finding."""
+    """Return a message for each finding on the listed pages that is no exception.
+
+    Exceptions that no finding needs get a message too.
+    """
     pages = sorted({path.relative_to(root).as_posix() for glob in rules["pages"] for path in root.glob(glob)})
     pages = [page for page in pages if page not in rules.get("later", [])]
     findings = [finding for page in pages for finding in check(page, (root / page).read_text(encoding="utf-8"))]

@@ -19,7 +19,9 @@ _SOLVES = 0.5
 
 
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:
-    """Find the best policy of each class among witness, script and runs; print and store it if it solves the class.
+    """Find the best policy that solves each class, and print and store its return and its source.
+
+    Candidates are the class's witness (a stored episode that solves a task), the class's script and the given runs.
 
     Example: python -m tools.experts results/data/experts.json --out assets/references/expert.json
 

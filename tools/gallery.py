@@ -83,13 +83,17 @@ def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
 
 
 def moments(first_success: int, steps: int) -> list[int]:
-    """Return the frames of a witness that the page shows; frame i is the state after i steps."""
+    """Return the frames of a witness (a stored episode that solves a task) that the page shows.
+
+    They are the start, two moments on the way to the first success, the first success and the end. Frame i is the state
+    after i steps.
+    """
     solved = first_success + 1
     return [0, round(solved / 3), round(2 * solved / 3), solved, steps]
 
 
 def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
-    """Draw the shown frames side by side, (height, STRIP * width, 3) uint8."""
+    """Draw the frames of a witness that ``moments`` chooses, side by side, (height, STRIP * width, 3) uint8."""
     first = replay(name, witness).first_success  # the file's value may be from older physics
     if first is None:
         raise BidexError(f"The witness of {name} does not succeed any more. Search for a new one.")
@@ -156,11 +160,11 @@ def _mask(task: TaskClass) -> str:
 
 
 def masked(task: TaskClass) -> tuple[list[str], list[str]]:
-    """Return the components of a variation that only goal entries of the observation show.
+    """Return the components of a task's variation that observations show only in goal entries.
 
-    The first list has the components that affect the reward, the second has the components that only affect success.
-    For each component, the parts of a task that it changes are replaced by NaN: every value that becomes NaN depends on
-    the component. The position of a fixture is not returned, because other entries show it.
+    The first list has the components that affect the reward; the second list has the components that affect only
+    success. To find them, everything that a component changes in a task is replaced by NaN: every value that becomes
+    NaN depends on the component. The position of a fixture is not returned, because other entries show it.
     """
     scene, space = compile_scene(task), task.variation_space
     data = mujoco.MjData(scene.model)
@@ -196,7 +200,10 @@ def _any_nan(values: Iterable[Tensor]) -> bool:
 
 
 class _Comparisons(TorchFunctionMode):
-    """Collects all compared tensors, because a comparison with NaN returns False and would hide the NaN."""
+    """Collects the operands of all comparisons in its context.
+
+    A comparison with NaN returns False, so that its result would hide the NaN.
+    """
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,8 +1,8 @@
-"""Views of several agents on a world: the observation entries and the actions of each agent (appendix A.2).
+"""Views of several agents on a world: the observation entries and the actions of each agent.
 
-Each hand has six units: five fingers, and the palm with wrist and base. An agent controls one or more units. It
-observes all entries of each hand in which it controls a unit, and all entries that belong to no hand: object, goal,
-task id. All agents share the reward.
+The division follows the paper's appendix A.2. Each hand has six units: five fingers, and the palm with wrist and base.
+An agent controls one or more units. It observes all entries of each hand in which it controls a unit, and all entries
+that belong to no hand: object, goal, task id. All agents share the reward.
 """
 
 from collections.abc import Iterable, Sequence
@@ -43,12 +43,13 @@ class AgentView:
 
 
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
-    """Return one view per agent of a world, in the order in which ``agents`` gives the agents.
+    """Return one view per agent of a world, in the order of the agents in ``agents``.
 
-    ``agents`` is ``single``, ``hands`` or ``fingers``, a text or TOML file as in ``hands/units.py``, or a dict from
-    each agent's name to its units. With ``hands`` and ``fingers`` the agents of the right hand come first. In a world
-    without hands the units are ``action/0``, ``action/1``, ..., and every agent observes everything. Raises BidexError
-    if a unit is unknown, missing or named twice, or if the hands' bases move in only some of the classes.
+    ``agents`` says which agent controls which units of the hands. It is ``single``, ``hands`` or ``fingers``, a line or
+    a TOML file in the format of ``hands/units.py``, or a dict from each agent's name to its units. With ``hands`` and
+    ``fingers`` the agents of the right hand come first. A world without hands has the units ``action/0``, ``action/1``,
+    ..., and every agent observes everything. Raises BidexError if a unit is unknown, missing or named twice, or if the
+    hands' bases move in only some of the classes.
     """
     units = _units(groups, num_actions)
     views = []

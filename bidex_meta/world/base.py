@@ -57,10 +57,11 @@ class Transition(NamedTuple):
 
 
 class BatchedWorld(VectorEnv, ABC):
-    """A ``contract.TaskWorld`` whose environments are split evenly over slots; a slot's environments are contiguous.
+    """A ``contract.TaskWorld`` that splits its environments evenly over slots, into contiguous ranges.
 
-    Worlds can be pickled and copied. A copy is built from the same arguments and continues bit for bit. Of the
-    attributes that a user may set, only ``stagger`` is copied.
+    A slot is a task class, or in MT1 a single task. Worlds can be pickled and copied. A copy is built from the
+    original's arguments and gets its state, so that it continues bit for bit. Of the attributes that a user may set,
+    only ``stagger`` is copied.
     """
 
     single_observation_space: Box
@@ -96,8 +97,8 @@ class BatchedWorld(VectorEnv, ABC):
         """Split the environments over the slots; a subclass calls ``_set_spaces`` and builds its own simulation.
 
         ``autoreset_mode`` is SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation).
-        With ``stagger`` first episodes begin at a random elapsed step, except in DISABLED mode. Raises BidexError for
-        fewer environments than slots, an unknown mode or a seed below 0.
+        With ``stagger`` the first episode of each environment is shortened by a random number of steps, except in
+        DISABLED mode. Raises BidexError for fewer environments than slots, an unknown mode or a seed below 0.
         """
         self.num_envs = checked.num_envs(num_envs, slots.names)
         self.device = device
@@ -198,7 +199,7 @@ class BatchedWorld(VectorEnv, ABC):
     def _start(self, mask: Tensor, stagger: bool) -> None:
         """Start episodes in the environments of a mask.
 
-        Call ``_count_episodes``, and write the first observations into ``_obs``.
+        An implementation must call ``_count_episodes``, and write the first observations into ``_obs``.
         """
 
     def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
@@ -232,7 +233,11 @@ class BatchedWorld(VectorEnv, ABC):
         """
 
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> Outcome:
-        """Count the step and return its outcome; of inactive environments only the transition's success is read."""
+        """Count the step in the active environments, and return reward, terminated, truncated and info.
+
+        ``broken`` marks active environments whose action was not finite: they count as unstable. For inactive
+        environments only the fields ``success`` and ``unstable`` of the transition are read.
+        """
         obs = transition.obs
         unstable = transition.unstable | broken
         valid = active & ~unstable
@@ -274,11 +279,11 @@ class BatchedWorld(VectorEnv, ABC):
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     def _made(self) -> dict[str, str]:
-        """Return, by name, the settings that together with the state determine the world's future; values are texts.
+        """Return the settings that, together with the state, determine the world's future, as texts by name.
 
-        A state is loaded only into a world with the same texts. Devices, engines, threads and pictures are left out,
-        because a run may continue with others. Autoreset modes are left out, because an evaluation may finish episodes
-        that began in training.
+        A state is loaded only into a world whose texts are the same. Devices, engines, threads and pictures are left
+        out, because a run may continue with different ones. Autoreset modes are left out, because an evaluation may
+        finish episodes that began in training.
         """
         made = {"slots": ", ".join(self.task_names)}
         for name, steps, scale in zip(*self._slots[:3], strict=True):
@@ -309,7 +314,11 @@ class BatchedWorld(VectorEnv, ABC):
 
     @checked_arguments
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute once per environment: the environment's entry if there is one, else the whole value."""
+        """Return the value of an attribute for each environment.
+
+        If the attribute has one entry per environment, each environment gets its own entry. Otherwise every environment
+        gets the whole value.
+        """
         value = getattr(self, name)
         has_entries = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         if has_entries:

@@ -51,7 +51,10 @@ def seed(given: object) -> int:
 
 
 def switches(given: str, slots: Sequence[Slot]) -> None:
-    """Raise BidexError for unknown switches, and if contacts of a class of version 1 would change."""
+    """Raise BidexError for options of the physics (switches) that are unknown or not allowed.
+
+    Options that change contacts are allowed only if all slots have classes of version 2.
+    """
     narrow = [slot.name for slot in slots if not slot.task_class.rules.wide]
     if Switches.of(given).changes_contacts and narrow:
         raise BidexError(
@@ -61,7 +64,10 @@ def switches(given: str, slots: Sequence[Slot]) -> None:
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:
-    """Raise BidexError if sampling or observation is unknown, or if ``points`` is neither a ``PointsRule`` nor None."""
+    """Raise BidexError if one of three options of a world has an invalid value.
+
+    ``task_sampling`` and ``observation`` must be known names. ``points`` must be a ``PointsRule`` or None.
+    """
     for name, given, known in (
         ("task_sampling", task_sampling, ("uniform", "fixed", "fresh")),
         ("observation", observation, get_args(Rule)),
@@ -73,7 +79,11 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
 
 
 def episodes_per_task(given: object, task_sampling: str, mode: AutoresetMode) -> None:
-    """Raise BidexError unless the number is a positive integer, and 1 if the world's environments keep their tasks."""
+    """Raise BidexError unless the number of consecutive episodes that play one task is valid.
+
+    It must be an integer from 1 to ``MOST_EPISODES``. It must be 1 if each environment keeps its task, that is, if
+    ``task_sampling`` is ``fixed`` or the autoreset mode is DISABLED.
+    """
     number = whole_number("episodes_per_task", given, 1, MOST_EPISODES)
     keeps = task_sampling == "fixed" or mode == AutoresetMode.DISABLED
     if number > 1 and keeps:
@@ -118,11 +128,10 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """Return the slots with the task pools of a saved state.
+    """Check a saved state, and return the slots with the task pools that the state contains.
 
-    The state is first checked against the world's ``own`` state and slots. ``task_id`` (n,): slot of each environment.
-
-    Raises BidexError if the state belongs to another world or is damaged.
+    ``own`` and ``slots`` are the present state and the slots of the world that loads the saved state. ``task_id`` (n,)
+    is the slot of each environment. Raises BidexError if the saved state belongs to another world or is damaged.
     """
     fits(given, own)
     if given["slots"] != own["slots"]:
@@ -141,10 +150,11 @@ def state(given: State, own: State, slots: Sequence[Slot], task_id: Tensor) -> l
 
 
 def fits(given: object, own: Mapping[str, Any], inside: str = "") -> None:
-    """Raise BidexError if a saved state has other names, types or shapes than ``own``, or non-finite numbers.
+    """Raise BidexError if a saved state does not fit ``own``, the present state of the world that loads it.
 
-    ``own`` is the state of the world that loads. Its entry ``made`` must be equal in both states. ``inside`` is the
-    path of both states if they are entries of larger states, for messages.
+    The saved state must contain all entries of ``own``, with equal types and shapes and with finite numbers. The entry
+    ``made`` must be equal in both states. If both states are entries of larger states, ``inside`` is their path there;
+    messages show it.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         if isinstance(given, Mapping):
@@ -205,11 +215,11 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
 
 
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
-    """Call a class's methods once, for a few rows of its first task and sensors that all read 0.
+    """Check a class's formulas: call the class's methods once, and check the returned values.
 
-    ``sensors`` has the engine's precision and device; ``observed`` says whether ``observe`` is called too. Raises
-    BidexError if a method returns anything but what is expected; the message names class, method, what was expected and
-    what was returned.
+    The methods get a few rows that all have the first of ``tasks``, and sensors that all read 0. Precision and device
+    are those of ``sensors``. ``observed`` says whether ``observe`` is called too. Raises BidexError if a method returns
+    anything but what is expected; the message names class, method, what was expected and what was returned.
     """
     task = scene.task
     name = type(task).__name__

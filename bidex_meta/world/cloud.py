@@ -42,7 +42,7 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """Focal length in widths of the image."""
+        """Focal length as a multiple of the image's width."""
         return float(0.5 / np.tan(np.radians(0.5 * self.field_of_view)))
 
 
@@ -136,10 +136,11 @@ class Cloud:
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the candidates' positions relative to the camera, and the camera's distances from the surfaces.
+        """Return the candidates' positions relative to the camera, and the camera's distances from their surfaces.
 
-        The positions are three tensors: to the right, down and forward. A distance is measured to the candidate's
-        tangent plane and is positive if the surface faces the camera. All are in metres, (n, P) each.
+        Candidates are the points that the camera may see. Returns four tensors, (n, P) each, in metres. The first three
+        are the position relative to the camera: to the right, down and forward. The fourth is the distance from the
+        camera to the candidate's tangent plane; it is positive if the surface faces the camera.
         """
         turn = rotation.index_select(1, self._bodies).float()
         offset = position.index_select(1, self._bodies).float() - self._eye

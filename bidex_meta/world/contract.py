@@ -1,17 +1,19 @@
-"""The contract of batched worlds: learners, evaluation and clients may rely on this page and on nothing else.
+"""The interface of batched worlds: learners, evaluation and clients may rely on this docstring and nothing else.
 
-``tests/test_contract.py`` checks every world against this page. A world has N environments. Each belongs to one slot: a
-task class of the suite, or in MT1 a task of the class. All tensors are on ``device``. A reset or step returns tensors
-that the caller owns: no later step changes them, and changes to them or to the given action do not affect the world.
+``tests/test_contract.py`` checks every world against this docstring. A world has N environments. Each belongs to one
+slot: a task class of the suite, or in MT1 a task of the class. All tensors are on ``device``. A reset or step returns
+tensors that the caller owns: no later step changes them, and changes to them or to the given action do not affect the
+world.
 
 There are three modes (``metadata["autoreset_mode"]``). In SAME_STEP (training) an environment whose episode ends starts
 its next episode within the step: the returned observation is the first of the new episode, and ``info["final_obs"]``
-has the last one of the old episode. In DISABLED (evaluation, meta-learning) an environment whose episode has ended is
-frozen: it may be stepped, but it keeps its observation and flags and gets reward 0, until a ``reset`` whose
-``reset_mask`` includes it. Gymnasium's tools expect NEXT_STEP, which none of our learners uses: the step after the end
-of an episode ignores the environment's action, starts its next episode and returns reward 0.
+has the last observation of the old episode. In DISABLED (evaluation, meta-learning) an environment whose episode has
+ended is frozen: it may be stepped, but it keeps its observation and flags and gets reward 0, until a ``reset`` whose
+``reset_mask`` includes it. Gymnasium's tools expect NEXT_STEP, which none of our learners uses: in this mode the step
+after the end of an episode ignores the environment's action, starts the next episode and returns reward 0.
 
-``info`` of a reset is empty (except ``pixels``); ``info`` of a step describes the transition just made:
+The ``info`` of a reset is empty, or has only the key ``pixels`` if the world draws pictures. The ``info`` of a step
+describes the transition just made:
 
 =====================  ====================  ===========================================================================
 key                    shape, type           meaning
@@ -40,9 +42,9 @@ episode can lose it again.
 
 For users of Gymnasium our worlds add the keys ``episode``, ``_episode``, ``final_info`` and ``_final_info``
 (``episodes.py``) to steps in which an episode ended. The warp engine adds them to every step, because checking for an
-end would make the host wait. Their values are zero outside their masks. ``solved`` says whether the goal is met in this
-state, whatever the suite's rule is. A world may add keys like these, ``reward_terms`` and ``pixels``; learners may not
-rely on them.
+end would make the host wait. Their values are zero in environments that their masks do not mark. ``solved`` says
+whether the goal is met in this state, whatever the suite's rule is. A world may add keys like these, ``reward_terms``
+and ``pixels``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each environment, after the first reset and after each
 reset with a seed, may begin at a random elapsed step, so that not all episodes end together. These elapsed steps count
@@ -70,7 +72,7 @@ Step = tuple[Tensor, Tensor, Tensor, Tensor, Info]
 
 @dataclass(frozen=True)
 class ObservationGroup:
-    """Entries of an observation that have the same kind in every environment of a world."""
+    """A named group of observation entries, such as ``goal``; it is the same in every environment of a world."""
 
     name: str
     """``right_hand``, ``left_hand``, ``object`` (a class's entries in no other group), ``goal`` (zeros if hidden),
@@ -88,9 +90,10 @@ class ObservationGroup:
 
 
 def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
-    """Return the groups of a world that knows no kinds of entries.
+    """Return the observation groups of a world that does not distinguish hands, objects and goals.
 
-    They are ``state``, and ``task_id`` for the last ``num_id_columns`` entries of the ``size`` entries.
+    The last ``num_id_columns`` of the ``size`` entries are the group ``task_id``. The other entries are the group
+    ``state``.
     """
     groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
     return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
@@ -158,7 +161,10 @@ class VectorWorld(Protocol):
 
 @runtime_checkable
 class TaskWorld(VectorWorld, Protocol):
-    """A world whose environments play known tasks of their slot's pool, as evaluation and meta-learning need."""
+    """A world in which every environment plays a known task from its slot's pool of tasks.
+
+    Evaluation and meta-learning need such worlds, because they must know which task each environment plays.
+    """
 
     slot_env_ids: list[slice]
     """Contiguous environments of each slot, as slices."""
@@ -180,7 +186,7 @@ class PooledWorld(TaskWorld, Protocol):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Task pool of each slot, (n, size of a variation) each."""
+        """Task pools: one array (n, size) for each slot, with one row of numbers (the variation) per task."""
         ...
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
@@ -193,10 +199,11 @@ class PooledWorld(TaskWorld, Protocol):
 
 
 class EndlessWorld(Protocol):
-    """A world whose suite has no fixed number of train tasks (``tasks_per_class = 0``).
+    """A world of a suite that has no fixed number of train tasks (``tasks_per_class = 0``).
 
-    In SAME_STEP and NEXT_STEP mode every episode draws a new task, until ``set_tasks`` gives others. In DISABLED mode
-    the pools stay, and a learner that plays trials calls ``fresh_tasks`` and ``set_tasks`` before each trial.
+    In SAME_STEP and NEXT_STEP mode every episode draws a new task; after a call of ``set_tasks``, episodes play the
+    given tasks instead. In DISABLED mode each pool stays until it is replaced. A learner that plays trials (several
+    episodes of one task) therefore calls ``fresh_tasks`` and ``set_tasks`` before each trial.
     """
 
     endless: bool

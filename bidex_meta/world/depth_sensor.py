@@ -46,9 +46,9 @@ class PointsRule:
 
 
 class DepthSensor:
-    """Puts clouds into the observations of a scene's class, beginning at entry ``first``.
+    """Puts point clouds into observations, and zeros the entries that depend on objects' states.
 
-    The attribute ``hidden`` lists the entries of the class's observation that depend on objects' states, ascending.
+    A cloud begins at entry ``first`` of an observation. The attribute ``hidden`` lists the zeroed entries, ascending.
     """
 
     def __init__(self, scene: Scene, rule: PointsRule, first: int, device: torch.device) -> None:
@@ -59,9 +59,10 @@ class DepthSensor:
         self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
 
     def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Zero hidden entries of observations (n, d) and fill in clouds, in place.
+        """Zero the hidden entries of observations (n, d), and write the clouds into the cloud entries, in place.
 
-        ``position`` and ``rotation`` of the bodies are as for ``Cloud``.
+        ``position`` (n, nbody, 3), in metres, and ``rotation`` (n, nbody, 3, 3) give the poses of the model's bodies in
+        the world frame.
         """
         values.index_fill_(1, self._hidden, 0.0)
         values[:, self._columns] = self._cloud(position, rotation).flatten(1)
@@ -88,7 +89,10 @@ def privileged_columns(scene: Scene) -> list[int]:
 
 
 def _without_objects(scene: Scene) -> TaskState:
-    """Return a state (one environment) at the nominal start of the middle task, with NaN for objects' sensors."""
+    """Return a state of one environment in which all sensors of objects read NaN.
+
+    The environment is at the scene's nominal start. Its task is the middle of the class's variation space.
+    """
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.start_qpos[: scene.model.nq]
     mujoco.mj_forward(scene.model, data)

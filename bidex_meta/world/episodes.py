@@ -72,13 +72,17 @@ class Episodes:
 
     @property
     def solved_at_end(self) -> Tensor:
-        """Return whether an episode that ends now counts as holding its goal at the end, (n,), bool."""
+        """Return which environments have met their goal in each of the last ``HELD_STEPS`` steps, (n,), bool.
+
+        If success counts at the end, an episode that ends now is a success in these environments.
+        """
         return self.held >= HELD_STEPS
 
     def statistics(self, at_end: bool) -> dict[str, Tensor]:
         """Return statistics of the running episodes, as in ``info["running"]``.
 
-        With ``at_end`` success means that the goal is held at the end, otherwise that it was met at any step.
+        With ``at_end`` an episode is a success if its goal has been held up to the present step. Otherwise it is a
+        success if its goal was met at any step.
         """
         if at_end:
             success = self.solved_at_end
@@ -98,11 +102,12 @@ class Episodes:
 
 
 def ended_info(info: Info) -> Info:
-    """Return Gymnasium's keys for the episodes that ended in a step, from the keys of ``contract``.
+    """Return the keys that Gymnasium expects in the info of a step in which episodes ended.
 
-    Values are zero outside their masks. ``episode`` holds r, l, success and unscaled, (N,) each; its mask ``_episode``
-    marks episodes that ended and count. ``final_info`` holds values of the last step and ``episode`` again, each with a
-    mask. ``_final_info`` marks all environments whose episode ended.
+    ``info`` has the keys that ``contract`` describes. ``episode`` holds r, l, success and unscaled, (N,) each; its mask
+    ``_episode`` marks episodes that ended and count. ``final_info`` holds values of the last step and ``episode``
+    again, each with a mask. ``_final_info`` marks all environments whose episode ended. Values are zero in environments
+    that a mask does not mark.
     """
     ended = info["_final_obs"]
     episode_mask = info["episode_mask"]
@@ -113,9 +118,9 @@ def ended_info(info: Info) -> Info:
 
 
 class Clock:
-    """Measures the seconds that the episodes of ``num`` environments take, for the entry ``t`` of ``episode``.
+    """Measures how many seconds each episode of ``num`` environments takes.
 
-    The times are not part of a world's state.
+    ``info["episode"]["t"]`` reports these times. They are not part of a world's state.
     """
 
     def __init__(self, num: int, device: torch.device) -> None:
@@ -153,11 +158,11 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
 
 
 def set_stagger(world: VectorWorld, stagger: bool) -> None:
-    """Set whether first episodes begin at random elapsed steps.
+    """Set whether a world shortens the first episode of each environment by a random number of steps.
 
-    It takes effect at the world's first reset, or at the next reset with a seed. Other libraries sum rewards from the
-    first step to the first end, so worlds that are made for them begin at 0 by default. The world may be wrapped. A
-    world without ``stagger`` is not changed.
+    The setting takes effect at the world's first reset, or at the next reset with a seed. Worlds that are made for
+    other libraries do not shorten episodes by default, because these libraries would report a shortened episode like
+    any other. The world may be wrapped. A world without the attribute ``stagger`` is not changed.
     """
     stagger = true_or_false("stagger", stagger)
     inner: Any = getattr(world, "unwrapped", world)

@@ -23,7 +23,11 @@ OWN_DRAWS = 2
 
 
 class Sizes(NamedTuple):
-    """Sizes of an environment: observation entries without the one-hot, action entries, and the time limit in steps."""
+    """Sizes of an environment of another library.
+
+    ``state`` is the number of observation entries without the class's one-hot, ``action`` is the number of action
+    entries, and ``episode`` is the time limit in steps.
+    """
 
     state: int
     action: int
@@ -33,9 +37,9 @@ class Sizes(NamedTuple):
 class ForeignWorld(BatchedWorld):
     """Environments of another library's classes; each class is a slot, and ``sizes`` applies to all of them.
 
-    Observations are the class's own numbers, followed by the class's one-hot if there are several classes. In SAME_STEP
-    mode each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j modulo the
-    number of tasks.
+    An observation has the class's own numbers. If there are several classes, a one-hot vector of the class follows. In
+    SAME_STEP mode each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j
+    modulo the number of tasks.
     """
 
     def __init__(
@@ -64,7 +68,10 @@ class ForeignWorld(BatchedWorld):
         self._success = torch.zeros(self.num_envs, dtype=torch.bool)
 
     def _draws(self, num: int) -> Tensor:
-        """Return uniform numbers (n, num) for the running episodes; they depend on seed, environment and episode."""
+        """Return uniform numbers in [0, 1), (n, num), for each environment's running episode.
+
+        The numbers depend only on seed, environment and episode.
+        """
         return uniform(self._keys, self.episodes.number, num)
 
     def _start(self, mask: Tensor, stagger: bool) -> None:
@@ -77,7 +84,7 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _place(self, mask: Tensor) -> None:
-        """Start the tasks ``task_index`` in the environments of a mask, and write their states into ``_obs``."""
+        """Start the task of each environment in a mask (``task_index``), and write its first state into ``_obs``."""
 
     def _move(self, active: Tensor, broken: Tensor) -> Outcome:
         reward, terminated, truncated, info = self._finish(active, broken, self._advance(active, broken))
@@ -86,9 +93,10 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        """Step the ``active`` environments with the actions in ``_action``; of all others only success is read.
+        """Step the ``active`` environments with the actions in ``_action``, and return the transition.
 
-        ``broken``: the active environments whose action was not finite; nothing is read from them.
+        For inactive environments the caller reads only the fields ``success`` and ``unstable``. ``broken`` marks active
+        environments whose action was not finite; the caller ignores their transition.
         """
 
     def state_dict(self) -> State:

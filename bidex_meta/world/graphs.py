@@ -1,8 +1,8 @@
-"""Ways to keep an accelerator busy during a step: engines run in parallel on streams, torch's work runs as CUDA graphs.
+"""Ways to keep an accelerator busy during a step: parallel streams for engines, CUDA graphs for torch's work.
 
-If torch's kernels were launched one by one, they would take longer than the physics. A graph records one stretch of
-work, that is, a part of a step. The state that a stretch reads and writes is in tensors at fixed addresses. The result
-is at a fixed address too, and the next replay overwrites it.
+If torch's kernels were launched one by one, they would take longer than the physics. A CUDA graph therefore records a
+part of a step, called a stretch here, and replays it at once. The state that a stretch reads and writes is in tensors
+at fixed addresses. The result is at a fixed address too, and the next replay overwrites it.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -40,10 +40,10 @@ def cuda_graph(work: Callable[[], Result]) -> tuple[Callable[[], None], Result]:
 
 
 class GraphCache:
-    """Recorded stretches of work, by key; all of them read and write the same state.
+    """A cache of recorded stretches of work (parts of a step), by key; all of them use the same state.
 
-    A stretch is recorded with the tensors that its closures hold at that time. Call ``forget`` after replacing any of
-    these tensors other than the state and the inputs.
+    A recording always uses the tensors that the work's closures held when it was recorded. Call ``forget`` after
+    replacing any of these tensors other than the state and the inputs.
     """
 
     def __init__(
@@ -59,15 +59,16 @@ class GraphCache:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all recordings; the next runs of each stretch are neither recorded nor replayed."""
+        """Drop all recordings; each stretch of work is recorded again only after a few direct runs."""
         self._state: dict[str, Tensor] = {}
         self._runs: dict[Hashable, int] = {}
         self._recorded: dict[Hashable, tuple[list[Tensor], Callable[[], None], object]] = {}
 
     def run(self, key: Hashable, work: Callable[..., Result], *inputs: Tensor) -> Result:
-        """Run or replay the work and return its result; the next replay of this stretch overwrites the result.
+        """Run the work and return its result: directly in the first runs, then by replaying a recording.
 
-        A key must always come with the same work and inputs of the same shapes.
+        The next replay with the same key overwrites the result. A key must always come with the same work, and with
+        inputs of the same shapes.
         """
         self._runs[key] = self._runs.get(key, 0) + 1
         if self._runs[key] <= _BEFORE:
@@ -110,7 +111,7 @@ def fresh(result: Result) -> Result:
 
 
 class Stepper(Protocol):
-    """Runs stretches: parts of a world's step that read no number on the host."""
+    """Runs parts of a world's step that read no tensor's value on the host."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """Run a method of the world on tensors whose shapes never change, and return its result.
@@ -120,7 +121,7 @@ class Stepper(Protocol):
         ...
 
     def keep(self, result: Result) -> Result:
-        """Return the result of a run in memory that no later run overwrites."""
+        """Return the result of ``run`` in memory that later calls of ``run`` do not overwrite."""
         ...
 
     def forget(self) -> None:
@@ -129,7 +130,7 @@ class Stepper(Protocol):
 
 
 class EagerStepper:
-    """Runs each stretch directly, without recording it."""
+    """Runs each part of a step directly, without recording it."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """See ``Stepper``."""
@@ -144,7 +145,7 @@ class EagerStepper:
 
 
 class CapturedStepper:
-    """Records each stretch as a graph and replays it."""
+    """Runs each part of a step directly a few times, then records it as a graph and replays the graph."""
 
     def __init__(
         self,
@@ -169,7 +170,7 @@ class CapturedStepper:
 
 
 class SideBySide:
-    """Runs jobs one after the other on a CPU, at the same time on a GPU."""
+    """Runs jobs in parallel on a GPU, and one after the other on a CPU."""
 
     def __init__(self, jobs: int, device: torch.device) -> None:
         """Prepare streams; ``jobs`` is the maximum number of jobs that run at the same time."""

@@ -41,7 +41,10 @@ class Slot:
 
 @dataclass(frozen=True)
 class Member:
-    """A slot's environments in the world and its rows in its group's engine, both contiguous."""
+    """The environments of one slot, as a part of the group of slots that share an engine.
+
+    The environments are contiguous in the world (``env_ids``) and in the engine (``engine_rows``).
+    """
 
     slot: int
     scene: Scene
@@ -111,9 +114,10 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
 
 
 def build_groups(slots: list[Slot], env_ids: list[slice], make_engine: EngineMaker) -> list[Group]:
-    """Compile the slots' scenes and group the slots with models of equal structure, in the slots' order.
+    """Compile the slots' scenes, and group the slots that can share an engine.
 
-    ``env_ids`` holds the contiguous environments of each slot.
+    The models and observation layouts of a group have equal structure. Groups, and the slots within a group, keep the
+    order of ``slots``. ``env_ids`` holds the contiguous environments of each slot.
     """
     scenes: dict[Hashable, Scene] = {}
     pools: list[list[int]] = []

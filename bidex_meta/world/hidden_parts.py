@@ -1,4 +1,4 @@
-"""Hidden parts of tasks: the methods of ``contract.PrivilegedWorld`` for worlds of hands."""
+"""Access to the numbers of tasks that observations hide, for worlds with hands (``contract.PrivilegedWorld``)."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,10 @@ from bidex_meta.world.part import PartedWorld, judge
 
 
 class HiddenParts:
-    """The numbers of variations that classes hide (``TaskClass.hides``), scaled from their range to [-1, 1]."""
+    """Gives access to the numbers of tasks that classes hide (``TaskClass.hides``).
+
+    Each number is scaled from its range to [-1, 1].
+    """
 
     def __init__(self, slots: Sequence[Slot], device: torch.device) -> None:
         self.columns: dict[str, list[int]] = {}

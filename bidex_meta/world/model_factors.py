@@ -1,7 +1,7 @@
-"""The dependence of a scene's model on the factors of a randomisation.
+"""Domain randomisation: the way in which a scene's model depends on random factors, such as that of friction.
 
 Every number that depends on a factor is multiplied by a power of the factor. This includes the numbers that
-``mj_setConst`` would compute, because calling it would take as long as a step.
+``mj_setConst`` would compute, because calling ``mj_setConst`` would take as long as a step.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ def object_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _free(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies are free objects that have no other joints and carry no bodies, (nbody,), bool."""
+    """Return which bodies are objects with a single, free joint and without child bodies, (nbody,), bool."""
     parents = np.isin(np.arange(model.nbody), model.body_parentid)
     free = np.array(
         [n == 1 and model.jnt_type[a] == 0 for n, a in zip(model.body_jntnum, model.body_jntadr, strict=True)]
@@ -36,9 +36,10 @@ def _free(model: mujoco.MjModel) -> np.ndarray:
 
 
 def heights(scene: Scene) -> dict[int, float]:
-    """Return how far each free object (see ``_free``) reaches below its origin at the start, metres.
+    """Return the height of each free object's origin above the object's lowest point, metres.
 
-    The key of an object is the ``qpos`` column of its z.
+    ``_free`` defines free objects; they are in the pose of the nominal start. The key of an object is the ``qpos``
+    column of its z coordinate.
     """
     model = scene.model
     data = mujoco.MjData(scene.model)
@@ -55,9 +56,10 @@ def heights(scene: Scene) -> dict[int, float]:
 
 
 def exponents(scene: Scene, varied: Sequence[str], device: torch.device) -> Exponents:
-    """Return the exponents, (n, 1) or (n, k), by which the model's fields (n, k) depend on the factors.
+    """Return the exponents by which the model's fields depend on the randomised factors.
 
-    Raises BidexError if an object's size varies and the object has a mesh.
+    A field (n, k) is multiplied by a factor to the power of the exponents, (n, 1) or (n, k). ``varied`` names the
+    factors. Raises BidexError if the size of objects varies and an object has a mesh.
     """
     found: Exponents = {}
     for factor, name, exponent in _laws(scene.model):
@@ -74,9 +76,10 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 def _laws(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield the name of a factor, the name of a field, and the factor's exponents in the field, (n, 1) or (n, k).
+    """Yield a factor, a field of the model, and the exponents by which the field depends on the factor.
 
-    Size factors do not change masses. Inverse inertias depend on both size and mass.
+    Factor and field are names; the exponents have the shape (n, 1) or (n, k). Size factors do not change masses.
+    Inverse inertias depend on both size and mass.
     """
     objects = object_bodies(model)
     free = _free(model)

@@ -1,4 +1,7 @@
-"""The computation of observations from sensors (one gather, one scale, the goal's blocks), and observation groups."""
+"""The computation of observations from sensors, and the named groups of observation entries.
+
+All entries are gathered in one operation and scaled in another. The task classes then fill in the blocks of the goal.
+"""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -21,17 +24,19 @@ _HAND_OF = {block.name: f"{block.name.partition('_')[0]}_hand" for block in both
 
 
 class Observer:
-    """Builds the observations of environments with one layout, by a gather of sensors, last actions and base rotations.
+    """Builds the observations of environments that have the same observation layout.
 
-    Blocks that only a task can compute (such as the goal's pose) are left at zero, and ``Part`` fills them in. A masked
-    goal and padding stay at zero.
+    All entries are gathered from sensors, last actions and base rotations. Blocks that only a task class can compute
+    (such as the goal's pose) are left at zero, and ``Part`` fills them in. Padding stays at zero, and so does a goal
+    that the suite masks.
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Look up source, factor and offset of every entry; ``scene`` is any scene whose task has the layout.
+        """Look up the source, scale and offset of every observation entry.
 
-        ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
-        the observation with padding and task id.
+        ``scene`` may be any scene whose task has the layout. ``start_mounts`` (num, 2, 4) holds the orientations
+        (x, y, z, w) of both hands' mounts at the start, for each row of the engine. ``width`` is the number of
+        observation entries, including padding and task id.
         """
         self.layout: Layout = scene.task.layout
         device = start_mounts.device
@@ -72,10 +77,11 @@ class Observer:
         self._scale[where] = 1.0
 
     def _of_quaternions(self, scene: Scene) -> list[int]:
-        """Return the first entry of each quaternion whose sign ``choose_signs`` sets; empty without wide variation.
+        """Return the first observation entry of each quaternion whose sign ``choose_signs`` sets.
 
-        A goal's block ends with such a quaternion. Quaternions of hands are left out: joints turn a hand continuously
-        from one start, so that the sign is unique even if w is near 0.
+        The list is empty unless the class has version 2's wide variation. A goal's block ends with such a quaternion.
+        Quaternions of hands are left out: joints turn a hand continuously from one start, so that the sign is unique
+        even if w is near 0.
         """
         if not scene.task.rules.wide:
             return []
@@ -92,9 +98,9 @@ class Observer:
         return found
 
     def choose_signs(self, values: Tensor) -> None:
-        """Negate, with wide variation, each quaternion of an object or goal whose w is negative.
+        """Negate each quaternion of an object or goal whose w is negative, in observations (n, width), in place.
 
-        The observations (n, width) are changed in place.
+        Only classes with version 2's wide variation do this; for other classes nothing changes.
         """
         if len(self._quaternions):
             columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
@@ -102,14 +108,17 @@ class Observer:
             values[:, columns] = torch.where(turns[..., 3:] < 0.0, -turns, turns).flatten(1)
 
     def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Return orientations of both mounts and inverses of their start orientations, (x, y, z, w), each (n, 2, 4)."""
+        """Return the orientations of both hands' mounts, and the inverses of their start orientations.
+
+        Both are quaternions (x, y, z, w), (n, 2, 4), for the engine rows ``rows``.
+        """
         return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
 
     def __call__(self, sensors: Tensor, action: Tensor, rotation: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Return unclipped observations of some rows (n, width), float32, without the tasks' own blocks.
+        """Return observations (n, width), float32, before clipping and without the blocks that task classes compute.
 
-        The observations are computed from sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3;
-        None for fixed bases). If ``out`` is given, the result is written into it.
+        They are computed from sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3), which are
+        None for fixed bases. If ``out`` is given, the result is written into it.
         """
         values = self._values[: len(sensors)]
         sensed, acted, turned = self._columns
@@ -140,11 +149,11 @@ def observation_groups(
     hidden: Sequence[Sequence[int]] | None = None,
     points: tuple[str, int] | None = None,
 ) -> tuple[ObservationGroup, ...]:
-    """Return groups that are valid for all classes of a world; entries whose kind differs by class are in ``task``.
+    """Return observation groups that are valid for all classes of a world.
 
-    ``width``: number of entries of the padded observation, without cloud and task id. ``hidden``: for each layout, the
-    entries that are always zero and count as padding. ``points``: name and number of entries of the cloud, which lies
-    between the padded observation and the task id.
+    Entries whose kind differs by class form the group ``task``. ``width``: number of entries of the padded observation,
+    without cloud and task id. ``hidden``: for each layout, the entries that are always zero and count as padding.
+    ``points``: name and number of entries of the cloud, which lies between the padded observation and the task id.
     """
     if hidden is None:
         hidden = [()] * len(layouts)

@@ -23,10 +23,10 @@ from bidex_meta.world.observations import Observer, Rule
 
 
 class Controls:
-    """Writes actions into a group's engine: position targets and base forces.
+    """Writes actions into a group's engine: targets for the joints, forces and torques for the bases.
 
     An action begins with the right hand. Each hand has entries for 20 joints, 3 base translations and 3 base rotations,
-    in this order (Tables 9 and 11).
+    in this order (the paper's Tables 9 and 11). Hands with fixed bases have only the joints' entries.
     """
 
     def __init__(self, group: Group) -> None:
@@ -46,9 +46,10 @@ class Controls:
             self._wrench[member.engine_rows, 3:] = TORQUE_PER_SCALE * task.orientation_scale
 
     def write(self, action: Tensor) -> None:
-        """Set joint targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
+        """Write actions into the engine: targets of joints, and force (N) and torque (N m) on moving bases.
 
-        ``action``: finite numbers in [-1, 1], shape (num, 52 or 40).
+        ``action`` (num, 52), or (num, 40) for fixed bases, is within [-1, 1] and finite. An entry a sets a joint's
+        target, which has limits lo and hi, to lo + (a + 1)/2 (hi - lo). Force and torque are in the world frame.
         """
         action = action.to(self._engine.ctrl.dtype)
         share = action.shape[1] // len(SIDES)
@@ -124,11 +125,11 @@ class Part:
             self._pools.append(pool)
 
     def renew(self, mask: Tensor, shares: Tensor) -> None:
-        """Give the environments of a mask (num,) new tasks; environment j of a member plays entry j of its pool.
+        """Give new tasks to the environments of a mask (num,).
 
-        ``shares`` in [0, 1), (num, at least the size of each variation), give the tasks' positions in their variation
-        spaces. Pools are rewritten in place and for all environments, because recorded graphs read them and have fixed
-        shapes.
+        Environment j of a slot plays entry j of its slot's pool. ``shares`` in [0, 1), (num, at least the size of each
+        variation), give the tasks' positions in the ranges of their variation spaces. Pools are rewritten in place and
+        for all environments, because recorded graphs read them and have fixed shapes.
         """
         for member, tasks, pool in zip(self.group.members, self.tasks, self._pools, strict=True):
             task = member.scene.task
@@ -138,7 +139,10 @@ class Part:
                 pool[name].copy_(values)
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Return a member's frozen numbers (see ``TaskClass.freeze``), from the environments' task indices."""
+        """Return the values that a task class computes once per task (``TaskClass.freeze``), for some tasks.
+
+        ``member``: index of the class in the group. ``task_index``: indices of the tasks in the class's pool.
+        """
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
@@ -159,17 +163,20 @@ class Part:
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """Yield each member that has chosen rows, the slice of its rows among the chosen rows, and its state.
+        """Yield the state of each member (a class of the group) that has rows among the chosen rows of the engine.
 
-        ``task_index``: task of each of the part's environments, (num,); ``rows``: the chosen engine rows, ascending, or
-        None for all.
+        Yields the member, the slice of its rows among the chosen rows, and its state. ``task_index`` (num,): task of
+        each environment of the part. ``rows``: chosen engine rows, ascending; None: all.
         """
         for i, member, where, chosen in self.members(rows):
             frozen = self.frozen(i, task_index[chosen])
             yield member, where, TaskState(self._engine.sensordata[chosen], member.scene.sensors, frozen)
 
     def members(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
-        """Yield index, member, slice among the chosen rows, and engine rows of each member that has chosen rows."""
+        """Yield index, member, slice and engine rows of each member that has chosen rows.
+
+        A member is a class of the group. The slice is the place of its rows among the chosen rows (None: all).
+        """
         for i, member in enumerate(self.group.members):
             if rows is None:
                 yield i, member, member.engine_rows, member.engine_rows
@@ -180,17 +187,20 @@ class Part:
                 yield i, member, slice(first, last), rows[first:last]
 
     def rows_in(self, mask: Tensor) -> Tensor | None:
-        """Return the engine rows of the environments of a mask (num_envs,), ascending.
+        """Return the engine rows of the environments of a mask (num_envs,), ascending; None stands for all rows.
 
-        For masked engines return None, which stands for all rows: counting the entries of a mask would make the host
-        wait for the accelerator.
+        Engines for accelerators (``Engine.masked``) always get None, because counting the entries of a mask would make
+        the host wait for the accelerator.
         """
         if self._engine.masked:
             return None
         return self.group.take(mask).nonzero().squeeze(1)
 
     def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
-        """Return ``Observer.mounts`` of engine rows (all if None); return None if the bases are fixed."""
+        """Return the orientations of the hands' mounts (``Observer.mounts``), or None if the bases are fixed.
+
+        ``rows`` chooses rows of the engine; None chooses all.
+        """
         chosen = slice(None) if rows is None else rows
         if self._observer.moving:
             return self._observer.mounts(self._engine.sensordata[chosen], chosen)
@@ -257,11 +267,13 @@ class Part:
             checked.own_numbers(task, "observe", task.observe(state), self.unstable, member.engine_rows)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor, shares: Tensor | None = None) -> Tensor:
-        """Return start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
+        """Return start positions of episodes, (n, start_size), as a pure function of the draws and the tasks.
 
-        ``rows``: engine rows (n,), ascending; None: all rows, with n / num successive starts for each row. ``draws``:
-        uniform numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,). ``shares``: shares of new
-        tasks as in ``renew``, (n, ...); None: the tasks come from the pools.
+        Args:
+            rows: Engine rows (n,), ascending. None: all rows, with n / num successive starts for each row.
+            draws: Uniform numbers in [-1, 1], (n, at least the classes' draws).
+            task_index: Task of each start in its pool, (n,).
+            shares: Positions of new tasks in their variation spaces, as in ``renew``. None: tasks come from the pools.
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         if rows is None:
@@ -342,10 +354,10 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
 
 
 def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, together: Together) -> Transition:
-    """Judge and observe all environments after a step; parts are processed at the same time.
+    """Compute rewards, success, failure and observations of all environments after a step.
 
-    ``task_index`` (n,) and ``action`` (n, a) are those of the step. ``width`` is the size of observations; their task
-    ids are not written.
+    ``together`` runs one job per part. ``task_index`` (n,) and ``action`` (n, a) are those of the step. ``width`` is
+    the number of observation entries; the entries of the task id are not written.
     """
     n = len(action)
     device = action.device

@@ -41,7 +41,10 @@ def env_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
 
 
 def derived(keys: Tensor, episode: Tensor, stream: int) -> Tensor:
-    """Return keys (n, 2) of a stream of random numbers in episodes (n,), from the keys (n, 2) of the environments."""
+    """Return the keys (n, 2) of another stream of random numbers in each environment's episode.
+
+    They depend on the environments' keys (n, 2), the numbers of the episodes (n,) and the number of the stream.
+    """
     beyond = torch.full_like(episode, _MASK - stream)  # the episode's own draws never count up to this number
     return torch.stack(threefry((keys[:, 0], keys[:, 1]), (episode, beyond)), dim=1)
 

@@ -85,7 +85,7 @@ class Randomiser:
             models.write(self.drawn, mask)
 
     def lift(self, starts: Sequence[Tensor], mask: Tensor) -> None:
-        """Lift larger objects in the start positions of the environments of a mask, in place.
+        """Raise enlarged objects in the start positions of the environments of a mask, in place.
 
         Otherwise these objects would start inside the surface on which they lie. ``starts`` holds the start positions
         of each part, see ``Starts.take``.
@@ -115,7 +115,10 @@ class Randomiser:
         return action, past
 
     def observe(self, obs: Tensor, elapsed: Tensor, env_ids: Tensor | slice = slice(None)) -> Tensor:
-        """Return observations (k, width) of some environments with noise; ``elapsed`` (k,): steps of their episodes."""
+        """Add noise to the observations (k, width) of some environments, and return the result.
+
+        ``elapsed`` (k,) is the number of steps in each environment's episode.
+        """
         if not self._rule.observation_noise:
             return obs
         noise = normal(self._streams[_OBSERVATION][env_ids], elapsed, self._deviation.shape[1])
@@ -124,7 +127,7 @@ class Randomiser:
 
 
 class _Models:
-    """The models of a part's environments."""
+    """Applies random factors and pushes to the models of the environments of one part."""
 
     def __init__(self, part: Part, varied: Sequence[str]) -> None:
         engine = part.group.engine
@@ -144,7 +147,10 @@ class _Models:
         self._heights = [heights(member.scene) for member in members]
 
     def write(self, drawn: dict[str, Tensor], mask: Tensor) -> None:
-        """Set fields of models to their compiled values times powers of the factors, in the environments of a mask."""
+        """Set the randomised fields of models in the environments of a mask.
+
+        A field becomes its compiled value times powers of the drawn factors.
+        """
         if not self._fields:
             return
         group = self._part.group

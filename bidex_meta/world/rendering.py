@@ -34,7 +34,7 @@ GHOST_ALPHA = 0.35
 
 
 class DrawnGhost(NamedTuple):
-    """A goal of one environment: an ellipsoid in the world, metres."""
+    """A goal of one environment as pictures show it: an ellipsoid in the world frame."""
 
     position: np.ndarray
     quaternion: np.ndarray
@@ -153,9 +153,10 @@ def _camera(world: "PartedWorld", env_id: int, name: str) -> mujoco.MjvCamera:
 
 
 def stage(task: "TaskClass", goals: "list[Ghost]") -> mujoco.MjModel:
-    """Return a class's model for pictures with its own camera and a movable, translucent body for each goal.
+    """Return a class's model for pictures, with the class's own camera and with a movable body for each goal.
 
-    The goals' poses follow those of the movable fixtures in a placement.
+    The renderer draws the goals' bodies translucently. In a placement (see ``Engine.placement``) the goals' poses
+    follow those of the movable fixtures.
     """
     spec = dressed_spec(task)
     azimuth, elevation = np.radians(task.camera_angle)
@@ -188,7 +189,7 @@ def _part(world: "PartedWorld", env_id: int) -> "tuple[Part, int]":
 
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, placement: torch.Tensor) -> None:
-    """Move everything that is drawn to where a row of ``Engine.placement`` puts it."""
+    """Set ``data`` to a placement (a row of ``Engine.placement``), so that everything is drawn in its present pose."""
     numbers = placement.double().cpu().numpy()
     data.qpos[:] = numbers[: model.nq]
     mocap = numbers[model.nq :].reshape(-1, 7)

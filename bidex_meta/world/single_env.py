@@ -47,7 +47,7 @@ class AnyTask(Protocol):
 
 @dataclass(frozen=True)
 class EnvRecipe:
-    """A task class in a suite: the settings that determine observations and rewards."""
+    """A task class with the settings of its suite that determine observations and rewards."""
 
     name: str
     moving_base: bool | None

@@ -25,7 +25,10 @@ draws would be needed at almost every step."""
 
 
 class Starts:
-    """The coming episodes of every environment: tasks, elapsed shares of the time limit, and start positions."""
+    """Draws the next episodes of every environment ahead of time, and stores them.
+
+    An episode consists of its task, its start position, and the share of the time limit that counts as elapsed.
+    """
 
     def __init__(
         self,
@@ -70,7 +73,10 @@ class Starts:
         self._takes = 0
 
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Draw ahead if the next ``take`` needs new draws; ``take`` must get the same mask, number and task_index."""
+        """Draw episodes ahead of time if the next call of ``take`` needs new ones.
+
+        That call must get the same mask, number and task_index.
+        """
         if self._masked:
             # An environment begins at most one episode per take, so counting takes replaces reading any number from the
             # device.
@@ -83,14 +89,16 @@ class Starts:
             self._draw((used >= _AHEAD // 2).nonzero().squeeze(1), number, task_index)
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return the starts of the environments in ``mask``, bool (n,), and write new tasks into pools.
+        """Return tasks, elapsed shares and start positions of the next episodes in ``mask``, bool (n,).
 
-        Call ``prepare`` before. ``number`` (n,): number of the episode that begins, or would begin next, in each
-        environment. ``task_index`` (n,): task that an environment keeps if none is drawn.
+        Call ``prepare`` before. If episodes draw new tasks, this method writes them into the pools. ``number`` (n,):
+        number of the episode that begins, or would begin next, in each environment. ``task_index`` (n,): task that an
+        environment keeps if none is drawn.
 
-        Returns the task (n,) and the elapsed share in [0, 1) (n,) of every environment, and for each part the start
-        positions (k, start_size) of its k environments in the mask (of all its environments if the engine is masked).
-        Values of environments outside the mask are not valid.
+        Returns:
+            Task of every environment, (n,); share of the time limit that counts as elapsed, in [0, 1), (n,); and for
+            each part the start positions (k, start_size) of its k environments in the mask. A part whose engine is
+            ``masked`` has start positions for all its environments. Values outside the mask are not valid.
         """
         place = (number - self._first).clamp(max=_AHEAD - 1)[:, None]
         shares = self._new_tasks(slice(None), number)
@@ -107,7 +115,7 @@ class Starts:
         return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
 
     def _draw(self, env_ids: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Fill the store of episodes drawn ahead of some environments, from the given episode numbers on."""
+        """Draw the next episodes of some environments, from the given episode numbers on, and store them."""
         self._first[env_ids] = number[env_ids]
         many, ahead = _repeated(env_ids)
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -123,7 +131,10 @@ class Starts:
                 qpos[engine_row[own], ahead[own]] = start.to(qpos.dtype)
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
-        """Fill the store of every environment in place, with shapes that do not depend on values."""
+        """Draw the next episodes of all environments and store them in place.
+
+        The shapes of tensors do not depend on values, so that a CUDA graph can record this method.
+        """
         self._first.copy_(number)
         many, ahead = _repeated(torch.arange(len(number), device=number.device))
         signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
@@ -141,7 +152,11 @@ class Starts:
         self._together([partial(place, part, qpos) for part, qpos in zip(self._parts, self._qpos, strict=True)])
 
     def _numbers(self, env_ids: Tensor, episode: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return draws in [-1, 1] (k, start_draws), task (k,) and elapsed share in [0, 1) (k,) of episodes (k,)."""
+        """Return the random numbers of episodes (k,): draws for the start, task, and elapsed share.
+
+        The draws (k, start_draws) are in [-1, 1]. The task (k,) is an index into the slot's pool. The share (k,) in
+        [0, 1) is the part of the time limit that counts as elapsed.
+        """
         draws = uniform(self._keys[env_ids], episode, self._draws)
         tasks = task_index[env_ids]
         if self._pool_size is not None:
@@ -152,9 +167,9 @@ class Starts:
         return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]
 
     def _new_tasks(self, env_ids: Tensor | slice, episode: Tensor) -> Tensor | None:
-        """Return the new tasks of episodes (k,), as shares in [0, 1) of the ranges in variation spaces, (k, size).
+        """Return the new tasks of episodes (k,), or None if episodes draw no new tasks.
 
-        Return None if episodes draw no new tasks.
+        A task is a row of shares in [0, 1), (k, size): each number is a position within a range of the variation space.
         """
         if self._task_keys is None:
             return None
@@ -162,7 +177,10 @@ class Starts:
 
 
 def _repeated(env_ids: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each environment ``_AHEAD`` times, and with it the offsets 0 to ``_AHEAD`` - 1, (k _AHEAD,) each."""
+    """Return each environment ``_AHEAD`` times in a row, and the number of each copy, from 0 to ``_AHEAD`` - 1.
+
+    For k environments both results have k ``_AHEAD`` entries.
+    """
     # Without output_size repeat_interleave would ask the device for the length.
     many = env_ids.repeat_interleave(_AHEAD, output_size=_AHEAD * len(env_ids))
     return many, torch.arange(_AHEAD, device=env_ids.device).repeat(len(env_ids))

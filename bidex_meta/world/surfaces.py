@@ -218,7 +218,10 @@ class Surfaces:
 
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Return the geoms with a surface that are in a shown group and not transparent."""
+    """Return the geoms that a camera can see.
+
+    Their type is in ``DRAWN``, they are in a group that MuJoCo's viewers show, and they are not fully transparent.
+    """
     geoms = []
     for geom in range(model.ngeom):
         material = model.geom_matid[geom]

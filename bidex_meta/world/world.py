@@ -320,7 +320,10 @@ class World(BatchedWorld):
         self._stepper.run(self._refresh, mask)
 
     def _take_starts(self, mask: Tensor, stagger: bool = False) -> list[Tensor]:
-        """Count new episodes in the environments of a mask and return their starts, part by part."""
+        """Begin new episodes in the environments of a mask, and return their start positions for each part.
+
+        This resets the counters and the last actions, and draws new random factors.
+        """
         # The number counts for all environments, because starts of others may be drawn in the same call.
         task_index, share, starts = self._starts.take(mask, self.episodes.number + 1, self.task_index)
         self._count_episodes(mask, task_index, share, stagger)
@@ -439,7 +442,7 @@ class World(BatchedWorld):
 
     @property
     def randomised(self) -> dict[str, Tensor]:
-        """Factors and the delay in control steps that were drawn for the running episodes, each (num_envs,)."""
+        """Random factors, and the delay of actions in control steps, of the running episodes, (num_envs,) each."""
         if self._randomiser is None:
             return {}
         return {name: value.clone() for name, value in self._randomiser.drawn.items()}
@@ -453,7 +456,7 @@ class World(BatchedWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Return the tasks of each slot, each (n, size of its variation)."""
+        """Return the task pools: for each slot an array (n, size), with one row of numbers (the variation) per task."""
         pools = {}
         for part in self.parts:
             for member, tasks in zip(part.group.members, part.tasks, strict=True):
@@ -512,7 +515,10 @@ def _with_entries(slot: Slot, env_ids: slice) -> Slot:
 
 
 def _option(value: float | str) -> str:
-    """Return an option of a class as text, for an object's file only the file name, because folders may move."""
+    """Return an option of a class as text.
+
+    The path of an object's file is reduced to the name without folder and suffix, because folders may move.
+    """
     if isinstance(value, str):
         return Path(value).stem
     return str(value)

@@ -68,7 +68,7 @@ class WorldWrapper(VectorWorld):
         self.world.load_state_dict(state)
 
     def to_numpy(self, stagger: bool = False) -> "NumpyWorld":
-        """Return this world, with its wrapper, as NumPy arrays."""
+        """Return this wrapped world with NumPy arrays, as Gymnasium's vector wrappers expect."""
         return NumpyWorld(self, stagger)
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Tasks of each slot, each (n, size of a variation)."""
+        """Task pools: one array (n, size) for each slot, with one row of numbers (the variation) per task."""
         return self.world.pools
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
@@ -100,13 +100,16 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
 class NumpyWorld(VectorEnv):
     """The result of ``world.to_numpy()``: NumPy arrays, for Gymnasium's vector wrappers.
 
-    ``info`` has ``success``, ``unstable``, ... of every environment. If an episode ended, ``info`` also has
-    ``final_obs`` (an array of objects: the last observation where an episode ended, elsewhere None) and ``final_info``,
-    whose ``episode`` has r, l, t, success and unscaled. The key ``episode`` itself is left to Gymnasium's
-    ``RecordEpisodeStatistics``. In DISABLED mode an ended environment may be stepped, as in the world, but its end is
-    reported only in the step that ended it; otherwise wrappers would count each later step as an episode. With
-    ``stagger`` a training world's first episodes begin at random elapsed steps, so that wrappers that count steps
-    report episodes that are too short.
+    ``info`` has ``success``, ``unstable``, ... of every environment. If an episode ended in the step, ``info`` also has
+    ``final_obs`` and ``final_info``. ``final_obs`` is an array of objects: the last observation where an episode ended,
+    elsewhere None. ``final_info["episode"]`` has r, l, t, success and unscaled. ``info`` itself has no key ``episode``,
+    because Gymnasium's ``RecordEpisodeStatistics`` adds this key.
+
+    In DISABLED mode an environment may be stepped after its episode ended, as in the world. The end is reported only in
+    the step in which it happens; otherwise wrappers would count each later step as an episode.
+
+    With ``stagger`` a training world shortens the first episode of each environment by a random number of steps.
+    Wrappers that count steps then report episodes that are too short.
     """
 
     @checked_arguments

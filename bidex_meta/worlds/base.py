@@ -1,4 +1,4 @@
-"""The interface of all worlds that a config can name, without loading torch and physics."""
+"""The interface of all worlds that a config can name; importing it loads neither torch nor physics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -62,7 +62,10 @@ Identity = dict[str, str | int | None]
 
 
 class Worlds(ABC):
-    """The worlds that a config names, with their common properties; ``name`` is the name in the user's spelling."""
+    """The worlds of the suite or class that a config names, and their common properties.
+
+    ``name`` is the name of the suite or class; for a user's own suite it is the path of the file.
+    """
 
     hides_goals: bool = False  # True for a meta suite that hides its goals
     suite: Suite | None = None
@@ -118,7 +121,10 @@ class Worlds(ABC):
 
     @property
     def rules(self) -> Rules | None:
-        """Return the rules of all classes, or None for classes of another library."""
+        """Return the rules for reward, variation, success and starts, which hold for all classes.
+
+        Return None for classes of another library.
+        """
         return None
 
     @property
@@ -128,11 +134,14 @@ class Worlds(ABC):
 
     @property
     def others(self) -> "Worlds":
-        """Return worlds with the same number of unseen tasks, drawn with another seed, on which no run trained."""
+        """Return worlds of the same suite or class whose tasks are drawn with another seed.
+
+        They have the same number of tasks. The tasks are unseen, because no run is trained with this seed.
+        """
         return type(self)(self._opened_as, replace(self.config, task_seed=self.seed + OTHER_SEED))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
-        """Return the default sizes of a training: environments, and steps over all of them.
+        """Return the default number of environments and the default number of environment steps of a training.
 
         ``adapts`` says whether the learner adapts to tasks.
         """
@@ -144,7 +153,10 @@ class Worlds(ABC):
 
     @property
     def moving_bases(self) -> bool:
-        """Return whether the hands' bases move, as in the shipped suites and when the references were measured."""
+        """Return whether the hands' bases move in all classes.
+
+        They move in the shipped suites, and they moved when the references were measured.
+        """
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
     def identity(self) -> Identity:
@@ -156,9 +168,10 @@ class Worlds(ABC):
         return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """Return the reference returns, which define the normalised score and the return of broken episodes.
+        """Return the reference returns of classes; the dict is empty if the references do not apply.
 
-        The dict is empty if bases, tasks or reward differ from those with which the references were measured.
+        References define the normalised score, and the return that an episode with broken physics gets. They do not
+        apply if bases, tasks or reward differ from those with which they were measured.
         """
         as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
         if self.moving_bases and as_printed:
@@ -180,7 +193,10 @@ V2_PRESET = "v2", "success counts at the end of the episodes, as in version 2"
 
 
 def physics_of(classes: "Mapping[str, TaskClass]") -> str:
-    """Return twelve hexadecimal digits that identify the physics of classes; touch sensors do not change them."""
+    """Return a digest of the physics of classes: twelve hexadecimal digits.
+
+    Touch sensors do not change the digest.
+    """
     from bidex_meta.engine.models import common_identity
     from bidex_meta.tasks.scene import compile_scene
 

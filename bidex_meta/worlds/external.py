@@ -40,7 +40,10 @@ class Foreign(Worlds):
             raise BidexError(f"Only bidex-meta's own suites draw their tasks, got {name}. Leave --tasks-per-class out.")
 
     def _check(self, split: str, rows: int) -> None:
-        """Refuse any split but train, any engine but C MuJoCo on the CPU, and worlds that do not fit into memory."""
+        """Raise BidexError if the world cannot be made.
+
+        The split must be ``train``, the engine must be C MuJoCo on the CPU, and the environments must fit into memory.
+        """
         if split != "train":
             raise BidexError(f"{self.name} has only the split train, got {split!r}. Leave --split out.")
         if not self.device.startswith("cpu") or self.engine == "warp":
@@ -56,11 +59,11 @@ class Foreign(Worlds):
         raise BidexError(f"Pictures and references need bidex-meta's own classes, got {self.name}. Name another.")
 
     def identity(self) -> Identity:
-        """Return an identity without entries: the version of the library's package identifies the physics."""
+        """Return an identity whose entries are None: the version of the library's package identifies the physics."""
         return {"physics": None, "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """Return no references."""
+        """Return an empty dict: there are no references for another library's classes."""
         return {}
 
 

@@ -84,7 +84,7 @@ class HumanoidWorld(ForeignWorld):
 
     @property
     def pools(self) -> list[np.ndarray]:
-        """Return the tasks, (n, 0)."""
+        """Return the pool of tasks, an array (n, 0): tasks have no numbers, because all of them are equal."""
         return [np.zeros((self.num_slot_tasks[0], 0))]
 
     def _place(self, mask: Tensor) -> None:

@@ -46,7 +46,11 @@ def suites_to_run() -> list[str]:
 
 
 def listed() -> list[dict[str, object]]:
-    """Return the entries of ``bidex-meta list suites``: our suites, Meta-World's suites, then the ladder's by rung."""
+    """Return the entries of ``bidex-meta list suites``.
+
+    Our suites come first, then Meta-World's. The suites of the ladder come last, sorted by rung, that is, by how much
+    they hide.
+    """
     rows: list[dict[str, object]] = []
     ladder: list[list[dict[str, object]]] = [[] for _ in RUNGS]
     for suite in map(load_suite, suite_names()):

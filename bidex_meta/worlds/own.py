@@ -113,7 +113,7 @@ class SingleClass(Worlds):
 
     @property
     def rules(self) -> Rules:
-        """Return the rules of the version that the class's name gives."""
+        """Return the rules of version 2 if the class's name ends in ``-v2``, otherwise those of version 1."""
         if self.class_name == plain_name(self.class_name):
             return V1
         return V2

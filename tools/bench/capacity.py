@@ -23,7 +23,7 @@ def capacity(
     threads: int | None = None,
     seed: int = 0,
 ) -> Json:
-    """Count the contacts and constraint rows of each class under the rough actions of ``stability``.
+    """Count the contacts and constraint rows of each class under rough actions (``stability.rough_actions``).
 
     C MuJoCo counts contacts and constraint rows after every step of every environment. mujoco_warp counts candidate
     pairs of the broadphase and pairs of the convex collider in a sample of 32 environments per step.

@@ -25,7 +25,9 @@ def cones(
     threads: int | None = None,
     seed: int = 0,
 ) -> Json:
-    """Count how often contacts change their zone, and their part of the Hessian, between Newton iterations.
+    """Count how often contacts change between Newton iterations.
+
+    A contact can change its zone (satisfied, quadratic or cone) and its part of the Hessian.
 
     C MuJoCo plays the class's script, or rough actions if it has none. At every ``every``-th control step mujoco_warp
     takes over the states on Warp's CPU device and plays one control step. Classes with pyramidal cones are left out.
@@ -57,7 +59,7 @@ def cones(
 
 
 class _Counts:
-    """Counts over the Newton iterations of an engine on Warp's CPU device."""
+    """Counts changes of contacts and constraint rows over the Newton iterations of an engine on Warp's CPU device."""
 
     def __init__(self, probe: Probe, tolerance: float) -> None:
         self._probe = probe

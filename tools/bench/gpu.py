@@ -42,7 +42,7 @@ def gpu(
         suite: Suite to step.
         tasks: Classes to step on their own.
         sizes: Numbers of environments.
-        steps: Number of control steps of each measurement. The same number of steps, at least 32, warms up before.
+        steps: Number of control steps of each measurement. As many steps, but at least 32, come first, to warm up.
         device: Device of the worlds.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
@@ -122,10 +122,11 @@ def training_speed(world: World, preset: str) -> int:
 
 
 def _stages(made: World, steps: int) -> dict[str, float]:
-    """Return milliseconds of a step, of its physics, of the rest (``torch``), and of each group that runs by itself.
+    """Return the milliseconds of a step and of its parts, by name.
 
-    ``launching`` is the host's part of the physics. ``overlap`` is 0 if groups run one after the other, and 1 if all
-    groups together take no longer than the slowest group.
+    ``physics`` is the physics of all groups together; ``torch`` is the rest of the step. The physics of each group is
+    also measured while no other group runs. ``launching`` is the time that the host spends in the physics. ``overlap``
+    is 0 if groups run one after the other, and 1 if all groups together take no longer than the slowest group.
     """
     took = {"step": 1000.0 * random_steps(made, steps) / steps}
     took["physics"], took["launching"] = _milliseconds(made, steps, made.step_engines)
@@ -159,7 +160,10 @@ def now(device: torch.device) -> float:
 
 
 def _milliseconds(made: World, steps: int, work: Callable[[], None]) -> tuple[float, float]:
-    """Return the mean milliseconds of a call of ``work``: until the device is done, and until the call returns."""
+    """Return two mean times per call of ``work``, in milliseconds.
+
+    The first time lasts until the device has finished its work, the second until the call returns.
+    """
     start = now(made.device)
     for _ in range(steps):
         work()

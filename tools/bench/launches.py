@@ -20,9 +20,10 @@ def launches(
     threads: int | None = None,
     seed: int = 0,
 ) -> Json:
-    """List the kernels of a substep by the size of the arrays that they access, on Warp's CPU device from real states.
+    """List the kernels of a physics substep, sorted by the size of the arrays that they access.
 
-    C MuJoCo plays the class as in ``cones``. The memory of a kernel is the size of its array arguments whose first
+    C MuJoCo plays the class's script, or rough actions if it has none. mujoco_warp takes over the states on Warp's CPU
+    device, where the kernels are counted. The memory of a kernel is the size of its array arguments whose first
     dimension is the world. It is the allocated size, of which only a part may be in use. A world that has converged
     reads almost nothing. Kernels in Newton's iterations are therefore counted only for worlds that still iterate.
 
@@ -62,9 +63,9 @@ class _Launches:
 
     @contextmanager
     def counting(self):
-        """Count all launches in this context; passes in Newton's iterations are weighted by the share of active worlds.
+        """Count all launches of kernels in this context, and the passes, which are launches per world.
 
-        A world is active until its solver has converged.
+        In Newton's iterations a launch counts as a pass only for the share of worlds whose solver has not converged.
         """
         from mujoco_warp._src import solver
 
@@ -112,7 +113,7 @@ class _Launches:
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in mine) / self._num
 
     def table(self, substeps: int, most: int) -> Json:
-        """Return the means over substeps."""
+        """Return totals, and a table of the ``most`` kernels that access most memory, as means over substeps."""
         rows = []
         for kernel, sums in self._kernels.items():
             mean = {name: value / substeps for name, value in sums.items()}

@@ -20,13 +20,13 @@ def pictures(
     seed: int = 0,
     out: Path | None = None,
 ) -> Json:
-    """Measure pictures per second, and steps per second with a picture of each environment.
+    """Measure pictures per second, and steps per second if each step draws every environment.
 
     Args:
         suites: Suites to draw. If a suite shows its goals, each environment is drawn twice.
         edges: Edge lengths of the square pictures, pixels.
         num_envs: Number of environments, all of which are drawn.
-        steps: Number of measured pictures per environment, and of measured control steps; one of each is a warm-up.
+        steps: Number of pictures per environment, and number of control steps; one more of each warms up.
         device: Device of the worlds.
         engine: As in ``Benchmark.make_world``; ``c`` draws with MuJoCo.
         seed: Seed of worlds and actions.

@@ -33,11 +33,11 @@ def stability(
     device: str = "cpu",
     engine: str = "auto",
 ) -> Json:
-    """Test if the physics is stable under rough actions, and under actions that solve the task.
+    """Test whether the physics is stable under rough actions, and under actions that solve the task.
 
     Half the environments draw uniform actions at every step; the other half hold each action at -1 or 1 for 5 to 40
-    steps. Depths of contacts are taken from a sample of environments. Then the class's witness, if there is one, is
-    played from its own start and from shifted starts.
+    steps. Depths of contacts are taken from a sample of environments. Then the class's witness (a stored episode that
+    solves a task), if there is one, is played from its own start and from shifted starts.
 
     Args:
         suite: Test the classes of this suite, with the suite's bases and the rules of its version.
@@ -51,10 +51,10 @@ def stability(
         engine: As in ``Benchmark.make_world``.
 
     Returns:
-        By class: number of unstable environment steps, warnings, speed of the fastest object (m/s), shares of sampled
-        states without a contact deeper than 5 and 15 mm, the 99.9 % quantile of depth (m), the share of states of the
-        witness without a contact deeper than 5 mm (None if there is no witness or the base is fixed), and whether all
-        limits hold.
+        By class: number of unstable environment steps; number of warnings; speed of the fastest object (m/s); the share
+        of sampled states without a contact deeper than 5 mm, and the share without one deeper than 15 mm; the 99.9 %
+        quantile of depth (m); the share of the witness's states without a contact deeper than 5 mm (None if there is no
+        witness or the base is fixed); and whether all limits hold.
     """
     result = {}
     for name, moving in variants(suite, task):
@@ -120,9 +120,10 @@ def _stability(made: World, steps: int, seed: int) -> Json:
 
 
 def witness_share(name: str, threads: int | None = None) -> float | None:
-    """Return the share of states without a contact deeper than 5 mm in replays of a witness; None without a witness.
+    """Return the share of states without a contact deeper than 5 mm while a class's witness is replayed.
 
-    Every state of the episodes counts, from the witness's own start and from the shifted starts of a replay.
+    A witness is a stored episode that solves a task; without one the result is None. Every state of the replayed
+    episodes counts, from the witness's own start and from the shifted starts.
     """
     if not witness_path(name).is_file():
         return None

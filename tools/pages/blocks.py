@@ -137,7 +137,10 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
 
 
 def _stored_digest(picture: Path) -> str | None:
-    """Read the stored digest of a picture's data; the bytes of the picture depend on the version of matplotlib."""
+    """Return the digest of a picture's data that is stored in the picture; None if there is no picture.
+
+    The bytes of pictures cannot be compared instead, because they depend on the version of matplotlib.
+    """
     if not picture.exists():
         return None
     with Image.open(picture) as opened:

@@ -18,7 +18,7 @@ _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "retur
 
 
 def gains_table(study: Study) -> Iterator[str]:
-    """Yield one row per run, class by class; a gain whose interval excludes zero is bold.
+    """Yield a table of gains, with one row for each class and run; a gain whose interval excludes zero is bold.
 
     A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
     the gain minus the gain of the control's run with the same seed. The half width of its interval is the root of the

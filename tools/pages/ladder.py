@@ -1,4 +1,7 @@
-"""The ladder: meta-learners compared with a policy that sees no goal or rewards, and with one that sees the goal."""
+"""Tables and pictures of the ladder, whose suites are ordered by how much of a task they hide.
+
+Meta-learners are compared with a policy that sees neither goal nor rewards, and with a policy that sees the goal.
+"""
 
 import json
 import re
@@ -59,10 +62,11 @@ class Line:
 
 
 def ladder_table(*studies: Study) -> Iterator[str]:
-    """Yield for each suite a table of learners, a sentence on whether it separates them, and a table of pairs.
+    """Yield three items for each suite: a table of learners, a verdict, and a table of pairs of learners.
 
-    "Gap closed" is a learner's success after the last exploring episode on a scale from blind PPO (0 %) to goal-shown
-    PPO (100 %). Results are on the test tasks, or on the ``split`` of a study if it has one.
+    The verdict says whether the suite separates the learners. "Gap closed" is a learner's success after the last
+    exploring episode on a scale from blind PPO (0 %) to goal-shown PPO (100 %). Results are on the test tasks, or on
+    the ``split`` of a study if it has one.
     """
     for number, (suite, lines) in enumerate(_suites(studies).items()):
         if number:
@@ -78,9 +82,10 @@ def ladder_table(*studies: Study) -> Iterator[str]:
 
 
 def suites_table(*studies: Study) -> Iterator[str]:
-    """Yield a table of suites: figures of ``bidex-meta validity``, and success of blind and goal-shown PPO.
+    """Yield a table of suites: what ``bidex-meta validity`` measured, and success of two policies.
 
-    The figures are means over classes, from ``validity/SUITE.json`` next to the folder of data.
+    The policies are blind PPO, which sees neither goal nor rewards, and goal-shown PPO. The measured figures are means
+    over classes, from ``validity/SUITE.json`` next to the folder of data.
     """
     rows = []
     for suite, lines in _suites(studies).items():
@@ -128,7 +133,10 @@ def ladder_figure(*studies: Study) -> "Figure":
 
 
 def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
-    """Group runs by meta suite and learner: goal-shown PPO first, then learners by success, blind PPO last."""
+    """Group runs by meta suite and learner, and order the learners of each suite.
+
+    Goal-shown PPO comes first, then the other learners by success, and blind PPO last.
+    """
     found: dict[str, dict[str, Line]] = {}
     runs = [(study.split or "test", run) for study in studies for run in study.runs]
     played = [pair for pair in runs if isinstance(pair[1].evaluation(), MetaTestEvaluation)]
@@ -155,7 +163,7 @@ def _suite(run: StoredRun) -> str:
 
 
 def _named(run: StoredRun) -> tuple[str, Line]:
-    """Return the name of a run's line in the table, and the line without results."""
+    """Return the name of a run's learner in the tables, and the line of this learner, still without results."""
     algo = run.config().algo
     if algo != "mtppo":
         return run.arm, Line(", ".join(learner_class(algo).privileges) or _OWN)
@@ -167,8 +175,9 @@ def _named(run: StoredRun) -> tuple[str, Line]:
 def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
     """Return the results by class after 0, 1, ... exploring episodes.
 
-    PPO has a single entry: the results on unseen tasks if PPO was evaluated on them, otherwise the results on its own
-    tasks. If PPO's suite lists its tasks, the evaluation has the same goals but other initial states.
+    PPO does not explore and has a single entry: the results on unseen tasks if PPO was evaluated on them, otherwise the
+    results on its own tasks. If PPO's suite lists its tasks, its unseen tasks have the same goals as its own tasks, but
+    other initial states.
     """
     if isinstance(evaluation, MetaTestEvaluation):
         return [shot.classes for shot in evaluation.splits[split].by_shot]

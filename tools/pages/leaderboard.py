@@ -1,4 +1,7 @@
-"""Tables of the leaderboard, from the entries in ``leaderboard/`` and its ``trials/`` next to the folder of data."""
+"""Tables of the leaderboard.
+
+The entries are in the folder ``leaderboard/`` and in ``leaderboard/trials/``, next to the folder of data.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
@@ -20,7 +23,11 @@ _LAST = ["runs", "steps", "tuning", "hours", "trained on", "commit"]
 
 
 def leaderboard_table(suite: str, data: Path) -> Iterator[str]:
-    """Yield, for each track of ``suite`` ("": of each suite), a table of entries, best first, and a table of pairs."""
+    """Yield two tables for each track of a suite: the entries, best first, and the pairs of entries.
+
+    A track is one of the leaderboard's competitions, such as ``multi-task``. If ``suite`` is "", the tables cover all
+    suites.
+    """
     entries = list(board.read_entries(data.parent / "leaderboard").values())
     for track in get_args(Track):
         of_track = [entry for entry in entries if entry.track == track and suite in ("", entry.suite)]
@@ -95,7 +102,11 @@ def _percent(tables: Sequence) -> str:
 
 
 def _pairs(ranked: Sequence[AnyEntry]) -> list[list[str]]:
-    """Return a row for each pair of entries; its claim names the better one if the interval excludes 1/2."""
+    """Return a row for each pair of entries, with the probability that the first entry is better, and a claim.
+
+    The claim names the better entry if the interval of this probability excludes 1/2. Otherwise it says that the pair
+    is not separated.
+    """
     rows = []
     for first, second in combinations(ranked, 2):
         found = board.improvement(first.result, second.result)

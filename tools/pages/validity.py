@@ -41,7 +41,10 @@ def validity_table(suite: str, data: Path) -> list[str]:
 
 
 def share_cell(row: Json, figure: str) -> str:
-    """Format a class's ``figure`` as a percentage, with the chance level if it is ``named``; "" if not measured."""
+    """Format a class's value of ``figure`` as a percentage, or as "" if it was not measured.
+
+    If ``figure`` is ``named``, the chance level follows in brackets.
+    """
     cell = _percent(row.get(figure))
     if figure == "named" and cell:
         cell += f" ({100 * row['chance']:.0f} %)"

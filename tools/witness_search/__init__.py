@@ -1,1 +1,4 @@
-"""Search for witnesses: actions that solve a task, found by planners on the printed reward, or by a script."""
+"""Search for witnesses, that is, sequences of actions that solve a task.
+
+Planners find witnesses by maximising the class's reward. Other witnesses come from playing the class's script.
+"""

@@ -21,7 +21,7 @@ from tools.witness_search.whole import searched
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """Arguments of every search, and the storage of the episode that it finds."""
+    """Arguments of every search, and the method that stores the episode that a search finds."""
 
     task: str  # Task class to solve.
     file: Path | None = None
@@ -30,9 +30,11 @@ class Search:
     threads: int | None = None  # Threads of the physics; None: one per core.
 
     def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
-        """Replay an episode (T, action_size), print the result, and store the episode with facts about its search.
+        """Replay an episode (T, action_size), print the result, and store the episode if it is good enough.
 
-        An episode that does not hold is stored only if its return is higher than ``above``.
+        An episode holds if it succeeds from its start and from most of the shifted starts; it is always stored. Any
+        other episode is stored only if ``file`` is given and the return is higher than ``above``. ``made`` contains
+        facts about the search, which are stored with the episode.
         """
         result = replay(self.task, Witness(actions, {}), self.threads)
         print(
@@ -49,14 +51,17 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Search):
-    """Search with a receding horizon: plan some steps ahead on the printed reward, play a few of them, plan again."""
+    """Search with a receding horizon: plan some steps ahead on the class's reward, play a few of them, plan again."""
 
     improve: Path | None = None  # Start from the episode in this file.
     tries: int = 1  # Number of searches, each with another seed, before giving up.
     planner: PlannerConfig = field(default_factory=PlannerConfig)  # The planner.
 
     def run(self) -> None:
-        """Search with one seed after another until an episode holds."""
+        """Search with one seed after another, until an episode holds or all ``tries`` are used.
+
+        An episode holds if it solves the task from its start and from eight of ten shifted starts.
+        """
         earlier = None if self.improve is None else load_witness(self.task, self.improve)
         rivals: list[float] = []
         best = -float("inf")

@@ -11,14 +11,18 @@ find a way, small changes improve it."""
 
 
 def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: torch.Generator) -> Tensor:
-    """Return ``count`` mutants (count, K, a): ``elites`` (E, K, a) with some of their knots changed.
+    """Return ``count`` mutants (count, K, a), that is, changed copies of good plans, ``elites`` (E, K, a).
 
-    Three properties of a mutant are drawn independently, each with probability 1/2. (1) It takes the left hand's
-    actions from another elite, because good actions of one hand seldom depend on the other hand. (2) It changes each
-    action with probability ``mutated``; otherwise it changes all actions of one part of the hands, so that a grip can
-    be carried somewhere, or a base stays while its fingers close. (3) It changes a random half of the knots, each
-    independently; otherwise it changes all knots from a random time on by the same amount. ``std`` is the standard
-    deviation of the coarsest changes.
+    A plan has K knots: points in time for which it gives the actions (a,). Three properties of each mutant are random,
+    with probability 1/2 each:
+
+    1. It takes the left hand's actions from another elite, because good actions of one hand seldom depend on the other.
+    2. It changes each action with probability ``mutated``. Otherwise it changes all actions of one part of the hands,
+       so that a grip can be carried somewhere, or a base stays while its fingers close.
+    3. It changes a random half of the knots, each by its own amount. Otherwise it changes all knots from a random time
+       on by the same amount.
+
+    ``std`` is the standard deviation of the coarsest changes.
     """
 
     def uniform(*shape: int) -> Tensor:

@@ -1,8 +1,9 @@
-"""A sampling planner: the cross-entropy method over knots in time, with a receding horizon, on the printed reward.
+"""A sampling planner: the cross-entropy method with a receding horizon, which maximises the class's reward.
 
-From the present state the planner samples action sequences, keeps the best sequences as elites, and moves mean and
-standard deviation towards the elites. After some rounds the planner plays the first steps of the best sequence; the
-rest warm-starts the next plan.
+A plan gives the actions at a few points in time, the knots; actions in between are interpolated. From the present state
+the planner samples action sequences, keeps the best sequences as elites, and moves mean and standard deviation towards
+the elites. After some rounds the planner plays the first steps of the best sequence; the rest warm-starts the next
+plan.
 """
 
 from dataclasses import dataclass
@@ -72,7 +73,10 @@ class Plan:
 
 
 class Planner:
-    """The search for one class, as the module describes it; raises BidexError if copies does not divide samples."""
+    """Searches for an episode that solves one class, as the module describes.
+
+    Raises BidexError if ``samples`` is not a multiple of ``copies``.
+    """
 
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
         if config.samples % config.copies:
@@ -128,7 +132,11 @@ class Planner:
         return Plan(played, np.array(rewards), first, max(rivals, default=None))
 
     def _plan(self, states: list[State], mean: Tensor, elites: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the new mean of the knots (K, a), the best sequences (E, K, a), and the best unsuccessful ones."""
+        """Improve a plan in some rounds of sampling.
+
+        Returns the new mean of the knots (K, a), the best sequences (E, K, a), and the best sequences that did not
+        succeed.
+        """
         cfg = self.config
         knots, order, won = elites, torch.arange(len(elites)), torch.zeros(len(elites), dtype=torch.bool)
         std = torch.full_like(mean, cfg.std)
@@ -160,9 +168,10 @@ class Planner:
         return (discount[:, None] * (trace.rewards - effort)).sum(0), trace.success.any(0)
 
     def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
-        """Return the remaining reward of the episode for sequences (n, K, a) that end without success.
+        """Return the reward that sequences of knots (n, K, a) earn from ``state`` to the end of the episode.
 
-        The last action of a sequence is held to the end.
+        The last action of a sequence is held to the end. Sequences that succeed on the way are left out. ``played`` is
+        the number of steps of the episode before ``state``.
         """
         sim, rest = self._judge, self.simulator.episode_steps - played
         if not len(knots):
@@ -187,7 +196,10 @@ class Planner:
         return knots.clamp(-1.0, 1.0)
 
     def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], Trace]:
-        """Play actions (T, a) in every copy; return the resulting states and the trace, a row per copy."""
+        """Play actions (T, a) from every copy of the state; return the resulting states and the trace.
+
+        The trace has a column for each copy.
+        """
         sim = self.simulator
         sim.load(states)
         trace = sim.play(actions[:, None].expand(-1, sim.num, -1))
