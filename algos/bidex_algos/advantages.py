@@ -8,7 +8,10 @@ from bidex_meta.world.contract import VectorWorld
 
 
 def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tensor:
-    """Return ``gamma``, or the discount for each entry of ``task_id`` (n,) if classes have their own discounts."""
+    """Return the discount of each entry of ``task_id`` (n,), or only ``gamma`` if no class has its own discount.
+
+    A class without its own discount has the discount ``gamma``.
+    """
     if all(own is None for own in world.gammas):
         return gamma
     return torch.tensor([gamma if own is None else own for own in world.gammas], device=task_id.device)[task_id]

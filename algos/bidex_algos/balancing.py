@@ -19,32 +19,38 @@ _FAMO_DECAY = 0.01  # Adam's weight decay, which draws famo's weights back to eq
 
 
 class Balance(ABC):
-    """Replaces the gradient of the sum of all tasks' losses by a balanced gradient."""
+    """Interface of methods that combine the gradients of several tasks' losses in another way than by adding them."""
 
     tag: ClassVar[str]  # metric tag of the number that ``backward`` returns
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Write the gradient into the parameters, which have no gradient yet, and keep the losses' graph.
+        """Compute the combined gradient of the tasks' losses and store it as the gradient of ``parameters``.
 
-        ``losses`` (num_tasks,) is this process's part of each task's loss. ``least`` (num_tasks,) is this process's
-        part of the smallest value that each loss can reach. Returns a number to be logged. It is already divided by the
-        number of processes, because the caller sums it over the processes, as it sums the gradients.
+        The parameters must not have a gradient yet. The graph of the losses is kept. ``losses`` (num_tasks,) is this
+        process's part of each task's loss. ``least`` (num_tasks,) is this process's part of the smallest value that
+        each loss can reach. Returns a scalar to be logged. The scalar is already divided by the number of processes,
+        because the caller sums it over the processes, as it sums the gradients.
         """
 
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
-        """Update the balance after a step of the parameters.
+        """Adapt the method's own state, such as task weights, after the optimiser has taken a step.
 
-        ``above`` computes this process's part of each loss minus the smallest value of that loss, (num_tasks,).
+        ``above`` is a function that computes this process's part of each loss minus the smallest value of that loss,
+        (num_tasks,), with the new parameters.
         """
 
     def parts(self) -> Parts:
-        """Return the parts of the balance that a checkpoint holds, by name."""
+        """Return the tensors and optimisers of this method that a checkpoint stores, by name."""
         return {}
 
 
 def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-    """Return gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the losses' graph is kept."""
+    """Return the gradient of each of the losses (num_tasks,) with respect to all parameters: (num_tasks, P).
+
+    P is the total number of entries of ``parameters``, which are flattened. The graph of the losses is kept for another
+    backward pass.
+    """
     one_each = torch.eye(len(losses), dtype=losses.dtype, device=losses.device)
     gradients = torch.autograd.grad(losses, parameters, one_each, retain_graph=True, is_grads_batched=True)
     return torch.cat([g.flatten(1) for g in gradients], dim=1)
@@ -72,7 +78,7 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Turn the summed gradient towards tasks whose losses a step along it lowers least (CAGrad, Liu et al. 2021).
+    """Return a gradient that favours the tasks whose losses would otherwise fall least (CAGrad, Liu et al. 2021).
 
     Let g_0 be the mean of the gradients. The result is the number of tasks times the vector d that maximises
     min_i <g_i, d> within a distance of ``radius`` |g_0| from g_0. The dual problem (equation 4 of the paper) minimises
@@ -81,8 +87,8 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
         min_w  <g_w, g_0> + radius |g_0| |g_w|        d = g_0 + radius |g_0| g_w / |g_w|
 
     ``gradients`` (num_tasks, P) has one row per task. ``radius`` is the paper's c: 0 gives the mean; a value below 1
-    ensures that the mean loss still falls. Returns the direction (P,) and the share of pairs of tasks whose gradients
-    conflict, a scalar.
+    ensures that the mean loss still falls. Returns two values: the resulting gradient (P,), and the share of pairs of
+    tasks whose gradients conflict, a scalar.
     """
     count = len(gradients)
     gram = (gradients @ gradients.T).double()
@@ -96,10 +102,11 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
-    """Return the weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w).
+    """Return the task weights w (n,) that solve the dual problem of CAGrad (see :func:`conflict_averse`).
 
-    The error of the minimum is at most 1e-4 of e'G e. ``gram`` holds the inner products G of the gradients (n, n),
-    float64. ``even`` holds the weights e of the mean (n,), from which the method starts.
+    The weights minimise w'G e + reach sqrt(w'G w) on the simplex. The value of the minimum is exact up to 1e-4 of
+    e'G e. ``gram`` (n, n) is G, the inner products of the gradients, float64. ``even`` (n,) is e, the equal weights of
+    the mean gradient; the method starts from these weights. ``reach`` is a scalar.
 
     This is an interior-point method. A logarithmic barrier with factor mu keeps the weights positive, and mu is halved
     at each step. The same mu smooths the square root near w'G w = 0. Each step is a Newton step that tries several
@@ -153,12 +160,13 @@ _LEAST = 1e-8
 
 
 class Famo(Balance):
-    """FAMO (Liu et al. 2023): task weights under which all losses fall at the same rate, without a gradient per task.
+    """FAMO (Liu et al. 2023): weights the tasks' losses so that all of them fall at the same rate.
 
-    The parameters descend along sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), with z = softmax(xi). The logits xi descend
-    along J'(log l - log l after the step), with J = dz / dxi. The l_i must be positive, so l_i is the loss of task i
-    minus the smallest value that it can reach. Adam moves xi (``logits``, float64) with step size ``rate``; its weight
-    decay ``decay`` draws the weights towards equal ones.
+    FAMO needs no separate gradient per task. Let l_i be the loss of task i minus the smallest value that this loss can
+    reach, so that l_i is not negative. The parameters descend along sum_i (z_i / l_i) grad l_i / sum_j (z_j / l_j),
+    with z = softmax(xi). The logits xi descend along J^T (log l before the step - log l after the step), with
+    J = dz / dxi. Adam moves xi (``logits``, float64) with step size ``rate``. Adam's weight decay ``decay`` draws the
+    weights towards equal ones.
     """
 
     tag = "Policy/largest_weight"
@@ -179,14 +187,20 @@ class Famo(Balance):
         return (len(shares) * shares / shares.sum().clamp_min(1e-30)).to(above.dtype)
 
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Write the gradient as in the base class; the returned number is the largest weight."""
+        """Store the gradient of the weighted losses, and return the largest weight as a share of the sum of weights.
+
+        The arguments are described in the base class. The returned number is divided by the number of processes.
+        """
         weights = self.weights(all_sum((losses - least).detach()))
         (weights * losses).sum().backward(retain_graph=True)
         return weights.max() / len(weights) / world_size()
 
     @torch.no_grad()
     def learn(self, above: Callable[[], Tensor]) -> None:
-        """Update the weights as in the base class, at the cost of another forward pass."""
+        """Adapt the logits of the task weights to how much each loss has fallen in the last step.
+
+        ``above`` is described in the base class. Calling it takes another forward pass.
+        """
         fallen = self.above.clamp_min(_LEAST).log() - all_sum(above()).double().clamp_min(_LEAST).log()
         fallen = fallen.masked_fill(self.above <= _LEAST, 0.0)
         z = self.logits.softmax(0)
@@ -194,12 +208,12 @@ class Famo(Balance):
         self.adam.step()
 
     def parts(self) -> Parts:
-        """Return the parts of the balance that a checkpoint holds."""
+        """Return the logits of the task weights and their optimiser, which a checkpoint stores, by name."""
         return {"famo_logits": self.logits, "famo_adam": self.adam}
 
 
 def balance_of(name: Balancing, num_tasks: int, device: torch.device) -> Balance | None:
-    """Return the balance called ``name``, or None for ``none``, which means that the losses are summed."""
+    """Return the balancing method called ``name``; for ``none`` return None, which means that the losses are summed."""
     if name == "pcgrad":
         return GradientBalance(project_conflicting)
     if name == "cagrad":

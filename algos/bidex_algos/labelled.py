@@ -12,10 +12,10 @@ from bidex_meta.training.learner import State
 
 
 class Labelled:
-    """The last ``steps`` vector steps of the environments ``rows`` (L,).
+    """Labelled observations of the last ``steps`` vector steps in the environments with the indices ``rows`` (L,).
 
-    ``task_id`` (L,) is the task of each of these environments, in ascending order. ``tasks`` (K,) are the tasks that
-    have an environment in ``rows``.
+    A vector step is one step of all environments. ``task_id`` (L,) is the task of each environment in ``rows``, in
+    ascending order. ``tasks`` (K,) are the tasks that have an environment in ``rows``.
     """
 
     def __init__(self, steps: int, rows: Tensor, task_id: Tensor, observations: int, actions: int):
@@ -31,11 +31,15 @@ class Labelled:
 
     @property
     def filled(self) -> int:
-        """Return the number of stored vector steps."""
+        """Return the number of stored vector steps; a vector step is one step of all environments."""
         return min(self.added, self.steps)
 
     def add(self, obs: Tensor, labels: Tensor) -> None:
-        """Store one vector step: the entries ``rows`` of the world's raw observations (N, d) and labels (N, a)."""
+        """Store the observations and labels of one step of all environments.
+
+        ``obs`` (N, d) are raw observations and ``labels`` (N, a) are teachers' actions in the N environments of the
+        world. Only the environments in ``rows`` are stored.
+        """
         self._obs[self.added % self.steps] = obs[self.rows]
         self._labels[self.added % self.steps] = labels[self.rows]
         self.added += 1

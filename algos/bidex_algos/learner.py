@@ -42,10 +42,13 @@ _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_
 class Learner(Contract):
     """Base of all learners of this package; ``policy`` acts in training, and ``agent`` acts in evaluations.
 
-    With several processes each process has its own world, samples and ``generator``, and all have the same networks:
-    statistics, gradients and ``env_steps`` cover all processes. Raises BidexError if the world is not in the mode
-    that :meth:`autoreset_mode` returns, if the world has discounts per class and the learner has a single discount, or
-    if an option needs the task's one-hot and the world does not show it.
+    With several processes, each process has its own world, samples and ``generator``. The networks are equal in all
+    processes, because statistics and gradients are computed over all processes. ``env_steps`` counts the steps of all
+    processes.
+
+    BidexError is raised in three cases: the world's autoreset mode is not the one that :meth:`autoreset_mode` returns;
+    classes of the world have their own discounts, but the learner supports only a single discount; or an option needs
+    the task's one-hot in the observation, but the world does not show it.
     """
 
     remedy: ClassVar[str]  # advice printed when a loss is no longer finite
@@ -81,7 +84,7 @@ class Learner(Contract):
 
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
-        """Return the networks' inputs; encoders of observation groups are added here."""
+        """Return the description of the networks' inputs, with encoders for point clouds and for the task's one-hot."""
         if shape.num_id_columns:
             size = vars(config).get("task_embedding", 0)
         else:
@@ -90,14 +93,17 @@ class Learner(Contract):
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
-        """Collect, learn and add to ``env_steps``; return all metrics except times."""
+        """Collect experience, learn from it and increase ``env_steps``; return all metrics except times."""
 
     @abstractmethod
     def _parts(self) -> Parts:
         """Return everything that a checkpoint holds besides the policy, by name."""
 
     def _place(self) -> State:
-        """Return the attributes named in ``going_on`` for the checkpoint; subclasses may add other plain values."""
+        """Return the values of the attributes named in ``going_on``, which a checkpoint stores.
+
+        Subclasses may add other plain values.
+        """
         return {name: vars(self)[name] for name in self.going_on}
 
     def _go_on_from(self, state: State) -> None:
@@ -147,7 +153,7 @@ class Learner(Contract):
         return self.agent.eval_action(obs)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin a new episode in the rows of ``env_mask``, bool (N,)."""
+        """Prepare the agent for new episodes in the environments that ``env_mask``, bool (N,), marks."""
         self.agent.reset(env_mask)
 
     def policy_state_dict(self) -> State:
@@ -211,7 +217,7 @@ class Learner(Contract):
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if the state is of a world of another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if it comes from a world of another size."""
         self._check_size(state)
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)
@@ -254,7 +260,10 @@ def _restore(part: Any, state: Any) -> None:
 
 
 def _network(weights: State) -> State:
-    """Leave out the learned sizes of inner steps, because a policy does not use them when it acts."""
+    """Return a policy's weights without the learned inner step sizes of meta-learners.
+
+    The step sizes are left out because a policy does not use them when it acts.
+    """
     return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
 
 

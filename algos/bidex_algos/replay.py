@@ -90,7 +90,10 @@ class Replay:
     def add(
         self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: Info
     ) -> None:
-        """Add one vector step from ``self.obs``: ``actions`` (N, a) and the results of the world's ``step``."""
+        """Add one step of all environments, which starts from the newest observations (``self.obs``).
+
+        ``actions`` (N, a) are the actions of the step; the other arguments are the results of the world's ``step``.
+        """
         valid = ~info["unstable"]
         cut = truncated & ~terminated & valid
         number = self._cuts + cut.cumsum(0)
@@ -170,7 +173,7 @@ class Replay:
         }  # fmt: skip
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the result of :meth:`state_dict`; raise BidexError if the state is of a replay of another size."""
+        """Restore the result of :meth:`state_dict`; raise BidexError if it comes from a replay of another size."""
         here = (self.steps, *self._obs.shape[1:])
         there = (state["steps"], *state["obs"].shape[1:])
         if here != there:
@@ -235,7 +238,10 @@ class Stretches:
         return self.replay.at("terminated", places) | (self.replay.at("cut", places) > 0)
 
     def take(self, batch: int) -> Transitions:
-        """Return one batch of the sequences, each as a single transition over several steps, (B,)."""
+        """Return the sequences of one batch, each as a single transition over several steps, (B,).
+
+        ``batch`` is the index of the batch.
+        """
         taken = self.replay.take(self.first[batch], self.last[batch])
         if self.rewards is None:
             return taken

@@ -12,10 +12,10 @@ from bidex_meta.world.contract import Info, VectorWorld
 
 
 class EpisodeStatistics:
-    """Exponentially decaying sums over about the last ``window`` finished episodes of each task, in each process.
+    """Decaying sums of return, length and success over about the last ``window`` finished episodes of each task.
 
-    Few episodes end in one rollout, and often none of a task with long episodes, so the sums cover several rollouts.
-    ``task_id`` is the task of each environment, int64 (N,).
+    Each process has its own sums. Few episodes end in one rollout, and often none of a task with long episodes, so the
+    sums cover several rollouts. ``task_id`` is the task of each environment, int64 (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
@@ -52,7 +52,7 @@ class EpisodeStatistics:
         return out
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the sums."""
+        """Return a copy of the sums, for a checkpoint."""
         return {"sums": self.sums.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

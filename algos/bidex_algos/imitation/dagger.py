@@ -43,11 +43,11 @@ class DAggerConfig(NetworkConfig):
     autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 1)
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of the labelled observations, as in the base class."""
+        """Estimate the bytes of all labelled observations, if ``width`` numbers are stored per environment step."""
         return self.samples * width
 
 
@@ -57,8 +57,8 @@ PRESETS: dict[str, DAggerConfig] = {"laptop": DAggerConfig()}
 class DAgger(Learner):
     """Data set aggregation (Ross et al. 2011, arXiv 1011.0686) with policies and scripts as teachers.
 
-    Scripted teachers follow an episode from its start. With such teachers a resumed run begins new episodes, so it is
-    not bitwise equal to an uninterrupted run.
+    A scripted teacher must see an episode from its start. With such teachers a resumed run therefore begins new
+    episodes and is not bitwise equal to an uninterrupted run.
     """
 
     name = "dagger"
@@ -119,7 +119,11 @@ class DAgger(Learner):
         self._begin(everyone, share)
 
     def _begin(self, ended: Tensor, share: float) -> None:
-        """Begin new episodes in the rows of a mask (N,): draw whether the teacher acts, and reset the teachers."""
+        """Begin new episodes in the environments that the mask ``ended`` (N,) marks.
+
+        Draw for each of these episodes whether the teacher acts in it, with probability ``share``, and reset the
+        teachers.
+        """
         drawn = torch.rand(ended.shape, generator=self.generator, device=self.device) < share
         self.teacher_plays = torch.where(ended, drawn & self.lessons.teachers.known, self.teacher_plays)
         self.lessons.teachers.reset(ended)
@@ -152,9 +156,10 @@ class DAgger(Learner):
             self._expect("(num_envs, observations) = ", *shapes)
 
     def state_dict(self) -> State:
-        """Return the state as in the base class, with a copy of the data set.
+        """Return the base class's state and, in addition, a copy of the data set.
 
-        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
+        The data set makes this copy itself. If the base class saved the data set, it would make a second copy, and two
+        copies may not fit in memory.
         """
         return super().state_dict() | {"data": self.lessons.data.state_dict()}
 

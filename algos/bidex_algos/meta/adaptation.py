@@ -20,7 +20,10 @@ StepSizeKind = Literal["fixed", "layer", "weight"]  # granularity of learned inn
 
 
 class StepSizes(nn.Module):
-    """Learned factors of the inner step size: one per moved tensor (``layer``), or one per entry (``weight``)."""
+    """Learned factors by which the inner step size of MAML and ProMP is multiplied.
+
+    Each parameter tensor that the inner step changes has one factor (``layer``), or one factor per entry (``weight``).
+    """
 
     def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
         super().__init__()
@@ -28,7 +31,10 @@ class StepSizes(nn.Module):
         self.factors = nn.ParameterDict({_key(name): torch.ones(size) for name, size in sizes.items()})
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return the factor of a parameter: a scalar, or a tensor of the parameter's shape."""
+        """Return the factor of the inner step size for the parameter called ``name``.
+
+        The factor is a scalar, or a tensor of the parameter's shape.
+        """
         return self.factors[_key(name)]
 
     @torch.no_grad()
@@ -39,7 +45,7 @@ class StepSizes(nn.Module):
 
     @torch.no_grad()
     def mean(self) -> Tensor:
-        """Return the mean factor over tensors and their entries, a scalar."""
+        """Return the mean over all entries of all factors, a scalar."""
         return torch.cat([factor.flatten() for factor in self.parameters()]).mean()
 
 
@@ -68,12 +74,15 @@ class TaskBatch:
     weights: Tensor  # 0 for steps after an episode's end and for steps in which physics broke, otherwise 1 (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return the fields in order."""
+        """Return the values of all fields, in the order in which the class declares them."""
         return tuple(vars(self).values())
 
 
 class Adapter:
-    """Takes gradient steps from an actor's parameters, the meta-parameters; ``MetaConfig`` describes the options."""
+    """Takes gradient steps for all tasks, starting from the parameters of ``actor``, which are the meta-parameters.
+
+    ``MetaConfig`` describes the options.
+    """
 
     def __init__(
         self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],

@@ -143,7 +143,10 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """Make a policy with fresh weights from ``init``, a CPU generator; encoders of ``inputs`` do not adapt."""
+    """Make a policy with fresh weights drawn from ``init``, a CPU generator.
+
+    Encoders of observation groups (in ``inputs``) are the same for all tasks: the inner step does not change them.
+    """
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 
@@ -190,7 +193,11 @@ class MetaLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
-        """Return SAME_STEP for slices of episodes, and DISABLED for whole episodes, which begin together."""
+        """Return the autoreset mode that the world must have.
+
+        The mode is SAME_STEP if the learner adapts on slices of running episodes. It is DISABLED if the learner adapts
+        on whole episodes, because whole episodes must begin together.
+        """
         if config.slice_steps is None:
             return "DISABLED"
         return "SAME_STEP"
@@ -247,9 +254,10 @@ class MetaLearner(Learner):
         self.steps_with_tasks = 0
 
     def _chosen_tasks(self) -> dict[str, np.ndarray]:
-        """Return, by class, the tasks of the next meta-batch: arrays (tasks, size of a variation).
+        """Return the tasks of the next meta-batch: for each class, by name, an array with one row per task.
 
-        A class has ``tasks_per_class`` tasks, or fewer if its pool is smaller.
+        A row holds the numbers that distinguish the task from other tasks of its class. A class has ``tasks_per_class``
+        rows, or fewer if its pool of tasks is smaller.
         """
         count = self.config.tasks_per_class
         if self.endless:

@@ -51,13 +51,16 @@ class MetaConfig(LearnerConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         steps = (self.slice_steps or self.max_adapt_steps or USUAL_STEPS) * (1 + self.inner_steps)
         return 4 * num_envs * width * steps + network_bytes(self.hidden, width, 2)
 
 
 class OuterConfig(MetaConfig):
-    """Options of all outer steps. Each learner's config declares them again, to define the order of its flags."""
+    """Options of the outer step.
+
+    Each learner's config declares these options again, to define the order of its flags.
+    """
 
     outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
     max_grad_norm: Positive  # Meta-gradients are clipped to this norm.

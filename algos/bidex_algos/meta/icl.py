@@ -64,7 +64,7 @@ class ICLConfig(LearnerConfig):
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         steps = self.episodes_per_trial * min(self.max_adapt_steps or USUAL_STEPS, USUAL_STEPS)
         kept = (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
         return kept + network_bytes(self.head, width, 1)
@@ -183,7 +183,7 @@ class ICL(TrialLearner):
 
     @torch.no_grad()
     def _take_moments(self, data: TaughtTrials) -> None:
-        """Update the statistics of each class with the labels of its trials."""
+        """Update the running mean and variance of each class's labels with the trials that have just been played."""
         filled = data.trials.filled()
         mean, var, count = torch.zeros(3, *self.label_stats.mean.shape, dtype=torch.float64, device=self.device)
         for task in self.tasks.tolist():
@@ -224,7 +224,10 @@ class ICL(TrialLearner):
         return losses
 
     def _drawn(self, data: TaughtTrials, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw ``count`` trials evenly over the classes; return the trial, environment and class of each draw, (B,)."""
+        """Draw trials at random, the same number for each class; return trial, environment and class of each draw.
+
+        All three results are (B,). B is ``count``, rounded up to a multiple of the number of classes.
+        """
         shape = len(self.tasks), math.ceil(count / len(self.tasks))
         trial = torch.randint(data.filled, shape, generator=self.generator, device=self.device)
         # A remainder of this large number favours no row by more than 1 in 2^40 / rows.
@@ -243,11 +246,12 @@ class ICL(TrialLearner):
         return self._of_class(off.square().mean(1))
 
     def _model(self, steps: Steps, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the negative log-likelihood and the squared error of the rewards of all goals, for each class (K,).
+        """Return the loss and the squared error of the reward model for each class, (K,) each.
 
-        A model that always predicts the mean reward has a squared error of 1. The likelihood is weighted by the
-        standard deviation (Seitzer et al. 2022, arXiv 2203.09168); otherwise a model learns nothing in the states
-        where it is unsure.
+        The loss is the negative log-likelihood of the rewards. Loss and error are means over all goals for which
+        rewards are stored. A model that always predicts the mean reward has a squared error of 1. The log-likelihood is
+        weighted by the predicted standard deviation (Seitzer et al. 2022, arXiv 2203.09168). Without this weight, a
+        model learns nothing in the states where it is unsure.
         """
         policy = self.policy
         paid = steps.paid[:, None].float()
@@ -257,7 +261,10 @@ class ICL(TrialLearner):
         return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))
 
     def _unlike(self, steps: Steps, task: Tensor) -> Tensor:
-        """Return the cross-entropy of the classes predicted from observations, (K,)."""
+        """Return, for each class, the cross-entropy of predicting the class from observations, (K,).
+
+        The result is 0 if there is only one class to predict.
+        """
         actor = self.policy.actor
         if actor.classes == 1:
             return torch.zeros(len(self.tasks), device=self.device)
@@ -272,9 +279,10 @@ class ICL(TrialLearner):
         return {"adam": self.adam, "generator": self.generator, "episodes": counts, "label_stats": self.label_stats}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class, with a copy of the data set.
+        """Return the base class's state and, in addition, a copy of the data set.
 
-        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
+        The data set makes this copy itself. If the base class saved the data set, it would make a second copy, and two
+        copies may not fit in memory.
         """
         return super().state_dict() | {"data": self.data and self.data.state_dict()}
 
@@ -286,9 +294,10 @@ class ICL(TrialLearner):
 
 
 class _Pupil:
-    """Plays a trial: teachers act in some environments, the policy acts in the others, and all steps are labelled.
+    """Chooses the actions in a trial: teachers act in some environments, and the policy acts in the others.
 
-    In a share ``still_share`` of the episodes the policy does not explore, as in an evaluation.
+    All steps are labelled by the teachers. In a fraction ``still_share`` of the episodes the policy does not explore,
+    as in an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
@@ -299,7 +308,10 @@ class _Pupil:
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
-        """Draw the episodes in which the policy explores, and reset the teachers."""
+        """Begin an episode: choose at random in which environments the policy explores, and reset the teachers.
+
+        In the first episode of a trial, also draw the goals whose rewards are computed in hindsight.
+        """
         learner = self._learner
         self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
         learner.teachers.reset(torch.ones_like(shown))
@@ -310,9 +322,10 @@ class _Pupil:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def _draw_goals(self, privileged: PrivilegedWorld) -> None:
-        """Store the tasks' own goals (N, k) and draw other goals from the same range.
+        """Store each environment's own goal, and draw other goals, whose rewards are computed in hindsight.
 
-        Entries that a class does not use are drawn too.
+        The other goals come from the same range. A goal has k entries in [-1, 1]. Entries that a class does not use are
+        random, in the own goal as well.
         """
         goals = self._data.goals
         world = self._learner.world
@@ -321,14 +334,14 @@ class _Pupil:
         goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
 
     def missed(self) -> Tensor:
-        """Return the mean squared difference between believed and hidden values, a scalar.
+        """Return the mean squared difference between the goals that the policy believes and the true goals, a scalar.
 
-        Hidden values lie in [-1, 1]. Without any knowledge of the task the difference is 1/3.
+        The entries of a goal lie in [-1, 1]. Without any knowledge of the task the difference is 1/3.
         """
         return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Store the rewards of the step, and the rewards that the other goals would have given."""
+        """Store the rewards of the step, and the rewards that it would have earned under the other drawn goals."""
         privileged = self._learner.teachers.privileged
         data = self._data
         data.rewards[slot, self._rows] = reward[:, None]

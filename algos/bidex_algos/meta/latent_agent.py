@@ -49,7 +49,7 @@ class LatentAgent:
 
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
-        """Add the evidence of one transition of every valid environment."""
+        """Add the evidence of one transition to the posterior of each environment; invalid transitions are left out."""
         # Meta-World's evaluation passes neither next observations nor valid environments.
         if timestep.next_observation is None:
             following = timestep.observation

@@ -33,7 +33,11 @@ class MemoryAgent:
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Begin episodes in the rows of ``env_mask`` (N,): mark them in the memory and discard evaluation copies."""
+        """Begin new episodes in the environments that ``env_mask`` (N,) marks.
+
+        The memory of each of these environments is marked: the previous episode has ended. The next evaluation episode
+        starts from a new copy of this memory.
+        """
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
@@ -86,7 +90,7 @@ class MemoryAgent:
         return action
 
     def observe(self, timestep: Timestep) -> None:
-        """Show the memory of an evaluation episode the reward of its last step."""
+        """Write the reward of the last step into the memory of each evaluation episode."""
         if self._playing is None:
             return
         if timestep.valid is None:

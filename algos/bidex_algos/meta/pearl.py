@@ -164,6 +164,7 @@ class PEARL(MTSAC):
     def _shown(self, rows: Tensor, trial: Tensor, episodes: Tensor) -> Tensor:
         """Estimate the sum of the evidence in the first ``episodes`` (M,) episodes of a trial, (M, 2 * latent).
 
+        The evidence of a transition consists of the terms that the transition adds to the parameters of the posterior.
         ``rows`` (M,) are environments. ``trial`` (M,) is 0 for an environment's previous trial and 1 for its running
         trial. The estimate uses ``context`` random transitions of these episodes.
         """

@@ -70,7 +70,7 @@ class RL2Config(PPOConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + self.hidden[-1])
         return 4 * num_envs * width * self.trial_steps + network_bytes(self.hidden, width, 2) + memory
 
@@ -191,7 +191,10 @@ class RL2(TrialLearner):
         return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
 
     def _outputs(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means (C, B, a) and values (C, B, heads) of the chunks with numbers ``chosen``, int64 (B,)."""
+        """Return mean actions (C, B, a) and values (C, B, heads) in B chunks of C steps.
+
+        ``chosen``, int64 (B,), are the indices of these chunks among all chunks of the trial that hold a step.
+        """
         chunk = b.chunk[chosen]
         row = b.row[chosen]
         x = self.policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))

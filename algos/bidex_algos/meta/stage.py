@@ -68,9 +68,10 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
     Observations are (tasks, B, d), all other arguments (tasks, B). The penalty on coefficients of observations is
     ``ridge`` times the number of features per sample, relative to the mean of the Gram matrix's diagonal. The
     coefficients of time and of the constant are hardly penalised. A ``ridge`` of 1 gives the best linear prediction if
-    features and noise explain equal parts of the returns. A fit with almost no penalty (1e-5) memorises the returns. On
-    ML1-wide we measured the correlation of advantages with the advantages of a baseline fitted to other rollouts, for
-    7, 20 and 50 rollouts::
+    features and noise explain equal parts of the returns.
+
+    A fit with almost no penalty (1e-5) memorises the returns. On ML1-wide we correlated the resulting advantages with
+    advantages whose baseline was fitted to other rollouts. With 7, 20 and 50 rollouts the correlations were::
 
         ridge 1e-5     0.19, 0.18, 0.47
         no baseline    0.71, 0.63, 0.62
@@ -114,7 +115,10 @@ class Stage:
         return len(self.obs)
 
     def by_task(self, name: str, rows: TaskRows) -> Tensor:
-        """Return a field of all steps by task (M, T * R, ...); it is rearranged step by step to avoid a large copy."""
+        """Return the field ``name`` of all steps, grouped by task, (M, T * R, ...).
+
+        The field is rearranged step by step to avoid a large copy.
+        """
         return torch.stack([rows.by_task(x) for x in vars(self)[name]], dim=1).flatten(1, 2)
 
 
@@ -150,7 +154,7 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 
 
 class Outcome(NamedTuple):
-    """Results of a stage."""
+    """Returns, successes and number of steps of one stage of adaptation."""
 
     earned: Tensor  # undiscounted, unscaled return of each environment (N,)
     success: Tensor  # whether each environment succeeded, bool (N,)

@@ -76,10 +76,10 @@ class TaughtTrials:
         self.added += 1
 
     def steps(self, trial: Tensor, row: Tensor, share: Tensor) -> Steps:
-        """Return one step of each of the trials ``trial`` (B,) of the environments ``row`` (B,).
+        """Return B steps: one step of the trial ``trial[i]`` of the environment ``row[i]`` for each i.
 
-        The entries of ``trial`` are below ``filled``. ``share`` (B,), in [0, 1), is the position of the step in its
-        trial, relative to the trial's length.
+        The entries of ``trial`` (B,) are below ``filled``. ``share`` (B,), in [0, 1), is the position of the step in
+        its trial, relative to the trial's length.
         """
         slot = (share * self._ring["lengths"][trial, row]).long()
         ring = self._ring

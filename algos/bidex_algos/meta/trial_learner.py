@@ -57,13 +57,13 @@ class TrialLearner(Learner):
 
     @classmethod
     def autoreset_mode(cls, config: Any) -> AutoresetMode:
-        """Return DISABLED, because the episodes of a trial begin together."""
+        """Return the autoreset mode that the world needs: DISABLED, because the episodes of a trial begin together."""
         return "DISABLED"
 
     def _play(self, trials: Trials, player: Player, blind_share: float = 0.0) -> None:
         """Play the next trial in all environments and record it in ``trials``.
 
-        In a share ``blind_share`` of the episodes the policy does not see rewards.
+        In a fraction ``blind_share`` of the episodes, the policy does not see rewards.
         """
         counts = [[self.episodes] for _ in range(trials.episodes)]
         counts[0].append(self.firsts)

@@ -70,18 +70,19 @@ class Trials:
         """Return the memory's inputs besides the observation, for the first ``slots`` slots.
 
         These are the last action (slots, N, a), the last reward, whether the policy saw this reward, and whether an
-        episode has just ended, each (slots, N). The slot after the last step counts as part of the same episode,
-        because its value replaces the rewards that the time limit cut off.
+        episode has just ended, each (slots, N). The slot after the last step of a trial does not count as the start of
+        another episode, because its value replaces the rewards that the time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
         return action, reward, known, done & self.filled(slots)
 
     def discounts(self, slots: int, gamma: float) -> Tensor:
-        """Return the discount of the state after each of the first ``slots`` transitions, (slots, N): gamma per step.
+        """Return the discount factor of the state after each of the first ``slots`` transitions, (slots, N).
 
-        After a termination, all steps that were left until the time limit are discounted too. Otherwise ending an
-        episode early would be rewarded, because the next episode would start earlier.
+        The factor is ``gamma`` for one step. After a termination, all steps that were left until the time limit are
+        discounted as well. Otherwise ending an episode early would be rewarded, because the next episode would start
+        earlier.
         """
         left = self.left[:slots].masked_fill(~self.terminated[:slots], 0)
         return gamma ** (1.0 + left.float())
@@ -135,8 +136,8 @@ def play(
 ) -> None:  # fmt: skip
     """Fill ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
 
-    In a share ``blind_share`` of the episodes the policy does not see rewards. ``statistics`` has one list of counters
-    for each episode of a trial; the counters are updated when that episode ends.
+    In a fraction ``blind_share`` of the episodes, the policy does not see rewards. ``statistics`` has one list of
+    counters for each episode of a trial; the counters are updated when that episode ends.
     """
     rows = torch.arange(world.num_envs, device=world.device)
     device = world.device
@@ -213,7 +214,10 @@ class Batch:
         return len(self.weights) // len(self.actor_states)
 
     def take(self, x: Tensor, chosen: Tensor) -> Tensor:
-        """Return the chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
+        """Select B chunks of C steps from a tensor ``x`` (T, N, ...), and return them as (C, B, ...).
+
+        ``chosen``, int64 (B,), are the indices of these chunks among the S chunks that hold a step.
+        """
         chunks = x.unflatten(0, (-1, self.size)).transpose(1, 2)
         return chunks[self.chunk[chosen], self.row[chosen]].transpose(0, 1)
 

@@ -43,7 +43,7 @@ class VariBADConfig(RL2Config):
     """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         return super().bytes_held(num_envs, width) + network_bytes(self.hidden, width, 2)
 
 
@@ -60,9 +60,10 @@ PRESETS: dict[str, VariBADConfig] = {
 
 
 class BeliefActor(RecurrentNet):
-    """An actor that reads the observation and the belief in the memory, and a decoder of rewards.
+    """An encoder with a memory, an actor that reads observation and belief, and a decoder that predicts rewards.
 
-    The decoder sees the observation only: the first ``seen`` entries of an input (..., inputs).
+    The encoder infers the belief about the task. The decoder reads only the observation, which is the first ``seen``
+    entries of an input (..., inputs).
     """
 
     def __init__(self, inputs: Inputs, seen: int, config: VariBADConfig, actions: int, generator: torch.Generator):
@@ -78,7 +79,10 @@ class BeliefActor(RecurrentNet):
         self.paid = MLP(hidden[-1], (hidden[-1],), 1, 0.01, generator, activation)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute outputs as in the base class; the memory gets no gradient."""
+        """Return mean actions (T, B, actions) for inputs (T, B, inputs), and the memory after these steps.
+
+        No gradient flows into the encoder and its memory.
+        """
         x, state = self.knowing(x, state)
         return self.actor(x), state
 
@@ -125,7 +129,7 @@ class BeliefCritic(nn.Module):
 
 
 class VariBAD(RL2):
-    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief of what a task hides."""
+    """VariBAD (Zintgraf et al. 2020, arXiv 1910.08348): a policy that acts on its belief about the hidden task."""
 
     name = "varibad"
     config_type = VariBADConfig
@@ -175,7 +179,10 @@ class VariBAD(RL2):
         return self.net.actor(known), critic.values(known)
 
     def _descend(self, b: Batch, chosen: Tensor) -> Tensor:
-        """Take one step of encoder and decoder; return the result of :meth:`_bound`, summed over all processes (2,)."""
+        """Take one gradient step of encoder and decoder.
+
+        Returns the reward error and the KL divergence that :meth:`_bound` computes, summed over all processes, (2,).
+        """
         reward, divergence = self._bound(b, chosen)
         self.model_adam.zero_grad()
         (reward + self.config.kl_weight / len(b.weights) * divergence).backward()
@@ -185,11 +192,11 @@ class VariBAD(RL2):
         return found
 
     def _bound(self, b: Batch, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return this process's share of the reward error and the KL.
+        """Return this process's part of the two terms of the loss: the reward error and the KL divergence.
 
-        The reward error is the mean squared error of decoded rewards. The KL is the mean KL of each belief from the
-        previous one. In the trials of the environments ``chosen``, int64 (B,), beliefs at random times predict rewards
-        of random steps, past and future.
+        ``chosen``, int64 (B,), are the environments whose trials are used. From the beliefs at random times, the
+        decoder predicts the rewards of random steps, past and future; the reward error is the mean squared error of
+        these predictions. The KL divergence is the mean divergence of each belief from the previous one.
         """
         policy = self.policy
         net = self.net

@@ -1,1 +1,4 @@
-"""Learners of several agents that share a reward: fingers and palms (appendix A.2, B.2)."""
+"""Learners of several agents that share a reward; an agent controls, for example, a hand, a finger or a palm.
+
+The learners follow the appendices A.2 and B.2 of Bi-DexHands.
+"""

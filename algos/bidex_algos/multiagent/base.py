@@ -1,6 +1,7 @@
 """The base of on-policy learners of several agents: the agents' policy, a common critic, and the critic's loss.
 
-The base class treats the agents as one policy, whose action joins the agents' actions. An update splits this action.
+The base class treats the agents as one policy with a joint action, which concatenates the agents' actions. An update
+splits the joint action again into the agents' parts.
 """
 
 import math
@@ -34,7 +35,11 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 
 
 def keep_partition(config: Networks) -> None:
-    """Replace the path of a partition file by its content, for checkpoints; raise BidexError for a wrong partition."""
+    """Check a config's division of the hands into agents, and replace the path of a file by the file's content.
+
+    A checkpoint therefore does not depend on the file. BidexError is raised if the division is wrong, or if the
+    architecture is not ``shared``.
+    """
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
     object.__setattr__(config, "agents", partition_line(vars(config)["agents"]))
@@ -107,10 +112,11 @@ LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # values that differ in bot
 
 @torch.no_grad()
 def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> None:
-    """Adjust the critics' output layers to preserve std V + mean: PopArt (van Hasselt 2016, Hessel et al. 2019).
+    """Adjust the critics' output layers so that std V + mean, the value in units of reward, does not change (PopArt).
 
-    Each critic has an output for each task. ``before`` and ``after`` are the old and new mean and standard deviation of
-    the returns, which define the critics' units, each (critics * tasks,).
+    V is a critic's output, and mean and std are those of the returns (van Hasselt 2016, Hessel et al. 2019). Each
+    critic has an output for each task. ``before`` is the old mean and standard deviation of the returns, and ``after``
+    is the new mean and standard deviation; all are (critics * tasks,).
     """
     given = [x.view(len(critics), -1) for x in (*before, *after)]
     for critic, old_mean, old_std, mean, std in zip(critics, *given, strict=True):
@@ -145,7 +151,11 @@ class TeamPolicy(GaussianPolicy):
 
 
 class MultiAgent(OnPolicy):
-    """Agents (``views``) that share a reward; each has its own observations and policy and an equal part of the KL."""
+    """Base of learners of several agents (``views``) that share a reward.
+
+    Each agent has its own observations and policy. The KL divergence that an update may cause is divided equally among
+    the agents.
+    """
 
     config: MultiAgentConfig
     policy: TeamPolicy
@@ -195,10 +205,10 @@ class MultiAgent(OnPolicy):
             return self._critic(batch.obs, batch.task_id)
 
     def _value_loss(self, b: Batch, old_values: Tensor, weights: Tensor) -> Tensor:
-        """Return twice Huber's loss, a scalar.
+        """Return twice the Huber loss of the critic's values, a scalar.
 
-        With ``value_clip`` the loss of a sample is the larger one of two losses: that of the value, and that of the
-        value clipped to a distance of ``value_clip`` from the old value.
+        With ``value_clip``, the loss of a sample is the larger of two losses: the loss of its value, and the loss of
+        the value after clipping to a distance of ``value_clip`` from the old value.
         """
         delta = self.config.huber_delta
         reach = self.config.value_clip
@@ -235,7 +245,10 @@ class MultiAgent(OnPolicy):
 
 
 class OwnAdams(MultiAgent):
-    """Agents with one optimiser per network; the step size of each optimiser follows the agent's share of the KL."""
+    """Base of multi-agent learners with one optimiser per network.
+
+    The step size of each optimiser adapts so that the KL divergence of an agent stays near the agent's share.
+    """
 
     config: MultiAgentPPOConfig
 

@@ -1,4 +1,4 @@
-"""HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
+"""HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; Bi-DexHands' appendix B.2.3).
 
 The order of agents is random in each iteration. Each agent maximises PPO's clipped surrogate. The advantage in the
 surrogate is multiplied by the likelihood ratios of the agents updated before, so that the agent's step improves the

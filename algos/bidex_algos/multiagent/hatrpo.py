@@ -1,4 +1,4 @@
-"""HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
+"""HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; Bi-DexHands' appendix B.2.2).
 
 The learner works like HAPPO, but takes MT-TRPO's step on each agent's own parameters, within the agent's share of the
 trust region.

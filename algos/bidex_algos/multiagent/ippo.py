@@ -1,6 +1,7 @@
-"""IPPO: PPO of several agents, each with a critic on its own observations (de Witt et al. 2020; appendix B.2.1).
+"""IPPO: PPO of several agents, each with its own critic (de Witt et al. 2020; Bi-DexHands' appendix B.2.1).
 
-IPPO differs from MAPPO only in the critics: each agent has its own values, returns and advantages, normalised per task.
+IPPO differs from MAPPO only in the critics: each agent has a critic on its own observations. Each agent therefore has
+its own values, returns and advantages, normalised per task.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
+"""MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; Bi-DexHands' appendix B.2.5).
 
 Each agent i maximises Q(x, a_1, ..., mu_i(o_i), ..., a_n) with the other agents' actions from the replay. Everything
 else is as in DDPG. The original has a critic for each agent because rewards may differ. Here the agents share rewards,
@@ -40,7 +40,7 @@ PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop":
 
 
 class DeterministicTeam(Team):
-    """All agents as one actor without a distribution; replaces a ``DeterministicActor``."""
+    """The networks of all agents as a single deterministic actor, which replaces a ``DeterministicActor``."""
 
     def __init__(
         self, views: tuple[AgentView, ...], config: MADDPGConfig, groups: Inputs, generator: torch.Generator, heads: int

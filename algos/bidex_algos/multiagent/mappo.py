@@ -1,4 +1,4 @@
-"""MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
+"""MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; Bi-DexHands' appendix B.2.4).
 
 MAPPO with one agent equals MT-PPO. In each mini-batch every agent maximises its own clipped surrogate. All agents share
 one advantage, which is normalised per task, as the returns are.

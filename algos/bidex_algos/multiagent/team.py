@@ -91,8 +91,9 @@ class Team(nn.Module):
 class TeamActor(Team):
     """Diagonal Gaussians of all agents, which together form one Gaussian of the world's action.
 
-    The class replaces a ``GaussianActor``. Each network has ``log_stds`` of shape (a_i,), or (heads, a_i) from which
-    the group ``task_id`` selects a row.
+    The class replaces a ``GaussianActor``. ``log_stds`` holds the log standard deviations of each network. They have
+    the shape (a_i,) with one head and (heads, a_i) with several; with several, the task in the observation selects the
+    row.
     """
 
     def __init__(
@@ -134,9 +135,9 @@ class TeamActor(Team):
         return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Return one agent's mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i).
+        """Return mean (B, a_i) and log standard deviation, (a_i,) or (B, a_i), of one agent's actions.
 
-        ``seen`` is the agent's input, ``task`` the one-hot.
+        ``seen`` is the input of the agent's network. ``task`` is the one-hot of each sample's task.
         """
         return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
@@ -149,10 +150,10 @@ class TeamActor(Team):
         return joint.index_select(-1, self._taken).split(self._sizes, dim=-1)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return the logarithms of standard deviations for observations (B, d).
+        """Return the log standard deviations of all actions for observations (B, d).
 
-        The shape is (a,) with one head, otherwise (B, a). The values are rows of the argument ``log_std``, by default
-        of the attribute ``log_std``.
+        The shape is (a,) with one head. With several heads, the task in each observation selects a row of ``log_std``,
+        and the shape is (B, a). If the argument ``log_std`` is None, the attribute of this name is used.
         """
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
@@ -168,7 +169,10 @@ class TeamActor(Team):
 
 
 class TeamCritic(Team):
-    """One critic per agent on its own observations, with ``heads`` outputs; other arguments as for :class:`Team`."""
+    """One critic per agent, which reads the agent's own observations and has ``heads`` outputs.
+
+    The other arguments are those of :class:`Team`.
+    """
 
     def __init__(
         self, views: Sequence[AgentView], config: NetworkConfig | OnPolicyConfig, heads: int,

@@ -69,7 +69,10 @@ class NetworkConfig(LearnerConfig):
 
 
 def check_networks(config: Networks) -> None:
-    """Raise BidexError if the layers do not fit the architecture; switch on the heads that the architecture implies."""
+    """Raise BidexError if a config's layers do not fit its architecture.
+
+    If the architecture gives each task its own output layer, switch on ``policy_heads`` and ``value_heads``.
+    """
     architecture = config.architecture
     if architecture in ("multi_head", "towers", "separate"):
         for heads in ("policy_heads", "value_heads"):
@@ -125,8 +128,8 @@ def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
 class Critics(nn.Module):
     """``count`` critics: networks of observation and action that differ only in their initial weights.
 
-    ``inputs`` are the groups of observation and action together; ``heads`` is the number of outputs of each network,
-    one per task or 1. Two networks reduce overestimation (Fujimoto et al. 2018).
+    ``inputs`` describes the input of each network: the observation, followed by the action. ``heads`` is the number of
+    outputs of each network, one per task or 1. Two networks reduce overestimation (Fujimoto et al. 2018).
     """
 
     def __init__(

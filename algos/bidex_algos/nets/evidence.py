@@ -1,8 +1,9 @@
 """Inference of a goal from rewards by a reward model, and a policy that acts on the resulting belief.
 
 The reward model is VariBAD's decoder of rewards (Zintgraf et al. 2020, arXiv 1910.08348), but it reads the goal, which
-is known in training, instead of a latent variable. The belief follows from Bayes' rule: the memory holds the
-log-likelihood of each fixed candidate, and every rewarded step adds its log-likelihood to this sum.
+is known in training, instead of a latent variable. The belief is a probability for each goal in a fixed list of
+candidates and follows from Bayes' rule. The memory holds the log-likelihood of each candidate; every rewarded step adds
+the log-likelihood of its reward.
 """
 
 import math
@@ -33,10 +34,11 @@ def spread(count: int, size: int) -> Tensor:
 
 
 class BeliefNet(nn.Module):
-    """A reward model and an actor, which both read a goal; ``hidden`` are the model's layers for an observation.
+    """A reward model and an actor, which both read an observation and a goal.
 
-    The observation does not show the class, so a third network predicts it if ``classes`` is above 1. In the model each
-    class has its own weights for the goal. In the actor each class has its own layers after the first.
+    ``hidden`` are the layers with which the reward model encodes the observation; ``head`` are the actor's layers. The
+    observation does not show the class, so a third network predicts it if ``classes`` is above 1. In the reward model
+    each class has its own weights for the goal. In the actor each class has its own layers after the first.
     """
 
     def __init__(
@@ -115,7 +117,7 @@ class Belief(Protocol):
 
 
 class ModelBelief:
-    """The belief over ``actor.candidates`` that the reward model of a policy's ``actor`` implies.
+    """The belief about the goal that follows from the reward model of a policy, over the candidates of its actor.
 
     Each log-likelihood is multiplied by ``trust``, because the model's errors in successive steps are correlated.
     """
@@ -130,7 +132,7 @@ class ModelBelief:
         return self._policy.actor.candidates
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return the log-likelihoods that :class:`Belief` describes.
+        """Return the log-likelihood of each reward (N,) under each candidate, (N, C); 0 if a reward is not ``known``.
 
         This takes most of a step's time. On the CPU, where a host sync is free, unknown rewards are therefore skipped.
         """
@@ -197,7 +199,11 @@ class BeliefPolicy(RecurrentPolicy):
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return mean actions and state as in the base class; a row with negative ``drawn`` does not explore."""
+        """Return mean actions (N, a) and the memory's next state (N, candidates) for raw observations (N, d).
+
+        ``drawn`` (N, 1) is the result of :meth:`drawn`; the policy does not explore in environments with a negative
+        entry. With None the policy explores in no environment.
+        """
         known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
         goal = self.belief.believed(state)

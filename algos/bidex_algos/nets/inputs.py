@@ -14,7 +14,10 @@ from bidex_meta.world.contract import ObservationGroup, plain_groups
 
 
 class Columns(nn.Module):
-    """Reads and writes some columns, in ascending order, of tensors (..., d); adds nothing to checkpoints."""
+    """Selects some columns of tensors (..., d), in ascending order, for reading or writing.
+
+    The module adds nothing to checkpoints.
+    """
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
@@ -74,7 +77,7 @@ class Inputs:
         return sum(group.size for group in self.groups)
 
     def columns(self, *names: str) -> Columns:
-        """Return the columns of some groups."""
+        """Return the columns of the groups ``names``; raise BidexError if there is no group of that name."""
         ranges = {group.name: group.where for group in self.groups}
         for name in set(names) - ranges.keys():
             raise unknown_name("observation group", name, ranges)
@@ -94,12 +97,12 @@ class Inputs:
         return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
 
     def without(self, *names: str) -> "Inputs":
-        """Hide further groups."""
+        """Return a copy of this description in which networks do not read the groups ``names`` either."""
         self.columns(*names)
         return replace(self, hidden=self.hidden | {*names})
 
     def only(self, *names: str) -> "Inputs":
-        """Hide all other groups, for example for an agent with its own view."""
+        """Return a copy of this description in which networks read only the groups ``names``."""
         self.columns(*names)
         return replace(self, hidden=frozenset(group.name for group in self.groups) - {*names})
 

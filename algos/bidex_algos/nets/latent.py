@@ -36,16 +36,17 @@ class LatentPolicy(SquashedPolicy):
         self.encoder = MLP(transition, hidden, 2 * size, 1.0, generator, activation)
 
     def compressed(self, reward: Tensor) -> Tensor:
-        """Compress rewards (...) to inputs (..., 1) of the normaliser ``rewards``.
+        """Compress rewards (...) by asinh and return them as (..., 1), for the normaliser ``rewards``.
 
         Rewards are compressed because rewards of unknown classes differ by orders of magnitude.
         """
         return torch.asinh(reward / self.reward_unit)[..., None]
 
     def evidence(self, obs: Tensor, actions: Tensor, reward: Tensor, next_obs: Tensor) -> Tensor:
-        """Return the terms that each transition adds to the two sums, (..., 2 * size).
+        """Return each transition's precision, and precision times mean, in one tensor (..., 2 * size).
 
-        Observations (..., d) and rewards (...) are raw.
+        These are the terms that the transition adds to the two sums that define the posterior. Observations (..., d)
+        and rewards (...) are raw.
         """
         before, after = (self.observations.some(self.noted(x), self.noted) for x in (obs, next_obs))
         seen = [before, actions, self.rewards(self.compressed(reward)), after]

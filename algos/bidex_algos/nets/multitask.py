@@ -1,6 +1,7 @@
-"""Trunks that replace an ``MLP``.
+"""Architectures that replace an ``MLP``.
 
-MOORE, PaCo, soft modules and towers divide weights among tasks. The transformer attends to groups of the observation.
+In MOORE, PaCo, soft modules and towers, each task uses its own weights, modules or mixture of them. The transformer
+attends to groups of the observation.
 """
 
 import math
@@ -111,8 +112,9 @@ class Moore(Headed):
     Gram-Schmidt; w_k are the weights of the experts in task k. The task's one-hot selects w_k and is not fed to the
     experts. Heads per task are the paper's multi-head variant.
 
-    Our additions: the mixture is multiplied by the root of its width, so that its entries are as large as the entries
-    of another layer, and passes through the config's non-linearity; w is initially a random vector of unit norm.
+    We made three additions. The mixture is multiplied by the root of its width, so that its entries are as large as the
+    entries of another layer. The mixture then passes through the config's non-linearity. Each w_k is initially a random
+    vector of unit norm.
     """
 
     def __init__(
@@ -139,7 +141,7 @@ class Moore(Headed):
             return gram_schmidt(raw.to(self.head.weight.dtype))
 
     def features(self, x: Tensor) -> Tensor:
-        """Compute the features as in the base class, in float32."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs), in float32."""
         experts = self.experts(x)
         with torch.autocast(x.device.type, enabled=False):
             return self.activation(self.scale * mixed(self.weights(x), experts))
@@ -185,11 +187,14 @@ class PaCo(nn.Module):
 class SoftModules(Headed):
     """Soft modularisation: layers of modules, with soft routes between them for each task (Yang et al. 2020).
 
-    Let f(s) and h(k) be embeddings of state s and task k, and e their elementwise product. The logits of the routes
-    are p^1 = D^1 relu(e) and p^l+1 = D^l+1 relu(U^l p^l * e), and the input of module i is g_i = sum_j softmax_j(p_ij)
-    relu(W_j g_j). The first entry of ``hidden`` is the width of f(s); each further entry is the width of a layer of
-    modules. Our changes: the head weights the modules of the last layer, while the paper adds them up; f is one layer;
-    modules have the config's non-linearity. We omit the weighting of losses by temperature.
+    Let f(s) and h(k) be embeddings of state s and task k, and e their elementwise product. The logits of the routes are
+    p^1 = D^1 relu(e) and p^(l+1) = D^(l+1) relu((U^l p^l) * e), where * is the elementwise product. The input of module
+    i is g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first entry of ``hidden`` is the width of f(s); each further
+    entry is the width of a layer of modules.
+
+    Three things differ from the paper. The head reads a weighted sum of the modules of the last layer, while the paper
+    adds them up. f is one layer. Modules have the config's non-linearity. We omit the weighting of losses by
+    temperature.
     """
 
     def __init__(
@@ -230,7 +235,7 @@ class SoftModules(Headed):
         return self.between(self.state(self.encoder(x)))
 
     def features(self, x: Tensor) -> Tensor:
-        """Compute the features as in the base class."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
         features = state = self.embedded(x)
         for layer, shares in zip(self.layers, self.routes(x, state), strict=True):
             features = torch.einsum("bij,jbn->ibn", shares, self.between(layer(features)))
@@ -238,7 +243,7 @@ class SoftModules(Headed):
 
 
 class Towers(Headed):
-    """Layers that all tasks share (``shared`` of them), followed by separate layers for each task.
+    """A network whose first ``shared`` layers belong to all tasks; each task has its own further layers.
 
     If ``shared`` is 0, each task has its own network. The task's one-hot selects the layers and is not fed to them.
     """
@@ -260,7 +265,7 @@ class Towers(Headed):
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """Compute the features as in the base class."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
         one_hot = self.one_hot(x)
         features = self.encoder(x)
         for layer in self.common:
@@ -311,7 +316,7 @@ class Transformer(Headed):
         self.head = linear(width, outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """Compute the features as in the base class."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
         tokens = [token(encoder(x)) for encoder, token in zip(self.encoders, self.tokens, strict=True)]
         with sdpa_kernel(SDPBackend.MATH):  # the other kernels have no second derivative, which TRPO needs
             return self.norm(self.blocks(torch.stack(tokens, dim=1)).mean(1))

@@ -22,7 +22,10 @@ MakeNetwork = Callable[..., Any]
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
-    """Return whether hidden layers run in bfloat16; ``auto``: on CUDA, and on CPUs with AMX tiles or AVX-512's BF16."""
+    """Return whether hidden layers run in bfloat16.
+
+    The setting ``auto`` chooses bfloat16 on CUDA, and on CPUs with AMX tiles or AVX-512's BF16.
+    """
     if setting != "auto":
         return setting == "on"
     if device.type == "cuda":
@@ -41,18 +44,19 @@ class Headed(nn.Module):
     """A network that applies the output layer ``head`` to :meth:`features`.
 
     An enclosing autocast decides the precision of the features. The output layer is always float32, because bfloat16
-    would round a mean of 1 by 0.004, enough to move the likelihood ratio of 52 actions.
+    would round a mean of 1 by 0.004. With 52 entries per action, such errors are large enough to move the likelihood
+    ratio.
     """
 
     head: nn.Linear
 
     @property
     def output_bias(self) -> Tensor:
-        """Return the output's biases, as described in :data:`MakeNetwork`."""
+        """Return the biases (outputs,) of the output layer."""
         return self.head.bias
 
     def features(self, x: Tensor) -> Tensor:
-        """Return the output layer's input for (batch, inputs): (batch, width)."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
         raise NotImplementedError
 
     def forward(self, x: Tensor) -> Tensor:
@@ -92,7 +96,7 @@ class MLP(Headed):
         self.head = linear(before, outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
-        """Compute the features as in the base class."""
+        """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
         return self.body(self.encoder(x))
 
 
@@ -133,7 +137,10 @@ def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -
 
 
 def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
-    """Select from outputs (..., heads * n) the outputs (..., n) of the head that a one-hot (..., heads) marks."""
+    """Select the outputs (..., n) of one head from the outputs ``out`` (..., heads * n) of all heads.
+
+    ``one_hot`` (..., heads) marks the head.
+    """
     if heads == 1:
         return out
     with torch.autocast(out.device.type, enabled=False):  # as in the output layer, because bfloat16 would round means
@@ -141,7 +148,10 @@ def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
 
 
 def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
-    """Select the rows (..., n) of (heads, n) for a one-hot (..., heads); a single row (n,) is returned unchanged."""
+    """Select the row of ``rows`` (heads, n) that each one-hot (..., heads) marks: (..., n).
+
+    If ``rows`` is only one row (n,), it is returned unchanged.
+    """
     if rows.dim() == 1:
         return rows
     with torch.autocast(rows.device.type, enabled=False):
@@ -172,26 +182,37 @@ class GaussianActor(nn.Module):
         return head_of(self.one_hot(x), self.mean(x), self.heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
-        """Return log standard deviations for observations (batch, d): (actions,) with one head, else (batch, actions).
+        """Return the log standard deviations of all actions for observations (batch, d).
 
-        The values are rows of the argument ``log_std``, by default of the attribute ``log_std``.
+        The shape is (actions,) with one head. With several heads, the task in each observation selects a row of
+        ``log_std``, and the shape is (batch, actions). If the argument ``log_std`` is None, the attribute of this name
+        is used.
         """
         return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
 
 def gaussian_log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
-    """Return the log-density of N(mean, exp(log_std)^2), summed over the last axis. Shape (...)."""
+    """Return the log-density of N(mean, exp(log_std)^2), summed over the last axis.
+
+    ``action`` and ``mean`` are (..., a), and the result is (...).
+    """
     z = (action - mean) * torch.exp(-log_std)
     return -0.5 * z.square().sum(-1) - (log_std + 0.5 * math.log(2.0 * math.pi)).expand(mean.shape).sum(-1)
 
 
 def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Tensor) -> Tensor:
-    """Return KL(p || q) of two diagonal Gaussians, summed over the last axis. Shape (...)."""
+    """Return KL(p || q) of two diagonal Gaussians, summed over the last axis.
+
+    The means are (..., a), and the result is (...).
+    """
     variance_ratio = torch.exp(2.0 * (log_std_p - log_std_q))
     shift = ((mean_p - mean_q) * torch.exp(-log_std_q)).square()
     return (log_std_q - log_std_p + 0.5 * (variance_ratio + shift - 1.0)).sum(-1)
 
 
 def gaussian_entropy(log_std: Tensor) -> Tensor:
-    """Return the differential entropy of a diagonal Gaussian, summed over the last axis. Shape (...)."""
+    """Return the differential entropy of a diagonal Gaussian, summed over the last axis.
+
+    ``log_std`` is (..., a), and the result is (...).
+    """
     return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum(-1)

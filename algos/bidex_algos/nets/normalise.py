@@ -14,9 +14,9 @@ _FOREVER = 1e18  # a count so large that further observations have no weight
 
 
 class RunningStats(nn.Module):
-    """Mean and variance of each element of a stream, in float64, merged batch by batch (Chan et al.).
+    """Running mean and variance of each element of a stream, in float64, merged batch by batch (Chan et al.).
 
-    If ``max_count`` bounds the count, older batches fade.
+    If the count of samples is bounded by ``max_count``, older batches lose weight as newer ones arrive.
     """
 
     mean: Tensor
@@ -46,7 +46,7 @@ class RunningStats(nn.Module):
     def normalise(self, x: Tensor, element: Tensor) -> Tensor:
         """Scale ``x`` (..., n) to zero mean and unit variance.
 
-        ``element``, int64 (n,), is the element of the statistics that applies to each column.
+        ``element``, int64 (n,), is the index of the element whose statistics apply to each column of ``x``.
         """
         return (x - self.mean.float()[element]) / self.std().float()[element]
 
@@ -60,10 +60,11 @@ class RunningStats(nn.Module):
 
 
 class ObservationNormaliser(nn.Module):
-    """Scales observations to zero mean and unit variance and clips them, except columns of ``inputs.unscaled``.
+    """Scales observations to zero mean and unit variance, except columns of ``inputs.unscaled``, and clips all columns.
 
-    Statistics of the other columns (``measured``) change only in :meth:`update`, so that the sampling policy and the
-    update see the same rollout. They do not change while ``settled``. If not ``enabled``, the module is the identity.
+    The statistics of the scaled columns (``measured``) change only in :meth:`update` and :meth:`merge`, so that the
+    sampling policy and the learner's update see the same rollout. While ``settled`` is true, :meth:`update` does
+    nothing. If not ``enabled``, the module is the identity.
     """
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
@@ -81,7 +82,7 @@ class ObservationNormaliser(nn.Module):
         self.register_buffer("scale", torch.ones(inputs.width))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Normalise (..., columns), float32."""
+        """Normalise raw observations (..., d); the result is float32."""
         if not self.enabled:
             return obs
         return ((obs - self.shift) * self.scale).clamp_(-self.clip, self.clip)
@@ -121,7 +122,10 @@ class ObservationNormaliser(nn.Module):
 
 
 def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:
-    """Make the normaliser for a config's ``normalise_observations`` and ``normalise_per_task`` and number of tasks."""
+    """Make the observation normaliser that a learner's config requires, for ``tasks`` tasks.
+
+    The options are ``normalise_observations`` and ``normalise_per_task``.
+    """
     options = vars(config)
     if options.get("normalise_per_task") and options["normalise_observations"] and tasks > 1:
         return TaskNormaliser(inputs, tasks)
@@ -129,7 +133,7 @@ def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) ->
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Normalises an observation by the statistics of its task, which the group ``task_id`` shows.
+    """Normalises each observation by the statistics of its own task, which the observation's group ``task_id`` shows.
 
     ``tasks`` is the number of tasks.
     """
@@ -143,7 +147,7 @@ class TaskNormaliser(ObservationNormaliser):
         self.scale = torch.ones(tasks, inputs.width)
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Normalise (..., columns), float32."""
+        """Normalise raw observations (..., d), each by the statistics of its task; the result is float32."""
         task = self.one_hot(obs).argmax(-1)
         return ((obs - self.shift[task]) * self.scale[task]).clamp_(-self.clip, self.clip)
 

@@ -77,7 +77,10 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
-    """Add a PointNet for each point cloud, which is not normalised; raise BidexError without ``point_widths``."""
+    """Give each point cloud among the inputs a PointNet as its encoder; point clouds are not normalised.
+
+    Raises BidexError if there is a point cloud but the config has no option ``point_widths``.
+    """
     options = vars(config)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)

@@ -66,7 +66,10 @@ class GaussianPolicy(ActorPolicy):
 
 
 def of_head(out: Tensor, head: Tensor) -> Tensor:
-    """Select from outputs (B, heads, ...) the outputs (B, ...) of the heads ``head``, int64 (B,)."""
+    """Select the outputs (B, ...) of one head for each sample from ``out`` (B, heads, ...).
+
+    ``head``, int64 (B,), is the head of each sample.
+    """
     return out.gather(1, head.view(-1, *[1] * (out.dim() - 1)).expand(-1, 1, *out.shape[2:]))[:, 0]
 
 

@@ -18,7 +18,10 @@ _LEAST = 1 << 21  # least number of multiplications for oneDNN; with fewer, the 
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Return differentiable ``x @ weight.T + bias``: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
+    """Return ``x @ weight.T + bias`` of shape (..., outputs), which is differentiable.
+
+    The arguments are ``x`` (..., inputs), ``weight`` (outputs, inputs) and ``bias`` (outputs,).
+    """
     if not _pays(x, weight):
         if x.is_cuda and torch.is_autocast_enabled("cuda"):
             x, weight = _in_eights(x, weight)
@@ -44,7 +47,10 @@ def _in_eights(x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Apply K layers, each to its own batch: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
+    """Apply K linear layers, each to its own batch, and return (K, batch, out).
+
+    The arguments are ``x`` (K, batch, in), ``weight`` (K, out, in) and ``bias`` (K, out).
+    """
     if _pays(x[0], weight[0]):
         if bias is None:
             biases = [None] * len(x)
@@ -75,10 +81,11 @@ def by_own(x: Tensor, index: Tensor, layers: Sequence[Callable[[Tensor], Tensor]
 
 
 def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int) -> Tensor:
-    """Apply to each row of ``x`` (B, inputs) the output layer of its head ``index``, int64 (B,), and return (B, n).
+    """Apply to each row of ``x`` (B, inputs) the output layer of one head, and return (B, n).
 
-    ``weight`` (heads * n, inputs) and ``bias`` (heads * n,) hold the layers of all heads. The function needs a host
-    sync. With twenty heads of 52 actions it takes a twentieth of the time of applying all heads to all rows.
+    ``index``, int64 (B,), is the head of each row. ``weight`` (heads * n, inputs) and ``bias`` (heads * n,) hold the
+    layers of all heads. The function needs a host sync. With twenty heads of 52 actions it takes a twentieth of the
+    time of applying all heads to all rows.
     """
     layers = zip(weight.unflatten(0, (heads, -1)), bias.unflatten(0, (heads, -1)), strict=True)
     return by_own(x, index, [partial(affine, weight=each, bias=offset) for each, offset in layers])
@@ -93,7 +100,7 @@ class Linear(nn.Linear):
 
 
 class _Affine(torch.autograd.Function):
-    """oneDNN's product with the gradient that PyTorch's operation lacks.
+    """oneDNN's linear layer with a gradient, because PyTorch's operation for oneDNN has none.
 
     The gradient consists of calls of :func:`affine`, so that it can be differentiated again.
     """
@@ -144,7 +151,11 @@ def _pays(x: Tensor, weight: Tensor) -> bool:
 
 @cache
 def is_faster_here() -> bool:
-    """Return whether this machine has an AMD processor with AVX-512, and PyTorch has both libraries."""
+    """Return whether oneDNN is faster than MKL on this machine.
+
+    This holds on AMD processors with AVX-512. The result is False if PyTorch lacks one of the two libraries, or
+    oneDNN's operation.
+    """
     both = torch.backends.mkl.is_available() and torch.backends.mkldnn.is_available()
     if not both or torch.backends.cpu.get_cpu_capability() != "AVX512" or "AuthenticAMD" not in _processor():
         return False

@@ -93,10 +93,11 @@ class RecurrentPolicy(nn.Module):
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
-        """Return the networks' input (..., width of ``inputs``): normalised observation, last action, last reward or 0.
+        """Return the networks' input of each step, (..., width of ``inputs``).
 
-        ``obs`` are raw (..., d), ``action`` (..., a). ``known`` and ``done`` (...) are described in :class:`Memory`;
-        both are part of the input.
+        The input consists of the normalised observation, the last action, the last reward (0 if it is not ``known``),
+        ``known`` and ``done``. Observations (..., d) and rewards (...) are given raw, and actions are (..., a).
+        ``known`` and ``done`` (...) are described in :class:`Memory`.
         """
         earned = torch.where(known, self.earned(reward), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)

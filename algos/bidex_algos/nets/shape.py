@@ -1,4 +1,4 @@
-"""The sizes and groups of the world for which a policy's networks were made; a checkpoint keeps them."""
+"""The sizes and observation groups of the world for which a policy's networks were made; a checkpoint stores them."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class Shape:
         return sum(group.size for group in self.groups if group.name == "task_id")
 
     def sizes(self) -> dict[str, int]:
-        """Return the sizes without the positions of the groups."""
+        """Return the sizes of observation, action and the task's one-hot, by name."""
         return {"observations": self.observations, "actions": self.actions, "num_id_columns": self.num_id_columns}
 
     def state_dict(self) -> State:
@@ -57,7 +57,7 @@ class Shape:
 
     @classmethod
     def load(cls, state: State) -> "Shape":
-        """Return the shape of a :meth:`state_dict`."""
+        """Return the shape that :meth:`state_dict` saved as ``state``."""
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
         named = tuple(ObservationGroup(*group) for group in groups)
         return cls(state["observations"], state["actions"], named, state.get("hidden", 0), state.get("classes", 1))

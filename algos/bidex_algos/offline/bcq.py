@@ -1,8 +1,9 @@
-"""BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; appendix B.3.1).
+"""BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; Bi-DexHands' appendix B.3.1).
 
-The model G, a variational autoencoder, minimises |G(s, z) - a|^2 + KL, with z the code of a. Let a'_j = G(s', z_j) +
-xi'(s', G(s', z_j)), j = 1...n, with |xi'| <= Phi. Q_i regresses to r + gamma (1 - terminated) max_j [w min_i + (1 - w)
-max_i] Q'_i(s', a'_j). The perturbation xi of an action maximises Q_1(s, a + xi(s, a)).
+The model G, a variational autoencoder, minimises |G(s, z) - a|^2 + KL, where z is the code of action a. A perturbation
+xi changes the proposed actions by at most Phi and maximises Q_1(s, a + xi(s, a)). In the next state s' the proposals
+are a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, with random codes z_j. Q_i regresses to r + gamma (1 -
+terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j). A prime after xi or Q denotes a target network.
 """
 
 import copy
@@ -42,7 +43,7 @@ class BCQConfig(CriticConfig):
     lower_weight: Fraction = 0.75  # Weight of the lower critic's value in a target; the higher value has the rest.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class, with the autoencoder."""
+        """Estimate the memory that the learner takes, in bytes, including the autoencoder."""
         return super().bytes_held(num_envs, width) + network_bytes(self.vae_hidden, width, 2)
 
 
@@ -84,7 +85,7 @@ def bounded(codes: Tensor) -> Tensor:
 
 
 class BCQPolicy(nn.Module):
-    """A policy on raw observations that selects the best proposed action by the first critic.
+    """A policy on raw observations that takes the proposed action to which the first critic gives the highest value.
 
     ``model`` proposes actions and ``actor`` changes them. The codes of the proposals are drawn when the policy is
     created and are equal in every state, so that the policy is a function of the observation.
@@ -212,9 +213,10 @@ class BCQ(Offline):
 
 
 def best_of(values: Tensor, count: int, lower_weight: float) -> Tensor:
-    """Return the value of the best of ``count`` proposals in each state (B,).
+    """Return the value of the best of ``count`` proposed actions in each state, (B,).
 
-    ``values`` (2, B * count) are both critics' values of all proposals, ordered by state.
+    ``values`` (2, B * count) are both critics' values of all proposals, ordered by state. The value of a proposal is a
+    weighted mean of both values, in which the lower value has the weight ``lower_weight``.
     """
     mixed = lower_weight * values.amin(0) + (1.0 - lower_weight) * values.amax(0)
     return mixed.view(-1, count).amax(1)

@@ -1,4 +1,4 @@
-"""IQL: values computed only from actions of the data (Kostrikov et al. 2022; appendix B.3.3).
+"""IQL: values computed only from actions of the data (Kostrikov et al. 2022; Bi-DexHands' appendix B.3.3).
 
 V minimises |t - 1(u < 0)| u^2 with u = min_i Q'_i(s, a) - V(s), so V is the t-expectile over the data's actions. pi
 maximises min(exp(beta u), bound) log pi(a | s). Q_i regresses to r + gamma (1 - terminated) V(s').

@@ -1,7 +1,7 @@
-"""TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
+"""TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021).
 
 The targets and the delay of the actor's updates are TD3's. The actor mu minimises (mu(s) - a)^2 - lambda Q_1(s, mu(s)),
-with lambda = alpha / mean |Q_1(s, mu(s))|.
+with lambda = alpha / mean |Q_1(s, mu(s))|. Bi-DexHands describes TD3+BC in appendix B.3.2.
 """
 
 import copy

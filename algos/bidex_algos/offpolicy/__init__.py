@@ -1,1 +1,1 @@
-"""Learners that learn from a replay."""
+"""Learners that learn from a replay buffer."""

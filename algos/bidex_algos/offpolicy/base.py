@@ -1,8 +1,9 @@
 """The base of the off-policy learners: a replay per task, updates after each step, critics, targets, checkpoints.
 
-The learners differ in exploration, in the critics' targets and in the actor's update. An iteration repeats one step in
-every environment, followed by ``updates_per_step`` updates on the same number of transitions of each task. Rewards are
-divided by the running standard deviation of their task's discounted return, so that no task dominates another.
+The learners differ in exploration, in the critics' targets and in the actor's update. In an iteration, every
+environment takes several steps. After each of these steps, ``updates_per_step`` updates follow, each on the same number
+of transitions of each task. Rewards are divided by the running standard deviation of their task's discounted return, so
+that no task dominates another.
 """
 
 import copy
@@ -62,19 +63,19 @@ class OffPolicyConfig(NetworkConfig):
     autocast: Autocast = "auto"  # Use bfloat16 in hidden layers; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         return self.bytes_stored(num_envs, width) + network_bytes(self.hidden, width, 3)
 
     def bytes_stored(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of the replay, as in the base class."""
+        """Estimate the bytes of the replay, if ``width`` numbers are stored per environment step."""
         return int(min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps))
 
 
 class ReturnScale:
-    """Running statistics of the discounted sum of rewards since an episode began.
+    """Running statistics, for each task, of the discounted sum of rewards since the start of an episode.
 
-    The sums of a task fade from the statistics over ``horizon`` newer sums. ``gamma`` is a number, or one number per
-    environment (N,).
+    The statistics of a task cover about its last ``horizon`` sums, because older sums lose weight. ``gamma`` is a
+    number, or one number per environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -99,7 +100,7 @@ class ReturnScale:
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 
     def parts(self) -> Parts:
-        """Return the parts that a checkpoint holds, by name."""
+        """Return the tensors and statistics that a checkpoint stores, by name."""
         return {"return_stats": self.stats, "discounted": self.discounted}
 
 
@@ -206,7 +207,10 @@ class OffPolicy(Learner):
         return info["unstable"].sum()
 
     def _note(self, reward: Tensor, info: Info) -> None:
-        """Process rewards (N,) and info of a step, after replay and statistics have been updated."""
+        """Process rewards (N,) and info of a step, after replay and statistics have been updated.
+
+        Subclasses override this method; here it does nothing.
+        """
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()
@@ -243,10 +247,11 @@ class OffPolicy(Learner):
         self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor,
         beside: Tensor | float = 0.0, also: Iterable[nn.Parameter] = ()
     ) -> dict[str, Tensor]:  # fmt: skip
-        """Take one step of all critics towards ``target`` (B, ...), for normalised observations (B, d).
+        """Take one gradient step of all critics towards the targets ``target`` (B, ...).
 
-        The loss ``beside`` is added to the critics' loss. The parameters ``also``, which belong to the critics'
-        optimiser, take a step on the same sum.
+        ``obs`` (B, d) are normalised observations. ``weights`` and ``counts`` are described in :meth:`_update`.
+        ``beside`` is another loss, which is added to the critics' loss. ``also`` are further parameters of the critics'
+        optimiser, which take a step on the sum of both losses. Returns scalars to be logged.
         """
         losses, values = self._critic_losses(obs, draw.actions, target)
         loss = (weights / counts.sum().clamp_min(1.0) * losses).sum()
@@ -261,10 +266,10 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """Take one step of the named optimisers on ``loss``, summed over processes.
+        """Take one step of each named optimiser on ``loss``, which is summed over processes.
 
-        Returns ``numbers`` (n,), summed over processes. ``parameters`` are given by the name of their optimiser; only
-        gradients for the optimiser named ``clipped`` are clipped.
+        ``parameters`` maps the name of each optimiser to its parameters. Only the gradients of the optimiser called
+        ``clipped`` are clipped. Returns ``numbers`` (n,), summed over processes.
         """
         weights = list(chain.from_iterable(parameters.values()))
         for name in parameters:
@@ -285,9 +290,10 @@ class OffPolicy(Learner):
         return {**networks, "adams": self.adams, **statistics}
 
     def state_dict(self) -> State:
-        """Return the state as in the base class, with a copy of the replay.
+        """Return the base class's state and, in addition, a copy of the replay.
 
-        The copy is added here because the base class would copy it once more, and two copies may not fit in memory.
+        The replay makes this copy itself. If the base class saved the replay, it would make a second copy, and two
+        copies may not fit in memory.
         """
         return super().state_dict() | {"replay": self.replay.state_dict()}
 

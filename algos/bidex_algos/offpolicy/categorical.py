@@ -66,7 +66,11 @@ class CategoricalConfig(OffPolicyConfig):
     clipped_double_q: bool = True  # Targets and actor use the critic with the lower value; off: the mean of both.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Return the base class's estimate, in which all networks have ``hidden`` layers, plus that of the critics."""
+        """Estimate the memory that the learner takes, in bytes.
+
+        The base class assumes that all networks have the layers ``hidden``. To its estimate this method adds the size
+        of the critics, which have their own layers.
+        """
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 
@@ -123,13 +127,14 @@ RECENT = 0.9  # decay per step of the mean of recent rewards, so that about the 
 
 
 class ReturnBound(ReturnScale):
-    """Extends the statistics by the largest absolute return of each task, because all returns must be within the atoms.
+    """Statistics of returns that also hold the largest absolute return of each task.
 
-    A sum discounts earlier rewards instead of later ones, because the end of the episode is not known yet. The sum of
-    the discount factors over successive rewards is the same in both directions. At a time limit the episode is assumed
-    to continue with its mean reward, or with the mean of its most recent rewards if that is larger. ``mass`` (N,) is
-    the sum that would result if all rewards had been 1. ``recent`` (2, N) holds the sums of rewards and of ones with a
-    discount of at most :data:`RECENT`.
+    The largest return is needed because rewards are scaled so that all returns lie within the atoms. A sum discounts
+    earlier rewards instead of later ones, because the end of the episode is not known yet. The sum of the discount
+    factors over successive rewards is the same in both directions. At a time limit the episode is assumed to continue
+    with its mean reward, or with the mean of its most recent rewards if that is larger. ``mass`` (N,) is the sum that
+    would result if all rewards had been 1. ``recent`` (2, N) holds two sums with a discount of at most :data:`RECENT`:
+    that of the rewards, and that of a 1 for each reward.
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -140,7 +145,10 @@ class ReturnBound(ReturnScale):
         self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """Add one step as in the base class."""
+        """Add one step of all environments, also to the sums from which the largest return is computed.
+
+        The arguments are described in :meth:`ReturnScale.note`.
+        """
         self.mass = self.gamma * self.mass + 1.0
         self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
         super().note(reward, terminated, truncated, broken)
@@ -158,7 +166,7 @@ class ReturnBound(ReturnScale):
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
 
     def parts(self) -> Parts:
-        """Return the parts that a checkpoint holds, as in the base class."""
+        """Return the tensors and statistics that a checkpoint stores, by name."""
         return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}
 
 

@@ -1,9 +1,9 @@
-"""DDPG: a deterministic actor that maximises a critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
+"""DDPG: a deterministic actor that maximises a critic (Lillicrap et al. 2016), on all tasks of a world.
 
 The critic Q regresses to r + gamma (1 - terminated) Q'(s', mu'(s')); the actor mu maximises Q(s, mu(s)). The critic's
 gradient drives actions to the bounds, where tanh has almost no slope (on two hands 86 % of the actions exceeded 0.99
 after 0.4 M steps); ``squash_price`` prevents this. The noise on actions is normal. Its standard deviation differs
-between the environments of a task, as in Horgan et al. (2018).
+between the environments of a task, as in Horgan et al. (2018). Bi-DexHands describes DDPG in appendix B.1.3.
 """
 
 import copy

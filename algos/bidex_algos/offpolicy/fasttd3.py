@@ -1,9 +1,9 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-Few updates with many transitions follow each vector step. Targets use the current actor's actions, and target networks
-follow fast. The actor maximises min_i E Z_i, targets may sum rewards over several steps, and weights decay. Rewards are
-divided by max(standard deviation, largest absolute value / bound) of their task's returns. The distributions are
-described in ``categorical.py``; see ``docs/learners/fasttd3.md``.
+After each step of all environments, the learner makes a few updates with large batches. Targets use the current actor's
+actions, and target networks follow fast. The actor maximises min_i E Z_i, targets may sum rewards over several steps,
+and weights decay. Rewards are divided by max(standard deviation, largest absolute value / bound) of their task's
+returns. The distributions are described in ``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass

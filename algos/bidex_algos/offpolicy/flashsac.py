@@ -111,7 +111,10 @@ def _of(module: nn.Module) -> list[UnitMLP]:
 
 @contextmanager
 def by_batch(network: nn.Module) -> Iterator[None]:
-    """Let batch norms in this context use their input's statistics and merge these into the running statistics."""
+    """Let the batch norms of ``network`` normalise by the statistics of their input, within this context.
+
+    The batch norms also merge these statistics into their running statistics.
+    """
     network.train()
     yield
     network.eval()

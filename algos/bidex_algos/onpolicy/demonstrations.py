@@ -34,7 +34,10 @@ class Demonstrations:
         self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
 
     def weight(self, env_steps: int) -> float:
-        """Return the weight of the term after ``env_steps`` steps; it is halved every ``HALF_LIFE`` steps."""
+        """Return the weight of the behaviour-cloning term in the loss after ``env_steps`` environment steps.
+
+        The weight is halved every ``HALF_LIFE`` steps.
+        """
         return WEIGHT * 0.5 ** (env_steps / HALF_LIFE)
 
     def draw(self) -> tuple[Tensor, Tensor]:
@@ -76,7 +79,10 @@ class Demonstrations:
             adam.step()
 
     def check(self, learner: str, stored: dict[str, float] | None) -> None:
-        """Raise BidexError if a checkpoint has a fingerprint, ``stored``, that is not the fingerprint of these data."""
+        """Raise BidexError if a checkpoint was made with demonstrations other than these.
+
+        ``stored`` is the fingerprint of the demonstrations in the checkpoint, or None if the checkpoint has none.
+        """
         if stored is not None and stored != self.fingerprint:
             raise BidexError(
                 f"{learner}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "

@@ -24,7 +24,10 @@ _EPISODES = 20.0
 
 
 def needs(episodes: EpisodeStatistics) -> Tensor:
-    """Return each class's need of a teacher (num_tasks,): it falls from 1 without any success to 0 at ``SUCCESS``."""
+    """Return how much each class needs its teacher, (num_tasks,).
+
+    The need falls from 1 for a class without any success to 0 at a success rate of ``SUCCESS``.
+    """
     _, _, successes, counts = all_sum(episodes.sums)
     return (1.0 - successes / counts.clamp_min(_EPISODES) / SUCCESS).clamp_min(0.0)
 

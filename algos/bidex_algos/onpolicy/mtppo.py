@@ -64,7 +64,7 @@ class OnPolicyConfig(LearnerConfig):
         check_rising(self, self.algo, "std_range")
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """Estimate the bytes of memory as in the base class."""
+        """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         return 4 * num_envs * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
 
 
@@ -348,7 +348,12 @@ class MTPPO(OnPolicy):
         return reported
 
     def _descend(self, first: bool, critic_alone: bool, *inputs: Tensor) -> Tensor:
-        """Take one step on a mini-batch; ``inputs`` are its fields, sum of weights and old log standard deviations."""
+        """Take one step on a mini-batch, and return the numbers to be logged, summed over processes.
+
+        ``inputs`` are the fields of the mini-batch's :class:`Batch`, the sum of its weights over all processes, and the
+        log standard deviations of the sampling policy. ``first`` marks the first mini-batch of an update. If
+        ``critic_alone``, only the critic takes a step.
+        """
         *fields, count, old_log_std = inputs
         b = Batch(*fields)
         actor = self.policy.actor
@@ -433,11 +438,17 @@ class MTPPO(OnPolicy):
         return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
 
     def state_dict(self) -> State:
-        """Return the state as in the base class; labels are copied only once, as two copies may not fit in memory."""
+        """Return the base class's state and, if there are teachers, a copy of the labelled data.
+
+        The data set makes this copy itself, because a second copy by the base class may not fit in memory.
+        """
         return super().state_dict() | ({} if self.lessons is None else {"data": self.lessons.data.state_dict()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restore the state as in the base class; begin new episodes if teachers follow an episode from its start."""
+        """Restore the result of :meth:`state_dict`.
+
+        If a teacher must see an episode from its start, begin new episodes.
+        """
         super().load_state_dict(state)
         if self._graphs is not None:
             self._graphs.forget()

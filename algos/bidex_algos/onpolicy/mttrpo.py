@@ -59,9 +59,11 @@ def gaussian_step(
     parameters: list[nn.Parameter], distribution: Callable[[], tuple[Tensor, Tensor]], keep_bounds: Callable[[], None],
     b: Any, gain: Tensor, old_log_std: Tensor, own_kl: Tensor, config: Any, max_kl: float
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Take a trust-region step of a Gaussian policy that increases the mean of ratio times ``gain`` (B,).
+    """Take a trust-region step of a Gaussian policy that increases the mean of likelihood ratio times ``gain`` (B,).
 
-    ``b`` are the samples. ``own_kl`` is the result of :func:`kl_from_itself`. Returns scalars to be logged.
+    ``b`` are the samples. ``distribution`` returns the policy's mean and log standard deviation for these samples.
+    ``keep_bounds`` clamps the standard deviations to their bounds. ``own_kl`` is the result of :func:`kl_from_itself`.
+    Returns scalars to be logged.
     """
     weight = b.weights / all_sum(b.weights.sum()).clamp_min(1.0)
 
@@ -159,8 +161,8 @@ class MTTRPO(OnPolicy):
 class TRPO(MTTRPO):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
-    The class is MT-TRPO with presets for a single task. The networks are from Table 42. All other values are those of
-    MT-TRPO, because the appendix has no table for TRPO.
+    The class is MT-TRPO with another preset ``paper``, which is for a single task. Its networks are from Table 42 of
+    the Bi-DexHands appendix. All other values are those of MT-TRPO, because the appendix has no table for TRPO.
     """
 
     presets = PRESETS | {"paper": replace(PRESETS["paper"], hidden=(1024, 1024, 512))}

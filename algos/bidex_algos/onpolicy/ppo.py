@@ -15,7 +15,7 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 
 @dataclass(frozen=True)
 class PPOConfig(LearnerConfig):
-    """Options of epochs, clip and step sizes; a config with several bases lists these options last."""
+    """Options of epochs, clipping and step sizes. If a config has several base classes, these options come last."""
 
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
     epochs: Count = 4  # Passes over the collected data per update.
@@ -41,10 +41,11 @@ def mini_batches(
     weights: Tensor, epochs: int, number: int, generator: torch.Generator,
     split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:  # fmt: skip
-    """Iterate over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
+    """Yield shuffled mini-batches of all samples, for several epochs.
 
-    Yields whether the mini-batch is the first of all, the indices of its samples, int64 (b,), and the sum of these
-    samples' weights over all processes (at least 1).
+    ``weights`` (B,) are the weights of the samples. Each epoch shuffles all samples and divides them into ``number``
+    mini-batches. For each mini-batch, three values are yielded: whether it is the first of all, the indices of its
+    samples, int64 (b,), and the sum of these samples' weights over all processes (at least 1).
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -63,7 +64,10 @@ class PolicyLoss(NamedTuple):
     earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
     def numbers(self, value: Tensor) -> list[Tensor]:
-        """Return the values named by :data:`NAMES`, without gradients; ``value`` is the critic's loss."""
+        """Return the losses and statistics to be logged, without gradients, in the order of :data:`NAMES`.
+
+        ``value`` is the critic's loss.
+        """
         return [self.surrogate.detach(), value.detach(), self.kl, self.outside]
 
 
@@ -96,9 +100,10 @@ def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
 
 
 class _Adam(torch.optim.Adam):
-    """Adam whose step size remains the given tensor, so that adapting the tensor also affects a loaded optimiser.
+    """Adam whose step size is a tensor that remains the same tensor when a state is loaded.
 
-    On CUDA its steps can be recorded in a graph.
+    Changes of this tensor therefore also affect an optimiser that was restored. On CUDA the steps can be recorded in a
+    graph.
     """
 
     def __init__(self, weights: list[nn.Parameter], rate: Tensor, eps: float = 1e-8) -> None:
