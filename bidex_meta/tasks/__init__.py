@@ -1,1 +1,1 @@
-"""The task classes, a module for each kind; ``registry`` maps class names to modules."""
+"""Task classes, one module per kind of task; ``registry`` finds a class by its name."""

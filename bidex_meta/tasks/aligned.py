@@ -1,4 +1,7 @@
-"""The reward of version 2: one formula for all classes, based on a state's errors."""
+"""Reward of version 2, which has one formula for all task classes.
+
+The formula reads the errors of a state: values such as a distance from the goal, which must become small for success.
+"""
 
 from typing import Literal, NamedTuple
 
@@ -9,7 +12,10 @@ from bidex_meta.tasks.variation import VariationSpace
 
 
 class Hidden(NamedTuple):
-    """A part of a task that observations show only in goal entries; success requires each part separately."""
+    """A part of a task's goal, such as a target point, that observations show only in their goal entries.
+
+    Suites with hidden goals set the goal entries to zero. Success requires every part to be within its own tolerance.
+    """
 
     names: tuple[str, ...]
     """Components of the variation: the coordinates of one point, in metres or rad, or the draws of an orientation."""
@@ -18,7 +24,10 @@ class Hidden(NamedTuple):
     kind: Literal["point", "orientation", "sign"] = "point"
 
     def described(self, space: VariationSpace) -> str:
-        """Return the components with their ranges, and the tolerance, as text."""
+        """Return a text with the range of each component of this part, and with the part's tolerance.
+
+        ``space`` holds the ranges. A part of the kind ``sign`` has no tolerance, so the text contains only the range.
+        """
         ends = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
         ranges = ", ".join(f"{name} {ends[name][0]:.3g} … {ends[name][1]:.3g}" for name in self.names)
         if self.kind == "sign":
@@ -27,7 +36,7 @@ class Hidden(NamedTuple):
 
 
 class Error(NamedTuple):
-    """One of the values that must be small for a state to be solved."""
+    """A value, such as a distance from the goal, that must be smaller than its tolerance for success."""
 
     value: Tensor
     """The error in each environment, at least 0, shape (n,), in the unit of the tolerance."""
@@ -36,7 +45,10 @@ class Error(NamedTuple):
 
 
 def at_least(value: Tensor, least: float, tolerance: float) -> Error:
-    """Return the error of a value that must exceed ``least``; the error is zero from ``least`` + ``tolerance`` on."""
+    """Return the error that is below ``tolerance`` exactly when ``value`` exceeds ``least``.
+
+    The error is max(0, ``least`` + ``tolerance`` - ``value``).
+    """
     return Error((least + tolerance - value).clamp(min=0.0), tolerance)
 
 
@@ -46,13 +58,17 @@ def within(errors: list[Error]) -> Tensor:
 
 
 def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> dict[str, Tensor]:
-    """Return the terms (n,) of the reward of version 2, in [0, 1]: their sum is 1 if ``solved``, otherwise at most 0.9.
+    """Return the terms of version 2's reward, each (n,), in [0, 1], by name; the reward is their sum.
 
-    The term ``solved`` is 1 or 0. If it is 1, all other terms are 0. Otherwise they depend on the class's errors e,
-    divided by their tolerances: ``far`` is the mean of 1 - tanh(e / 16), and ``near`` is the mean of exp(-0.3 e). For
-    an egg at distance d (m) from its goal these are 1 - tanh(2 d) and exp(-10 d). In classes with ``guides``, which are
-    distances d (m) of hands from points, ``reach`` is the mean of 1 - tanh(3 d). The weights are 0.25 for far and 0.65
-    for near; in classes with reach they are 0.2 for reach, 0.2 for far and 0.5 for near.
+    If a state is ``solved``, the term ``solved`` is 1, all other terms are 0 and the reward is 1. If not, ``solved`` is
+    0, and the other terms sum to at most 0.9. These other terms are weighted means, in which e is an error divided by
+    its tolerance and d is a distance (m) in ``guides``:
+
+    * ``far``: mean of 1 - tanh(e / 16) over all errors, times 0.25, or times 0.2 if there are guides.
+    * ``near``: mean of exp(-0.3 e) over all errors, times 0.65, or times 0.5 if there are guides.
+    * ``reach``: mean of 1 - tanh(3 d) over all guides, times 0.2; left out if there are none.
+
+    For an egg whose goal is x metres away, the means in ``far`` and ``near`` are 1 - tanh(2 x) and exp(-10 x).
     """
     off = torch.stack([error.value / error.tolerance for error in errors])
     far = (1.0 - torch.tanh(off / 16.0)).mean(dim=0)

@@ -1,4 +1,4 @@
-"""Articulated objects on a table (appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes)."""
+"""Task classes with articulated objects (A.2.12, A.2.14, A.2.15 of the paper's appendix; docs/figures.md, Classes)."""
 
 import math
 from collections.abc import Mapping
@@ -44,13 +44,15 @@ angle."""
 
 
 class OpenScissors(ReachTask):
-    """Open shears, which lie on a table, to a task's angle, with each hand at one loop.
+    """Open a pair of shears to a given angle, with one hand at each loop; the shears lie on a table.
 
-    Observation: Table 30 (428). Reward: equation 14. The formula does not give the target angle, so each task freezes
-    one. At 0 rad the shears are open by 34 degrees. At -0.59 rad they are shut, as at the start. The object pose is the
-    pose of the left hand's half. The goal block shows the pose that the right handle has at the target angle if the
-    left hand's half stays where it is. The rotation difference is that of the right hand's half and shows the missing
-    angle.
+    Observation: Table 30 of the paper's appendix, size (428). Reward: equation 14. The equation does not give the
+    target angle, so each task has its own.
+
+    The hinge is at 0 rad when the shears are open by 34 degrees, and at -0.59 rad when they are shut, as at the start.
+    Each hand has one half of the shears. The object pose in the observation is the pose of the left hand's half. The
+    goal block shows the pose that the right handle has at the target angle if the left hand's half stays where it is.
+    The goal block's rotation difference compares the right hand's half with this pose and so shows the missing angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -78,10 +80,12 @@ class OpenScissors(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return the shears' placement and their goal.
+        """Return the values that a task fixes: the place of the shears and the target angle of the hinge.
 
-        ``scissors``: shift and yaw of the shears (n, 3); ``target``: goal angle of the hinge (n, 1), rad; ``turn``: the
-        same angle as a quaternion (n, 4); ``ghost``: pose of the goal in pictures of version 1 (n, 7).
+        * ``scissors``: shift and yaw of the shears from their nominal start (n, 3).
+        * ``target``: target angle of the hinge (n, 1), rad; ``turn``: the same angle as a quaternion (x, y, z, w),
+          (n, 4).
+        * ``ghost``: pose (n, 7) of the right handle at the target angle while the shears lie at the task's start.
         """
         root = constant((*_SCISSORS.position, *_SCISSORS.quaternion), variation).repeat(len(variation), 1)
         place(root, variation[:, :3])
@@ -117,7 +121,11 @@ class OpenScissors(ReachTask):
         return within(self.errors(state))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the right handle's goal for the present pose of the shears, in version 1 for their start pose."""
+        """Return the goal to draw in pictures: the right handle at the hinge's target angle.
+
+        In suites with wide variation (version 2) the goal follows the shears as they move; otherwise it belongs to the
+        place where the shears lie at the task's start.
+        """
         if self.rules.wide:
             pose = self.observe(state)["goal_pose"]
         else:
@@ -126,9 +134,10 @@ class OpenScissors(ReachTask):
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
-    """Return the right handle's pose (n, 7) if the hinge has turned by ``turn``, a quaternion (n, 4).
+    """Return the pose (n, 7) that the shears' right handle has when the hinge is turned by ``turn``.
 
-    ``position`` and ``rotation`` are the pose of the left hand's half.
+    ``position`` (n, 3) and ``rotation`` (n, 4) are the pose of the other half of the shears, the left hand's half.
+    ``turn`` (n, 4), like all rotations here, is a quaternion (x, y, z, w).
     """
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
@@ -147,11 +156,15 @@ _BODY_POINT = 0.07
 
 
 class OpenPenCap(ReachTask):
-    """Pull the cap off a pen that lies on a table, with the left hand at its body and the right hand at its cap.
+    """Pull the cap off a pen on a table; the left hand holds the pen's body, the right hand holds its cap.
 
-    Observation: Table 34 (428). Reward: equation 16. For success the cap must be pulled by 13 cm, its own length. At
-    the goal position the cap's point is 0.3 m from where the body's point is at the task's start. The goal orientation
-    is that of the pen at the start. Reward and success do not read the goal.
+    Observation: Table 34 of the paper's appendix, size (428). Reward: equation 16.
+
+    In version 1 success requires the points on body and cap to be more than 0.3 m apart. The cap, which is 13 cm long,
+    has then been pulled by its own length. The goal position, for the cap's point, is 0.3 m from the place of the
+    body's point at the task's start. The goal orientation is the pen's orientation at the task's start. Reward and
+    success do not read this goal pose. With wide variation, as in version 2, each task has its own distance between the
+    points instead of 0.3 m.
     """
 
     needs = Capacity(56, 0, 121)
@@ -182,10 +195,11 @@ class OpenPenCap(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return the pen's placement and the goal of the cap.
+        """Return the values that a task fixes: the place of the pen and the goal of the cap.
 
-        ``pen``: shift and yaw (n, 3); ``gap``: target distance of the points on body and cap (n, 1), m; ``goal``: pose
-        of the goal (n, 7); ``goal_inverse``: inverse of the goal's rotation (n, 4).
+        * ``pen``: shift and yaw of the pen from its nominal start (n, 3).
+        * ``gap``: target distance between the points on body and cap (n, 1), metres.
+        * ``goal``: goal pose of the cap (n, 7); ``goal_inverse``: inverse of its rotation (n, 4).
         """
         pen = constant((*_PEN.position, *_PEN.quaternion), variation).repeat(len(variation), 1)
         place(pen, variation[:, :3])
@@ -201,7 +215,11 @@ class OpenPenCap(ReachTask):
         return 5.0 * apart(state, *self.points)
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the cap; with wide variation it is relative to the present pose of the pen's body."""
+        """Return the goal of the cap to draw in pictures.
+
+        In suites with wide variation (version 2) the goal follows the pen's body as it moves; otherwise it stays where
+        the task has put it.
+        """
         if not self.rules.wide:
             return super().ghosts(state)
         pen = state.quaternion("pen/quaternion")
@@ -245,14 +263,20 @@ _BAR = (0.005, 0.09, 0.005)
 
 
 class Switch(ReachTask):
-    """Press the buttons of two rocker switches.
+    """Press the buttons of two rocker switches, one with each hand.
 
-    The table is 0.5 x 1 m and 55 cm high. Observation: Table 36 (428). Reward: equation 17. The raised half of each
-    rocker is the button. The button's point lies on the surface, 3.5 cm from the hinge; its target is its position at
-    full travel. Switch 1 is at -y, for the left hand. The entries for the pose and velocity of switch 1 show its
-    rocker, because the housing does not move. The goal block holds the target of switch 1 and the orientation of its
-    rocker at full travel. A task shifts the housings by up to 3 cm along x and y, but does not turn them; an episode
-    makes no further draws.
+    Observation: Table 36 of the paper's appendix, size (428). Reward: equation 17. The table is 0.5 x 1 m and 55 cm
+    high.
+
+    The button is the raised half of a rocker. Its point, which the hand must reach, lies on the button's surface, 3.5
+    cm from the hinge. The target of the point is its position at the rocker's full travel. Switch 1 is at -y and
+    belongs to the left hand. In the observation, the pose and velocity of switch 1 are those of its rocker, because the
+    housing does not move. The goal block holds the target of switch 1's point, and the orientation of the rocker at
+    full travel.
+
+    A task shifts each housing by up to 3 cm along x and y, but does not turn it. With wide variation, as in version 2,
+    a task instead gives a target angle to each rocker, and every episode shifts the housings by up to 9 cm. The goal
+    block then holds both target angles, and the difference of each rocker's angle from its target.
     """
 
     needs = Capacity(36, 0, 90)
@@ -292,10 +316,12 @@ class Switch(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``switch1``, ``switch2``: base positions (n, 3); ``goal1``, ``goal2``: buttons' target points (n, 3).
+        """Return the values that a task fixes: the places of the switches and the targets of their buttons.
 
-        ``goal`` is the pose of switch 1's button at full travel (n, 7), ``goal_inverse`` the inverse of its rotation
-        (n, 4). With wide variation ``angles`` are the rockers' target angles (n, 2), rad.
+        * ``switch1`` and ``switch2``: positions of the switches' bases (n, 3), world, metres.
+        * ``goal1`` and ``goal2``: positions of the buttons' points at full travel (n, 3), world, metres.
+        * ``goal``: pose of switch 1's button at full travel (n, 7); ``goal_inverse``: inverse of its rotation (n, 4).
+        * ``angles``: target angles of both rockers (n, 2), rad; only with wide variation (version 2).
         """
         frozen = {}
         for i, switch in enumerate(self.objects, start=1):
@@ -340,7 +366,7 @@ class Switch(ReachTask):
         return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals of the buttons' points if variation is wide, otherwise an empty list."""
+        """Return the goals to draw in pictures: the buttons at their target angles, or none without wide variation."""
         if not self.rules.wide:
             return []
         found = []

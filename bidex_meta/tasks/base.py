@@ -1,4 +1,4 @@
-"""The base of task classes: one scene, one variation space, one reward formula, one success test."""
+"""The base class of all task classes, and the contact solver settings that a class may choose."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping, Sequence
@@ -31,15 +31,21 @@ from bidex_meta.utils.validation import Count, Finite, NonNegative, Point, Posit
 @checked_arguments
 @dataclass(frozen=True)
 class Solver:
-    """Settings of the contact solver per class, in addition to the common profile (bidex_meta/hands/README.md).
+    """Settings of MuJoCo's contact solver for one task class.
+
+    bidex_meta/hands/README.md describes the settings that are the same for all classes.
 
     Attributes:
-        iterations: Maximum number of Newton iterations; ``line_search``: maximum number of steps of a line search.
-        cone: Friction cones: an elliptic cone is exact; a pyramid costs 25 to 33 % less and slips a little.
+        iterations: Maximum number of Newton iterations.
+        line_search: Maximum number of steps of each line search.
+        integrator: MuJoCo's integration method.
+        cone: Shape of the friction cones. An elliptic cone is exact. A pyramid takes 25 to 33 % less time and lets
+            objects slip a little.
         impratio: Stiffness of friction relative to the normal force; a higher ratio makes held objects creep less.
-        time_step: Seconds; a control step has a whole number of time steps. Contacts and limits are as stiff as this
-            time step allows.
-        most_condim: Maximum dimension of a contact: 4 with torsional friction (eggs and fingertips), 3 without.
+        time_step: Length of a physics step, seconds; a whole number of physics steps must make a control step. Contacts
+            and joint limits are as stiff as this time step allows.
+        most_condim: Largest dimension of a contact. 4 includes torsional friction, which eggs and fingertips have; 3
+            does not.
     """
 
     iterations: Count = 10
@@ -74,44 +80,52 @@ JITTER, JOINT_NOISE = 0.005, 0.1
 
 
 class TaskClass(ABC):
-    """The base of the manipulation tasks, batched over environments.
+    """The base of the manipulation task classes, batched over environments.
 
-    Environments are the first axis of all tensors, which have the engine's precision. A class has no state: what a task
-    freezes is in ``frozen``, what an episode draws is in ``draws``.
+    The first axis of every tensor is the environment. Tensors have the engine's precision. An instance stores no state
+    of tasks or episodes: methods receive such state in the arguments ``frozen`` (values that a task fixes) and
+    ``draws`` (random numbers of an episode).
+
+    "Wide variation" below means the variation of version 2: a task fixes only what suites with hidden goals hide, and
+    every episode draws the rest, such as the places of objects.
 
     Attributes:
-        name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: the task in one line.
-        formula: The printed reward; ``solved``: the condition for success in one line.
-        deviations: Intended differences from the appendix, one line each.
-        episode_steps: Time limit, control steps; ``wide_steps``: time limit with wide variation, if that takes longer.
+        name: Name of the class, e.g. ``CatchUnderarm``.
+        summary: The task in one line.
+        formula: The paper's reward formula, with the changes that ``deviations`` lists, in one line.
+        solved: The condition for success in one line.
+        deviations: Intended differences from the paper's appendix, one line each.
+        episode_steps: Time limit in control steps; ``wide_steps``: a longer limit for wide variation, or None.
         right: Start pose of the right hand; ``left``: start pose of the left hand.
         transition_scale: Scale of the base forces; ``orientation_scale``: scale of the base torques (docs/figures.md,
-            base).
-        start_draws: Number of uniform numbers that the start of an episode takes.
-        variation_space: Components that a task of this class freezes; an attribute or a property. With wide variation
-            these are only the hidden components: ``adopt`` splits ``wide_space``.
-        episode_space: Components that every episode draws. With wide variation these are the components that are not
-            hidden; otherwise there are none.
-        wide_space: Components of both spaces, in the order in which ``freeze`` reads them; None: the class has no
-            version 2.
+            section Base).
+        start_draws: Number of random numbers that ``start`` takes per environment.
+        variation_space: Components that a task fixes; an attribute or a property. With wide variation, ``adopt``
+            replaces it with the hidden components of ``wide_space``.
+        episode_space: Components that every episode draws: with wide variation the components of ``wide_space`` that
+            are not hidden, otherwise none.
+        wide_space: All components for wide variation, in the order in which ``freeze`` reads them. None means that the
+            class does not support wide variation, and so has no version 2.
         wide_solved: The condition for success with wide variation.
-        wide_blocks: Observation blocks that are appended with wide variation, in classes whose printed observation has
-            no goal block.
-        jittered_hands: Hands that get joint noise from jittered starts, because ``start`` adds no noise to them.
+        wide_blocks: Observation blocks that wide variation appends, in classes whose printed observation has no goal
+            block.
+        jittered_hands: Hands to which ``start`` adds no joint noise, so that ``begin`` adds it if the suite's rules ask
+            for jittered starts.
         jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
         rules: The suite's rules; ``adopt`` sets them.
         chosen: Options of the constructor by name, with given or default values; ``registry.get`` sets them.
         blocks: Observation blocks that follow both hands' blocks.
-        moving_base: True if the hands' bases are driven (52 actions), False if they are fixed (40 actions). In the
-            constructor None stands for the class's default (fixed only in HandOver).
-        touch: Whether the hands have touch sensors, which the observation shows; ``registry.get`` sets it.
+        moving_base: True if actions drive the hands' bases (52 actions), False if the bases are fixed (40 actions). In
+            the constructor, None stands for the class's default, which is fixed only in HandOver.
+        touch: Whether the hands have touch sensors, which the observation then shows; ``registry.get`` sets it.
         solver: Settings of the contact solver for this class.
-        needs: Sizes for the fixed buffers of mujoco_warp: the maximum numbers of contacts and constraint rows in 30,208
+        needs: Sizes for mujoco_warp's fixed buffers: the largest numbers of contacts and constraint rows in 30,208
             states under rough actions. ``python -m tools.bench capacity --task NAME --steps 30000`` measures them. A
             class that was not measured has the largest numbers of all classes.
-        camera_target: Point at the centre of pictures, world, metres; ``camera_distance``: the camera's distance to it.
+        camera_target: Point at the centre of pictures, world, metres; ``camera_distance``: the camera's distance from
+            this point, metres.
         camera_angle: Azimuth and elevation of the camera, degrees, chosen so that hands, objects and goal are visible.
-        depth_camera: Position and target of the camera of point clouds, world, metres; None: the camera looks down
+        depth_camera: Position and target of the camera of point clouds, world, metres; with None the camera looks down
             at ``camera_target`` from the front.
     """
 
@@ -154,10 +168,10 @@ class TaskClass(ABC):
         self.moving_base = true_or_false("moving_base", default)
 
     def adopt(self, rules: Rules) -> None:
-        """Adopt a suite's rules, once.
+        """Set the rules of the suite in which this class is used.
 
-        Raises BidexError if the class lacks the wide variation or the reward of version 2 that the rules require, or
-        already has other rules.
+        Raises BidexError if the class already has other rules than the default ones, or if it lacks the wide variation
+        or the reward of version 2 that ``rules`` require.
         """
         if self.rules not in (V1, rules):
             raise BidexError(
@@ -172,10 +186,12 @@ class TaskClass(ABC):
             self.widen()
 
     def widen(self) -> None:
-        """Use the wide variation: a task freezes the hidden components of ``wide_space``, each episode draws the rest.
+        """Use wide variation (version 2): let tasks fix only what suites hide, and let every episode draw the rest.
 
-        Otherwise a policy with memory could recognise a task by the placement of its objects. A class that hides
-        nothing keeps all components in its tasks.
+        A task then fixes the hidden components of ``wide_space``, such as a goal. Every episode draws the other
+        components, such as the places of objects. If a task fixed the places too, a policy with memory could recognise
+        the task by them. In a class that hides nothing, tasks fix all components. Raises BidexError if ``wide_space``
+        is None.
         """
         if self.wide_space is None:
             raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
@@ -186,18 +202,23 @@ class TaskClass(ABC):
         self._order = [drawn.index(name) for name in self.wide_space.names]
 
     def varied(self, shares: Tensor) -> Tensor:
-        """Return the variations (n, variation_space.size) at the given shares, in [0, 1), of the variation space."""
+        """Return the variations (n, variation_space.size) that ``shares`` select from the variation space.
+
+        ``shares``, in [0, 1), has shape (n, at least variation_space.size). A share of 0 selects the lower end of a
+        component's range, and 0.5 selects its middle.
+        """
         space = self.variation_space
         low = constant(space.low, shares)
         high = constant(space.high, shares)
         return low + (high - low) * shares[:, : space.size]
 
     def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
-        """Return the result of ``freeze`` for tasks' variations (n, variation_space.size) and ``episode_space``.
+        """Return the values that ``freeze`` computes from tasks' variations and the components that episodes draw.
 
-        ``draws`` in [-1, 1], (n, at least episode_space.size), give the components of ``episode_space``, which only
-        affect the start of an episode. None stands for the middle of ``episode_space``: rewards, success and
-        observations do not depend on these components.
+        ``variation`` has shape (n, variation_space.size). ``draws``, in [-1, 1], has shape (n, at least
+        episode_space.size); its first columns select values from ``episode_space``. Without ``draws``, the middle of
+        ``episode_space`` is used. This is allowed for rewards, success and observations, because ``episode_space`` only
+        affects the start of an episode.
         """
         space = self.episode_space
         if not space.size:
@@ -237,31 +258,34 @@ class TaskClass(ABC):
 
     @abstractmethod
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Compute frozen values, each (n, k), for reward and observation from variations (n, variation_space.size).
+        """Return the values that a task fixes, such as its goal pose, each (n, k), by name.
 
-        With wide variation the variations are vectors of ``wide_space``. Then only ``start`` may read frozen values
-        that depend on components drawn per episode.
+        ``start``, reward and observation read these values. ``variation`` (n, variation_space.size) describes the
+        tasks. With wide variation (version 2) its columns are instead those of ``wide_space``, which include the
+        components that every episode draws. Only ``start`` may then read values that depend on these components.
         """
 
     @abstractmethod
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Write the start of an episode, from uniform numbers in [-1, 1], (n, start_draws), and frozen numbers.
+        """Write the positions at the start of an episode into ``qpos``.
 
-        ``qpos`` maps a part (``right/joints``, an object, ...) to views (n, k) of its positions that hold the nominal
-        start and are written in place; quaternions are (w, x, y, z).
+        ``draws`` (n, start_draws) are uniform random numbers in [-1, 1]. ``frozen`` holds the values that ``freeze``
+        returned. ``qpos`` maps the name of each part (``right/joints``, an object, ...) to a view (n, k) of the part's
+        positions. The views hold the nominal start and are changed in place. Quaternions are (w, x, y, z).
         """
 
     @property
     def draws(self) -> int:
-        """Return the number of uniform numbers that ``begin`` takes."""
+        """Return the number of random numbers per environment that ``begin`` takes."""
         more = 24 * len(self.jittered_hands) + 2 * len(self.jittered_fixtures)
         return self.episode_space.size + self.start_draws + (more if self.rules.jittered else 0)
 
     def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Run ``start``, then apply what the suite's rules add.
+        """Write the positions at the start of an episode: call ``start``, then add jitter if the rules require it.
 
-        ``draws`` has shape (n, self.draws). Its first columns belong to ``episode_space``; ``frozen`` already contains
-        the values that follow from them.
+        The rules are those of the suite. ``draws`` (n, self.draws) are uniform random numbers in [-1, 1]. The first
+        episode_space.size columns have already been used to compute ``frozen``. ``frozen`` and ``qpos`` are as in
+        ``start``.
         """
         draws = draws[:, self.episode_space.size :]
         self.start(draws[:, : self.start_draws], frozen, qpos)
@@ -290,45 +314,59 @@ class TaskClass(ABC):
         return []
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the layout's blocks that are not read from sensors, by name, each (n, size); empty by default."""
+        """Return the observation blocks that are computed instead of read from sensors, each (n, size), by name.
+
+        By default there are none.
+        """
         return {}
 
     @abstractmethod
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Return named terms, each (n,), that sum to the reward of the printed formula."""
+        """Return the terms of the paper's reward formula (``formula``), each (n,), by name; the reward is their sum."""
 
     @abstractmethod
     def success(self, state: TaskState) -> Tensor:
         """Return whether the task is solved in this state. Shape (n,), bool."""
 
     def errors(self, state: TaskState) -> list[Error]:
-        """Return a state's errors for the reward of version 2, at least one."""
+        """Return the errors that the reward of version 2 reads: at least one value that must be small for success.
+
+        A class without this method cannot have the reward of version 2.
+        """
         raise NotImplementedError
 
     def hides(self) -> tuple[Hidden, ...]:
-        """Return the parts of a task that only goal entries show, with success tolerances; empty by default."""
+        """Return the parts of the goal that suites with hidden goals hide, with their success tolerances.
+
+        By default there are none.
+        """
         return ()
 
     def hidden_columns(self) -> list[int]:
-        """Return the columns of a variation that hold hidden components."""
+        """Return the indices of the components of a variation that suites with hidden goals hide."""
         names = self.variation_space.names
         return [names.index(name) for name in chain.from_iterable(part.names for part in self.hides())]
 
     def guides(self, state: TaskState) -> list[Tensor]:
-        """Return distances (m), each (n,), from hands to points; the reward of version 2 rewards small distances."""
+        """Return distances (m), each (n,), such as from a hand to a handle; version 2 rewards small distances.
+
+        By default there are none.
+        """
         return []
 
     def instruct(self, goal: Mapping[str, float] | None) -> str:
-        """Return the instruction of a task, a sentence without a full stop; ``summary`` by default.
+        """Return a sentence, without a full stop, that says what to do in a task; by default the class's ``summary``.
 
-        ``goal`` holds the components of ``hides`` by name. If it is None, the sentence must not reveal them.
+        ``goal`` holds the values of the components that ``hides`` lists, by name. If ``goal`` is None, the sentence
+        must not reveal these values.
         """
         return self.summary
 
     def instruction(self, variation: Sequence[float] | np.ndarray | None = None, hidden: bool = False) -> str:
-        """Return the instruction of the task with this variation (variation_space.size,), or of the class for None.
+        """Return a sentence that says what to do in the task with this variation, shape (variation_space.size,).
 
-        With ``hidden`` the sentence leaves out what suites with hidden goals hide.
+        If ``variation`` is None or ``hidden`` is true, the sentence leaves out the values that suites with hidden goals
+        hide.
         """
         if variation is None or hidden:
             return self.instruct(None)
@@ -336,11 +374,14 @@ class TaskClass(ABC):
         return self.instruct({names[i]: float(variation[i]) for i in self.hidden_columns()})
 
     def solved_in(self, state: TaskState) -> Tensor:
-        """Return ``success``, computed once for reward and world. Shape (n,), bool."""
+        """Return whether the task is solved in this state, shape (n,), bool.
+
+        ``success`` is computed only once per state, because the reward and the world both read its result.
+        """
         return state.once("solved", lambda: self.success(state))
 
     def rewards(self, state: TaskState) -> dict[str, Tensor]:
-        """Return named terms, each (n,), that sum to the reward by the suite's rules."""
+        """Return the terms of the reward that the suite's rules choose, each (n,), by name; the reward is their sum."""
         if self.rules.reward == "paper":
             return self.reward_terms(state)
         return aligned_terms(self.solved_in(state), self.errors(state), self.guides(state))

@@ -1,4 +1,8 @@
-"""GraspAndPlace (the appendix only has a picture) and PourWater (appendix A.2.17); docs/figures.md."""
+"""Task classes with a bucket: GraspAndPlace and PourWater.
+
+Sources: A.2.17 of the paper's appendix for PourWater, and docs/figures.md. For GraspAndPlace the appendix has only a
+picture and one line.
+"""
 
 import math
 from collections.abc import Mapping
@@ -30,10 +34,10 @@ _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
 
 
 def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
-    """Return which points (n, k, 3) lie in a bucket, between floor and rim and within the wall. (n, k), bool.
+    """Return whether points lie in a bucket, that is, between its floor and rim and within its wall. (n, k), bool.
 
-    ``bucket`` (n, 3) holds the buckets' origins, ``quaternion`` (n, 4) their orientations (x, y, z, w). Points and
-    origins are in the world frame, metres.
+    ``points`` (n, k, 3) and the buckets' origins ``bucket`` (n, 3) are in the world frame, metres. ``quaternion``
+    (n, 4) holds the buckets' orientations (x, y, z, w).
     """
     x, y, z = rotate(conjugate(quaternion)[:, None], points - bucket[:, None]).unbind(-1)
     share = (z - FLOOR) / (RIM - FLOOR)
@@ -42,7 +46,10 @@ def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
 
 
 def stands(quaternion: Tensor) -> Tensor:
-    """Return whether buckets with orientations (x, y, z, w), (n, 4), are within 45 degrees of upright. (n,), bool."""
+    """Return whether buckets are within 45 degrees of upright, shape (n,), bool.
+
+    ``quaternion`` (n, 4) holds the buckets' orientations (x, y, z, w).
+    """
     return uprightness(quaternion) > math.cos(math.radians(45.0))
 
 
@@ -52,11 +59,14 @@ _TURN = "quaternion (x, y, z, w), world frame"
 class GraspAndPlace(ReachTask):
     """Put a block into a bucket: the left hand takes the block, the right hand takes the bucket.
 
-    The table is 1 x 1 m and 60 cm high. Observation: as in the original (425; docs/figures.md, observation). Reward:
-    the original's formula with hand-point distances. The original's condition for success, d < 20 cm, is also met by a
-    block next to the bucket. A task shifts and turns bucket and block. Both start on the table; in the original they
-    start inside the table. Here the bucket's pose and the bucket's link have the same orientation, so entries 401-404
-    and 414-417 are equal.
+    The appendix has no table for this class. The observation, size (425), is therefore that of the original code,
+    Bi-DexHands (docs/figures.md, section Observation). The reward is the original's formula, with distances from the
+    hands' points (section Hand point). In the original, success requires that bucket and block are less than 20 cm
+    apart, so a block next to the bucket is enough. Here the block must be in the upright bucket.
+
+    A task shifts and turns bucket and block. Both start on the table, which is 1 x 1 m and 60 cm high; in the original
+    they start inside the table. Here the bucket and the bucket's link have the same orientation, so the observation's
+    entries 401-404 and 414-417 are equal.
     """
 
     needs = Capacity(35, 4, 108)
@@ -98,9 +108,11 @@ class GraspAndPlace(ReachTask):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``bucket`` and ``block``: shift and yaw (n, 3).
+        """Return the values that a task fixes: the places of the objects and, in version 2, the bucket's goal.
 
-        With wide variation also return ``goal``: target pose of the bucket (n, 7).
+        * ``bucket`` and ``block``: shift and yaw from the nominal start (n, 3) each.
+        * ``goal``: goal pose of the bucket (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); only with wide
+          variation (version 2).
         """
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
 
@@ -132,9 +144,10 @@ class GraspAndPlace(ReachTask):
 
 
 def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
-    """Return ``goal``: the upright bucket's nominal pose, moved by ``shift`` (n, 2), metres, and the inverse rotation.
+    """Return a dict with the bucket's goal pose, or an empty dict if tasks have no such goal.
 
-    If ``shift`` is empty, (n, 0), return an empty dict.
+    The goal pose ``goal`` (n, 7) is upright, at the bucket's nominal position moved by ``shift`` (n, 2), metres.
+    ``goal_inverse`` (n, 4) is the inverse of its rotation. If ``shift`` is empty, (n, 0), tasks have no such goal.
     """
     if not shift.shape[1]:
         return {}
@@ -159,7 +172,11 @@ def _bucket_ghosts(state: TaskState) -> list[Ghost]:
 
 
 def _bucket_words(goal: Mapping[str, float] | None, bucket: SceneObject, wide: bool) -> str:
-    """Return the end of an instruction, which gives the bucket's goal; it is empty if the bucket has no goal."""
+    """Return the clause that adds the bucket's goal to an instruction; it is empty if the bucket has no goal.
+
+    The bucket has a goal only with ``wide`` variation, as in version 2. If ``goal`` is None, the clause does not give
+    the goal's coordinates.
+    """
     if not wide:
         return ""
     if goal is None:
@@ -183,21 +200,21 @@ _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 class PourWater(ReachTask):
     """Pour water from a kettle, held by the right hand, into a bucket, held by the left hand.
 
-    The table is 0.5 x 1 m and 40 cm high. Observation: Table 40 (428). Reward: equation 19. The kettle's point is its
-    handle, and the bucket's point is its origin.
+    Observation: Table 40 of the paper's appendix, size (428). Reward: equation 19. The right hand must reach the
+    kettle's handle, the left hand the bucket's origin. The table is 0.5 x 1 m and 40 cm high.
 
     The spout's goal is on the bucket's axis, 1 cm below the rim if the bucket stands on the table. The goal moves with
-    the bucket, but sinks by 5 cm for each cm by which the bucket's floor is lifted, to at most 20 cm below its height
-    on the table. If the goal were fixed to the bucket, spout and goal would also meet if the bucket were lifted and
-    tipped under an upright kettle. The spout only gets near the sinking goal if the kettle is tilted over the rim. At
-    less than 30 degrees of tilt no water leaves and the spout stays 3 cm away. At 40 degrees it is 2 cm away, and from
-    60 degrees on it reaches the goal. The goal's orientation is the kettle's orientation at the task's start, tilted by
-    40 degrees towards the spout.
+    the bucket. For each cm by which the bucket's floor is lifted, the goal also sinks by 5 cm relative to the bucket,
+    but never to more than 20 cm below its height for a standing bucket. If the goal were fixed to the bucket, spout and
+    goal would also meet if the bucket were lifted and tipped under an upright kettle. The spout only gets near the
+    sinking goal if the kettle is tilted over the rim. At less than 30 degrees of tilt no water leaves, and the spout
+    stays 3 cm away from the goal. At 40 degrees it is 2 cm away, and from 60 degrees on it reaches the goal. The goal's
+    orientation is the kettle's orientation at the task's start, tilted by 40 degrees towards the spout.
 
-    A task shifts and turns the bucket, and the kettle with the water. The water consists of drops of 5 mm radius
-    without friction, which no observation shows. With twelve drops, the default, physics takes 1.4 times as long as in
-    HandOver; with the paper's 30 drops it takes 2.4 times as long. The kettle has about the original's outline and
-    weighs 1.5 kg; the original's 2.46 kg are the mass of the full body.
+    A task shifts and turns the bucket, and the kettle with the water. The water consists of drops without friction, of
+    5 mm radius; observations do not show the drops. With twelve drops, the default, physics takes 1.4 times as long as
+    in HandOver; with the paper's 30 drops it takes 2.4 times as long. The kettle has about the original's outline and
+    weighs 1.5 kg. The original's body weighs at most 2.46 kg, the mass of its full hull.
     """
 
     name = "PourWater"
@@ -238,7 +255,10 @@ class PourWater(ReachTask):
     )
 
     def __init__(self, moving_base: bool | None = None, water: int = 12) -> None:
-        """Choose the base and the number of drops, 1 to 125."""
+        """Create the class with ``water`` drops of water, 1 to 125.
+
+        ``moving_base`` says whether the hands' bases move; None takes the class's default.
+        """
         super().__init__(moving_base)
         self.water = whole_number("water", water, 1, 125)  # five layers fit under the lid
         # We measured 12, 30 and 125 drops: a drop adds at most 1.8 contacts, 1 convex pair and 1.6 rows.
@@ -251,11 +271,13 @@ class PourWater(ReachTask):
             SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return the placement of kettle and bucket, and the spout's goal orientation.
+        """Return the values that a task fixes: the places of kettle and bucket, and their goals.
 
-        ``kettle`` and ``bucket``: shift and yaw (n, 3) each; ``goal_rotation``: quaternion (x, y, z, w), (n, 4);
-        ``goal_rotation_inverse``: the inverse quaternion (n, 4). With wide variation ``goal`` (n, 7) is the bucket's
-        target pose.
+        * ``kettle`` and ``bucket``: shift and yaw from the nominal start (n, 3) each.
+        * ``goal_rotation``: goal orientation of the kettle, a quaternion (x, y, z, w), (n, 4).
+        * ``goal_rotation_inverse``: the inverse of ``goal_rotation`` (n, 4).
+        * ``goal``: goal pose of the bucket (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); only with wide
+          variation (version 2).
         """
         nominal = xyzw(constant(_KETTLE.quaternion, variation))
         tilt = xyzw(constant(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0)), variation))
@@ -272,7 +294,10 @@ class PourWater(ReachTask):
                 qpos[f"water{i}/{axis}"][:, 0] = drops[:, i, k]
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
-        """Return the trough of the kettle, which reaches under the left forefinger."""
+        """Return the box around the kettle's trough, because joint noise might push the left forefinger into it.
+
+        The trough reaches under the left forefinger. ``TaskClass.obstacles`` describes the entry.
+        """
         kettle = qpos["kettle"]
         turn = xyzw(kettle[:, 3:])
         centre = kettle[:, :3] + rotate(turn, constant(_TROUGH, kettle))

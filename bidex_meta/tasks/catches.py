@@ -1,4 +1,7 @@
-"""The throwing classes, which differ in numbers only (appendix A.2.1 to A.2.5; docs/figures.md, classes)."""
+"""Task classes in which eggs are thrown or passed; the classes differ only in numbers.
+
+Sources: A.2.1 to A.2.5 of the paper's appendix, and docs/figures.md, section Classes.
+"""
 
 import math
 from typing import ClassVar
@@ -12,7 +15,7 @@ from bidex_meta.tasks.eggs import EggTask, goal_object_blocks
 class CatchUnderarm(EggTask):
     """Throw an egg underarm from one upturned palm to the other, with moving bases.
 
-    Observation: Table 10 (422). Reward: equation 2.
+    Observation: Table 10 of the paper's appendix, size (422). Reward: equation 2.
     """
 
     needs = Capacity(28, 6, 48)
@@ -34,9 +37,9 @@ class CatchUnderarm(EggTask):
 class HandOver(CatchUnderarm):
     """Pass an egg from one upturned palm to the other across a gap of 4 cm.
 
-    Observation: Table 8 (398) with fixed bases, and 422 entries with the moving bases that suites use. Reward:
-    equation 1. With moving bases the class has the scales of CatchUnderarm, because the original gives none
-    (docs/figures.md, decisions).
+    Observation: Table 8 of the paper's appendix, size (398), with fixed bases. Suites use moving bases, with which the
+    observation has 422 entries. Reward: equation 1. No source gives the scales of base forces and torques for this
+    class, so it has the scales of CatchUnderarm (docs/figures.md, section Decisions).
     """
 
     needs = Capacity(28, 8, 51)
@@ -53,8 +56,8 @@ class HandOver(CatchUnderarm):
 class TwoCatchUnderarm(CatchUnderarm):
     """Throw two eggs at once, each to the other hand.
 
-    Observation: Table 14 (446). Reward: equation 4. Both goals have the same orientation. Both eggs start with the same
-    noise and the same orientation (docs/figures.md, start noise).
+    Observation: Table 14 of the paper's appendix, size (446). Reward: equation 4. Both goals have the same orientation.
+    Both eggs start with the same orientation and the same position noise (docs/figures.md, section Start noise).
     """
 
     needs = Capacity(42, 8, 57)
@@ -75,8 +78,8 @@ class TwoCatchUnderarm(CatchUnderarm):
 class CatchOver2Underarm(EggTask):
     """Throw an egg from an upright hand down to an upturned palm.
 
-    Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m away
-    from its start.
+    Observation: Table 12 of the paper's appendix, size (422). Reward: equation 3 with alpha = 20. The episode fails
+    when the egg drops, and also when the mount of a hand is 0.1 m or more from its start.
     """
 
     needs = Capacity(17, 4, 33)
@@ -105,8 +108,8 @@ class CatchOver2Underarm(EggTask):
 class CatchAbreast(EggTask):
     """Throw an egg sideways between two palms that lie side by side, tilted towards each other.
 
-    Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m away from its
-    anchor.
+    Observation: Table 16 of the paper's appendix, size (422). Reward: equation 5. The episode fails when the egg drops,
+    and also when a palm is 0.1 m or more from a fixed point, its anchor.
     """
 
     needs = Capacity(23, 6, 45)

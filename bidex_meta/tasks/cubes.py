@@ -1,4 +1,4 @@
-"""Classes with two cubes (appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes)."""
+"""Task classes with two cubes (the paper's appendix, A.2.10, A.2.13 and A.2.16; docs/figures.md, section Classes)."""
 
 import math
 from collections.abc import Mapping
@@ -44,10 +44,11 @@ def _cubes(name: str, first: Point, second: Point) -> tuple[SceneObject, SceneOb
 
 
 class _TwoBlocks(ReachTask):
-    """Two blocks on a table that must be brought to the frozen positions ``goal1`` and ``goal2``, each (n, 3).
+    """Base of the classes in which two blocks on a table must be brought to their goal positions.
 
-    The target term of the reward is ``weight`` times (``widest`` - d), with d the sum of the blocks' distances from
-    these positions. Block 1 starts at -y and belongs to the left hand.
+    A task fixes the goal positions ``goal1`` and ``goal2``, each (n, 3). The target term of the reward is ``weight``
+    times (``widest`` - d), where d is the sum of both blocks' distances from their goals. Block 1 starts at -y and
+    belongs to the left hand.
     """
 
     weight: ClassVar[float]
@@ -63,7 +64,7 @@ class _TwoBlocks(ReachTask):
         return first, second
 
     def off_by(self, state: TaskState, tolerance: float) -> list[Error]:
-        """Return the distance of each block to its goal as an error with this tolerance."""
+        """Return one error per block: its distance from its goal, with this tolerance, both in metres."""
         return [Error(distance, tolerance) for distance in self.distances(state)]
 
     def target(self, state: TaskState) -> Tensor:
@@ -71,7 +72,7 @@ class _TwoBlocks(ReachTask):
         return self.weight * (self.widest - (first + second))
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the targets; with wide variation they have the colours of their blocks."""
+        """Return both goals to draw in pictures: green, or with wide variation in the colours of their blocks."""
         if self.rules.wide:
             colours = (_RED, _BLUE)
         else:
@@ -91,9 +92,11 @@ _PUSHED = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
 class PushBlock(_TwoBlocks):
     """Push two blocks on a table to goals 20 cm away, one block with each hand.
 
-    The table is 1 x 1 m and 60 cm high. Its friction is the mean of 0.5, the original table's friction, and 1, the
-    friction of hands and blocks. Observation: Table 26 (417). It does not show the goals. Goals are therefore fixed and
-    starts vary: a task shifts and turns each block. Reward: equation 12.
+    Observation: Table 26 of the paper's appendix, size (417). Reward: equation 12. The table is 1 x 1 m and 60 cm high.
+    Its friction is the mean of 0.5, the original table's friction, and 1, the friction of hands and blocks. The
+    observation of Table 26 does not show the goals. In version 1 the goals are therefore the same in all tasks, and a
+    task shifts and turns the start of each block. With wide variation, as in version 2, tasks have different goals, and
+    goal entries are appended to the observation.
     """
 
     needs = Capacity(38, 0, 103)
@@ -124,7 +127,11 @@ class PushBlock(_TwoBlocks):
     blocks = (*object_blocks("block1"), *_TwoBlocks.centres)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``block1``, ``block2``: shift and yaw; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
+        """Return the values that a task fixes, each (n, 3): the places of the blocks and their goals.
+
+        ``block1`` and ``block2`` are shift and yaw from the nominal start. ``goal1`` and ``goal2`` are goal positions,
+        world, metres.
+        """
         first, second = (constant(goal, variation).expand(len(variation), 3) for goal in _PUSHED)
         if self.rules.wide:
             first = first + pad(variation[:, 6:8], (0, 1))
@@ -132,7 +139,7 @@ class PushBlock(_TwoBlocks):
         return super().freeze(variation) | {"goal1": first, "goal2": second}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return the goals of both blocks with wide variation, otherwise an empty dict."""
+        """Return the observation's goal blocks, with both goal positions; an empty dict without wide variation."""
         if not self.rules.wide:
             return {}
         goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
@@ -164,12 +171,18 @@ class PushBlock(_TwoBlocks):
 class StackBlock(_TwoBlocks):
     """Stack two blocks: the left hand's block 1 on the right hand's block 2.
 
-    The table is 0.5 x 1 m and 60 cm high. Observation: Table 38 (428). The goal entries show target 1, the pose of the
-    top block: upright and with yaw 0 (the reward does not depend on rotations). Reward: equation 18. For success each
-    block must be within 3 cm of its target, and block 1 must be on block 2: one edge higher, within 1 cm, and within 3
-    cm of the vertical through its centre. A task shifts and turns both blocks, and shifts the targets by up to 3 cm
-    along x and y. The friction of a pair is the mean of the original's figures: 0.25 for blocks, 0.5 for hands and 0.2
-    for the table (docs/figures.md, friction).
+    Observation: Table 38 of the paper's appendix, size (428). Reward: equation 18. The table is 0.5 x 1 m and 60 cm
+    high. The goal entries show target 1, the pose of the top block. This pose is upright with yaw 0, but the reward
+    does not depend on rotations. For success each block must be within 3 cm of its target, and block 1 must be on block
+    2. That means that block 1 is one edge length higher, within 1 cm, and within 3 cm of the vertical through block 2's
+    centre.
+
+    A task shifts and turns both blocks, and shifts the targets by up to 3 cm along x and y. With wide variation, as in
+    version 2, a task only shifts the targets, by up to 9 cm, and chooses which block must be on top.
+
+    The original's friction is 0.25 for blocks, 0.5 for hands and 0.2 for the table, and a pair has the mean of both.
+    Here a block has 0.375 and the table 0.225, which are the means for hand and block, and for block and table
+    (docs/figures.md, section Friction).
     """
 
     needs = Capacity(43, 0, 115)
@@ -214,10 +227,12 @@ class StackBlock(_TwoBlocks):
             cube.priority = 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``block1`` and ``block2``: shift and yaw; ``goal1`` and ``goal2``: target positions; each (n, 3).
+        """Return the values that a task fixes: the places of the blocks and their targets.
 
-        In version 1 ``goal`` is the top block's target pose (n, 7). With wide variation ``upper`` (n, 1) is 1 if block
-        1 must be on top, and -1 if block 2 must be.
+        * ``block1`` and ``block2``: shift and yaw from the nominal start (n, 3); ``goal1`` and ``goal2``: target
+          positions (n, 3).
+        * ``goal``: target pose of the top block (n, 7); only without wide variation (version 1).
+        * ``upper`` (n, 1): 1 if block 1 must be on top, -1 if block 2 must; only with wide variation (version 2).
         """
         shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
         bottom = shift + constant((0.0, 0.0, 0.625), shift)
@@ -231,7 +246,10 @@ class StackBlock(_TwoBlocks):
         return frozen | {"goal1": first, "goal2": second, "upper": upper}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return target 1 and block 1's orientation; with wide variation return the targets of both blocks."""
+        """Return the observation's goal blocks, which show target 1 and the orientation of block 1.
+
+        With wide variation (version 2) they hold the target positions of both blocks, and zeros.
+        """
         if self.rules.wide:
             goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
             return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
@@ -268,12 +286,12 @@ class StackBlock(_TwoBlocks):
 class ReOrientation(TaskClass):
     """Turn the two cubes that lie on the hands to one common orientation.
 
-    There is no table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing
-    requires; in the original it lies on the right hand. Bases move as the appendix says (52 actions), with the scales
-    of CatchUnderarm. No episode ends early: the reward is negative, so that an early end would increase the return.
-
-    Both cubes start with the same random orientation 10 cm above the mounts and drop onto the palms. Fingers that the
-    start noise would push into a cube's bounding sphere are opened.
+    Observation: Table 32 of the paper's appendix, size (446). Reward: equation 15, with the angles subtracted. There is
+    no table. Cube 1 (``object1``) lies on the left hand (-y), because the reward formula pairs it with this hand; in
+    the original it lies on the right hand. The bases move, as the appendix says (52 actions), and have the scales of
+    CatchUnderarm. No episode ends early, because the reward is negative and an early end would increase the return.
+    Both cubes start with the same random orientation, 10 cm above the mounts of the hands, and drop onto the palms. If
+    the start noise would push a finger into the bounding sphere of a cube, the finger is opened.
     """
 
     needs = Capacity(26, 0, 67)
@@ -304,7 +322,10 @@ class ReOrientation(TaskClass):
             cube.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal1``, ``goal2``: poses (n, 7); ``goal1_inverse``, ``goal2_inverse``: inverse rotations (n, 4)."""
+        """Return the goal poses ``goal1`` and ``goal2`` (n, 7), and the inverses of their rotations (n, 4).
+
+        The keys of the inverses are ``goal1_inverse`` and ``goal2_inverse``.
+        """
         frozen = {}
         for i, centre in enumerate(((0.0, -0.76, 0.56), (0.0, -0.39, 0.56)), start=1):
             position = constant(centre, variation).expand(len(variation), 3)
@@ -350,7 +371,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals. With wide variation a goal is three rods along its x (red), y (green) and z (blue)."""
+        """Return both goals to draw in pictures: ellipsoids, or with wide variation rods along their axes."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]

@@ -1,4 +1,7 @@
-"""The four door classes (appendix A.2.7 and A.2.8; docs/figures.md, classes)."""
+"""Task classes with doors: four classes in which a double swing door is opened or closed.
+
+Sources: A.2.7 and A.2.8 of the paper's appendix, and docs/figures.md, section Classes.
+"""
 
 import math
 from abc import abstractmethod
@@ -41,17 +44,17 @@ _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door
 
 
 class _Door(ReachTask):
-    """A double swing door that two hands open or close.
+    """Base of the four door classes, in which two hands open or close a double swing door.
 
-    Leaf and handle at +y belong to the right hand. A task freezes the door's position along y and one start angle for
-    both leaves; an episode makes no further draws. The goal block holds the pose of the door's base, which is also the
-    object's pose. With wide variation a task also freezes the target angles of the right leaf (hinge 1) and the left
-    leaf (hinge 2). Instead of the base pose, the goal block then holds both target angles, and how far each leaf is
-    from its angle.
+    The leaf and the handle at +y belong to the right hand. A task fixes the door's position along y, and one start
+    angle for both leaves. The goal block of the observation holds the pose of the door's base, which is also the
+    object's pose. With wide variation, as in version 2, a task instead fixes the target angles of the right leaf (hinge
+    1) and the left leaf (hinge 2), and every episode draws the door's position and the start angle. The goal block then
+    holds both target angles, and how far each leaf is from its target angle.
 
-    The opening classes measure success along y: a single leaf that is open by 1.26 rad already brings the handles 0.5 m
-    apart. The Inward classes have the same door upside down, so that it swings towards the hands. Their handle points
-    lie behind the pulls that then face the hands.
+    In version 1 the opening classes measure success along y, because a single leaf that is open by 1.26 rad already
+    brings the handles 0.5 m apart in space. The Inward classes have the same door upside down, so that it swings
+    towards the hands. The points that their hands must reach lie behind the pulls that then face the hands.
     """
 
     inward: ClassVar[bool]
@@ -92,10 +95,11 @@ class _Door(ReachTask):
         return [(-x if self.inward else x, y, z) for x, y, z in _HANDLES]
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return the pose of the door and the angles of its leaves, rad.
+        """Return the values that a task fixes: the pose of the door and the angles of its leaves.
 
-        ``goal``: pose of the door's base (n, 7); ``goal_inverse``: inverse of the base's rotation (n, 4); ``angle``:
-        start angle of both leaves (n, 1). With wide variation ``leaves`` (n, 2) are the target angles.
+        * ``goal``: pose of the door's base (n, 7); ``goal_inverse``: inverse of its rotation (n, 4).
+        * ``angle``: start angle of both leaves (n, 1), rad.
+        * ``leaves``: target angles of the right and the left leaf (n, 2), rad; only with wide variation (version 2).
         """
         position = constant(_BASE, variation).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
@@ -126,7 +130,10 @@ class _Door(ReachTask):
         return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goals of the handles with wide variation, otherwise an empty list."""
+        """Return the goals to draw in pictures: the handles of leaves at their target angles.
+
+        Without wide variation (version 1) there are no target angles, and the list is empty.
+        """
         if not self.rules.wide:
             return []
         base = posed(state["object/position"], state.quaternion("object/quaternion"))
@@ -144,7 +151,7 @@ class _Door(ReachTask):
 
     @abstractmethod
     def narrow_errors(self, state: TaskState) -> list[Error]:
-        """Return the errors of a task without target angles."""
+        """Return the errors of a state for tasks that give the leaves no target angles (version 1)."""
 
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state))
@@ -224,7 +231,10 @@ class _Close(_Door):
 
 
 class DoorOpenOutward(_Open):
-    """Push a double door open. Observation: Table 20 (428). Reward: equation 7."""
+    """Push a double door open.
+
+    Observation: Table 20 of the paper's appendix, size (428). Reward: equation 7.
+    """
 
     needs = Capacity(44, 0, 96)
     name = "DoorOpenOutward"
@@ -234,9 +244,10 @@ class DoorOpenOutward(_Open):
 
 
 class DoorCloseInward(_Close):
-    """Push shut a double door that is open towards the hands. Observation: Table 20 (428). Reward: equation 8.
+    """Push shut a double door that is open towards the hands.
 
-    The hands start farther out than in the other door classes, next to the open leaves.
+    Observation: Table 20 of the paper's appendix, size (428). Reward: equation 8. The hands start farther out than in
+    the other door classes, next to the open leaves.
     """
 
     needs = Capacity(38, 0, 77)
@@ -251,7 +262,10 @@ class DoorCloseInward(_Close):
     wide_space = _closed_to(0.05)  # with larger angles the leaves would start in the hands
 
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, Point]]:
-        """Return the panel of each leaf; an open leaf ends next to the fingertips of its hand."""
+        """Return a box around the panel of each leaf, because joint noise might push fingers into it.
+
+        An open leaf ends next to the fingertips of its hand. ``TaskClass.obstacles`` describes the entries.
+        """
         door = qpos["object"]
         base = posed(door[:, :3], xyzw(door[:, 3:]))
         panels = []
@@ -261,7 +275,10 @@ class DoorCloseInward(_Close):
 
 
 class DoorOpenInward(_Open):
-    """Pull a double door open by its handles. Observation: Table 22 (428). Reward: equation 9."""
+    """Pull a double door open by its handles.
+
+    Observation: Table 22 of the paper's appendix, size (428). Reward: equation 9.
+    """
 
     needs = Capacity(40, 0, 88)
     name = "DoorOpenInward"
@@ -273,7 +290,7 @@ class DoorOpenInward(_Open):
 class DoorCloseOutward(_Close):
     """Pull shut, by its handles, a double door that is open away from the hands.
 
-    Observation: Table 22 (428). Reward: equation 10.
+    Observation: Table 22 of the paper's appendix, size (428). Reward: equation 10.
     """
 
     needs = Capacity(37, 0, 98)

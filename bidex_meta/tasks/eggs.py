@@ -42,7 +42,11 @@ def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
 
 
 def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]:
-    """Return the goal blocks of ``goal_object_blocks``."""
+    """Return the goal blocks of an observation for several objects, by name.
+
+    For each object these are the goal's pose (n, 7) and the rotation from the goal to the object (n, 4). ``numbers``
+    holds the suffixes of the objects' names, as in ``goal_object_blocks``.
+    """
     blocks: dict[str, Tensor] = {}
     for i in numbers:
         blocks |= observe_goal(state, f"object{i}/quaternion", f"goal{i}")
@@ -50,7 +54,10 @@ def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]
 
 
 def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
-    """Return poses (n, 7), position and quaternion (x, y, z, w), from positions (n, 3) and orientation draws (n, 2)."""
+    """Return goal poses (n, 7) at positions (n, 3), with random orientations that ``draws`` (n, 2) in [-1, 1] select.
+
+    A pose is a position and a quaternion (x, y, z, w). docs/figures.md, section Start noise, gives the formula.
+    """
     return torch.cat((position, random_orientation(draws[:, 0], draws[:, 1])), dim=1)
 
 
@@ -76,10 +83,11 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
 def lay_egg_on_hand(
     egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
 ) -> None:
-    """Lift an egg (or the spheroid around an object) off the palm, and open the fingers that would penetrate it.
+    """Lift an egg off the palm and open fingers, so that the egg does not penetrate the hand at the start.
 
-    The egg (n, 7) and the joint angles (n, 24) of the hand that starts at ``pose`` are written in place. Semi-axes are
-    in metres.
+    ``egg`` holds the egg's poses (n, 7), quaternion (w, x, y, z), and ``joints`` the joint angles (n, 24) of the hand,
+    rad. Both are changed in place. The hand starts at ``pose``. ``radius`` and ``half`` are the short and the long
+    semi-axis of the egg, or of the spheroid around another object, metres.
     """
     quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
@@ -93,11 +101,12 @@ def lay_egg_on_hand(
 def put_down(
     place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
 ) -> None:
-    """Write the start pose of an egg (``held`` is None) or of another object, so that it does not penetrate the hand.
+    """Write the start pose of an egg or another object, so that it does not penetrate the hand below.
 
-    An egg gets any orientation; another object lies on a broad side. The poses (n, 7) and the joint angles (n, 24) of
-    the hand below are written in place. If no joints are given, there is no hand below: then an object that extends
-    further down than an egg starts higher by the difference. Draws and noise are those of ``start_egg``.
+    ``held`` is the other object, or None for an egg. An egg gets any orientation; another object lies on a broad side.
+    The object's poses ``place`` (n, 7) and the hand's joint angles ``joints`` (n, 24), rad, are changed in place; the
+    hand starts at ``pose``. If ``joints`` is None, there is no hand below. An object that extends further down than an
+    egg then starts higher by the difference. ``draws`` and ``noise`` are those of ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -121,21 +130,22 @@ def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
 
 
 class EggTask(TaskClass):
-    """Throw each egg to a goal pose at the other hand.
+    """The base of the throwing classes: throw each egg to a goal pose at the other hand.
 
     All goals of a task have the same orientation, and all eggs have the same range of start noise.
 
     Attributes:
-        starts: Nominal start of each egg, world, metres: first an egg on the right hand, then one on the left.
-        goals: Centre of the box of each egg's goals, world, metres.
-        position_noise: Half width of the noise in the eggs' start positions, m; ``joint_noise``: half width of the
-            noise in joint angles, as a share of each joint's range.
-        lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
+        starts: Nominal start of each egg, world, metres. The first egg is on the right hand, the second on the left
+            hand.
+        goals: For each egg, the centre of the box from which tasks draw the egg's goal, world, metres.
+        position_noise: Half width of the noise in the eggs' start positions, metres.
+        joint_noise: Half width of the noise in the joint angles at the start, as a share of each joint's range.
+        lies_on_hand: Whether eggs start on a palm, whose fingers then open to make room.
         alpha: Weight of the distance in the reward, per metre.
-        floor: Height of an egg at which the episode fails, metres.
-        anchors: Anchor of each point (world, metres), by the name of the point's sensor. The episode fails when a point
-            is 0.1 m or more from its anchor.
-        numbers: Suffixes of the names of eggs and goals.
+        floor: Height in metres; the episode fails when an egg is no higher than this.
+        anchors: Fixed points (world, metres) by the name of a position sensor. The episode fails when the sensor's
+            position is 0.1 m or more from the fixed point.
+        numbers: Suffixes of the names of eggs and goals; one empty suffix for a single egg.
     """
 
     formula = "exp(-0.2 (50 d + r)), d and r the distance and the angle between egg and goal"
@@ -154,10 +164,11 @@ class EggTask(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Choose the base and the object: ``"egg"``, the name of an object in the package, or an MJCF file.
+        """Create the class with an egg or with another object that is thrown instead.
 
-        Raises BidexError if there is no such object, or if its file has no object that a hand can hold. See
-        docs/objects.md.
+        ``object`` is ``"egg"``, the name of an object in the package, or the path of an MJCF file (docs/objects.md).
+        ``moving_base`` says whether the hands' bases move; None takes the class's default. Raises BidexError if there
+        is no such object, or if its file has no object that a hand can hold.
         """
         super().__init__(moving_base)
         self.variation_space = self._goals_within(0.03)
@@ -172,7 +183,11 @@ class EggTask(TaskClass):
         return (*super().scene_key, self.held)
 
     def _goals_within(self, half: float) -> VariationSpace:
-        """Return the space of goal positions (world, metres) and the two draws of the goals' orientation."""
+        """Return the space from which tasks draw the goals: one position per egg, and one orientation for all.
+
+        Each coordinate is within ``half`` metres of the centre in ``goals``. The orientation is given by two draws in
+        [-1, 1].
+        """
         boxes = (box(f"goal{i}", centre, half) for i, centre in zip(self.numbers, self.goals, strict=True))
         return join(*boxes, orientation("goal"))
 
@@ -185,9 +200,10 @@ class EggTask(TaskClass):
                 self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``goal``, or ``goal1`` and ``goal2``: the poses of the goals (n, 7).
+        """Return the values that a task fixes: each egg's goal pose (n, 7), and the inverse of its rotation (n, 4).
 
-        Further entries, with the suffix ``_inverse``, are the inverses of the goals' rotations (n, 4).
+        The keys are ``goal`` and ``goal_inverse``, or for two eggs ``goal1``, ``goal1_inverse``, ``goal2``,
+        ``goal2_inverse``.
         """
         frozen = {}
         for k, i in enumerate(self.numbers):
@@ -209,7 +225,10 @@ class EggTask(TaskClass):
         return observe_goals(state, self.numbers)
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Return ``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d + r)), with distance d (m) and angle r."""
+        """Return one term (n,) per egg: exp(-0.2 (alpha d + r)), with d and r the distance and the angle to its goal.
+
+        d is in metres, r in radians. The keys are ``pose``, or for two eggs ``pose1`` and ``pose2``.
+        """
         terms = {}
         for i in self.numbers:
             translation, rotation = distances(state, f"object{i}", f"goal{i}")
@@ -247,7 +266,10 @@ class EggTask(TaskClass):
         return within(self.errors(state))
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return whether an egg dropped or a hand left its anchor; rewards are positive, so an early end earns less."""
+        """Return whether the episode fails, shape (n,), bool: an egg dropped, or a hand left its anchor.
+
+        All rewards are positive, so that a policy loses reward if an episode ends early.
+        """
         ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
         for name, anchor in self.anchors.items():
             point = state[name]

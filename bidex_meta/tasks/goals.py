@@ -1,4 +1,4 @@
-"""Common parts of classes with a goal pose: the frozen goal, goal blocks of the observation, goals in pictures."""
+"""Helpers for task classes with a goal pose: fixing it per task, observing it, and drawing it in pictures."""
 
 from typing import NamedTuple
 
@@ -43,6 +43,10 @@ def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Te
 
 
 def observe_goal(state: TaskState, sensor: str, goal: str = "goal") -> dict[str, Tensor]:
-    """Return the two goal blocks of a body whose orientation ``sensor`` measures."""
+    """Return the goal blocks of an observation for one body, by name.
+
+    ``<goal>_pose`` (n, 7) is the goal's pose. ``<goal>_rotation_difference`` (n, 4) is the rotation from the goal to
+    the body. ``sensor`` is the name of the sensor that measures the body's orientation.
+    """
     difference = rotation_difference(state, sensor, goal)
     return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": difference}

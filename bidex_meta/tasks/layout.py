@@ -93,10 +93,12 @@ class Layout:
 
 
 def hand_blocks(side: str, moving: bool, touch: bool = False) -> tuple[Block, ...]:
-    """Return one hand's blocks of Table 7: 199 entries, or 187 with a fixed base (no base entries, 20 actions).
+    """Return the observation blocks of one hand, as in Table 7 of the paper's appendix.
 
-    With ``touch`` 7 entries follow, one per body in ``hand.TOUCHED``. If f is the sum of the normal forces (N) of the
-    body's contacts, the entry is f / (f + TOUCH_FORCE), in [0, 1).
+    With a moving base they have 199 entries. With a fixed base they have 187: the six entries of the base are missing,
+    and there are 20 instead of 26 last actions. With ``touch`` a block of 7 entries follows, one entry per body in
+    ``hand.TOUCHED``. If f is the sum of the normal forces (N) of the body's contacts, its entry is f / (f +
+    TOUCH_FORCE), in [0, 1).
     """
 
     def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
@@ -128,7 +130,11 @@ def hand_blocks(side: str, moving: bool, touch: bool = False) -> tuple[Block, ..
 
 @checked_arguments
 def object_blocks(sensors: Text, name: Text | None = None) -> tuple[Block, ...]:
-    """Return the blocks ``<name>_...`` of a free object, pose and velocities (13 entries), from ``<sensors>/...``."""
+    """Return the observation blocks of a free object: its pose and velocities (13 entries).
+
+    The blocks read the sensors ``<sensors>/...`` and are called ``<name>_...``. Without ``name``, they are called
+    ``<sensors>_...``.
+    """
     name = name or sensors
     spin = f"{sensors}/angular_velocity"
     return (

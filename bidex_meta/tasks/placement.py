@@ -1,4 +1,4 @@
-"""Start poses of objects: a task freezes a shift and a turn from the nominal pose; an episode adds a small jitter.
+"""Start poses of objects: the nominal pose is shifted and turned per task, and jittered a little per episode.
 
 A turn (yaw) is a rotation about the vertical axis through the object's origin.
 """
@@ -24,7 +24,11 @@ DRAWS = 3
 
 @checked_arguments
 def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> VariationSpace:
-    """Return the space of an object's shift, ``<name>_x`` and ``<name>_y`` (m), and turn, ``<name>_yaw`` (rad)."""
+    """Return the variation space of an object's place: its shift along x and y, and its turn about the vertical axis.
+
+    The components are ``<name>_x`` and ``<name>_y``, at most ``shift`` metres from 0, and ``<name>_yaw``, at most
+    ``turn`` radians from 0.
+    """
     half = (shift, shift, turn)
     return VariationSpace((f"{name}_x", f"{name}_y", f"{name}_yaw"), tuple(-h for h in half), half)
 
@@ -41,10 +45,10 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
 
 
 def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
-    """Shift and turn nominal poses (n, 7), quaternion (w, x, y, z), in place.
+    """Shift and turn an object's nominal poses ``pose`` (n, 7), quaternion (w, x, y, z), in place.
 
-    ``frozen`` (n, 3) holds x and y in metres and yaw in radians. ``draws`` in [-1, 1], (n, 3), give the episodes'
-    jitter; None for a fixture, which has no jitter.
+    ``frozen`` (n, 3) holds the shift along x and y, metres, and the yaw, radians, that the tasks fix. ``draws`` (n, 3)
+    in [-1, 1] select the jitter that episodes add. A fixture has no jitter, so its ``draws`` are None.
     """
     if draws is None:
         shift = frozen
@@ -55,6 +59,10 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
 
 def place_all(names: Iterable[str], qpos: dict[str, Tensor], frozen: dict[str, Tensor], draws: Tensor) -> None:
-    """Place several objects; each uses the frozen numbers under its name and ``DRAWS`` columns of the draws."""
+    """Shift and turn several objects in ``qpos``, in place.
+
+    ``frozen`` holds the shift and yaw (n, 3) of each object under the object's name. For its jitter each object takes
+    the next ``DRAWS`` columns of ``draws``.
+    """
     for name, jitter in zip(names, draws.split(DRAWS, dim=1), strict=True):
         place(qpos[name], frozen[name], jitter)

@@ -30,17 +30,19 @@ def apart(state: TaskState, a: str, b: str) -> Tensor:
 
 
 class ReachTask(TaskClass):
-    """A class whose reward is the sum of the terms ``left``, ``right``, ``target`` and ``constant``.
+    """Base of the classes in which each hand must reach a point, such as a handle.
 
-    ``left`` is -d_left and ``right`` is -d_right, with d the distance (m) of the hand from the point it must reach.
+    The reward is the sum of the terms ``left``, ``right``, ``target`` and ``constant``. ``left`` is -d_left and
+    ``right`` is -d_right, where d_left and d_right are the distances (m) of the hands from their points.
 
     Attributes:
         table: The table of the class.
-        objects: Objects that a task shifts and turns and an episode jitters, in the order of variation and draws.
-        points: Sensors of the points that the left and the right hand must reach.
-        constant: Constant of the reward.
+        objects: Objects that a task shifts and turns, and that an episode jitters. Variations and draws have this
+            order.
+        points: Names of the sensors that give the points for the left and the right hand.
+        constant: Value of the term ``constant``.
         exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
-        terms: Names of the reward's terms, in the order in which they are summed.
+        terms: Names of the reward's terms, in the order in which they are summed; a class may leave ``constant`` out.
         ghost: Semi-axes of the ellipsoid that shows the goal in pictures, metres; None: no goal is drawn.
     """
 

@@ -37,7 +37,10 @@ def module_of(name: str) -> str:
 
 
 def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
-    """Return the name of a class among a suite's ``classes``: in suites of version 2 ``Switch-v2`` means ``Switch``."""
+    """Return the key of the class called ``name`` in ``classes``, the classes of a suite by name.
+
+    In suites of version 2 ``Switch-v2`` and ``Switch`` are the same class. An unknown name is returned as it is.
+    """
     plain = plain_name(name)
     written = list(classes)
     if name not in written and plain in written and classes[plain].rules == V2:
@@ -46,11 +49,12 @@ def name_among(name: str, classes: Mapping[str, "TaskClass"]) -> str:
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """Return the name by which ``get`` knows a class.
+    """Return a class's name in the exact spelling that ``get`` accepts.
 
-    Case is ignored in names of shipped classes, but not in ``package.module:Class``. The name may end in ``-v2``.
+    The case of names of shipped classes is ignored, but not the case of ``package.module:Class``. The name may end in
+    ``-v2``.
 
-    Raises BidexError if there is no such class; the message calls it a ``kind``.
+    Raises BidexError if there is no such class; the error message calls the class a ``kind``.
     """
     plain = plain_name(str(name))
     has_version = plain != str(name)
@@ -64,22 +68,26 @@ def resolve(name: str, kind: str = "task class") -> str:
 
 
 def with_object(name: str | None) -> dict[str, str]:
-    """Return the option of ``get`` that chooses an object, as a dict; the dict is empty for None."""
+    """Return the keyword arguments of ``get`` that choose this object: ``{"object": name}``, or ``{}`` for None."""
     return {} if name is None else {"object": name}
 
 
 def check_object(name: object) -> None:
-    """Raise BidexError for an object named ``v2``, because class names with it would mean version 2."""
+    """Raise BidexError if an object is called ``v2``.
+
+    In a class name such as ``CatchUnderarm-v2``, the ending would be read as version 2 instead of the object.
+    """
     if isinstance(name, str) and Path(name).stem.casefold() == "v2":
         raise BidexError(f"object: expected a name other than v2, which stands for a version, got {name!r}. Rename it.")
 
 
 def get(name: str, moving_base: bool | None = None, touch: bool = False, **options: float | str) -> "TaskClass":
-    """Return a task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
+    """Return an instance of a task class, which is named as ``CatchUnderarm`` or as ``package.module:Class``.
 
-    ``CatchUnderarm-v2`` has the rules of version 2. ``moving_base`` drives the hands' bases (52 actions) or fixes them
-    (40); None takes the class's default. With ``touch`` observations show touch sensors. Options are those of the
-    class, e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
+    docs/own-task.md explains the second form. The name ``CatchUnderarm-v2`` gives the class the rules of version 2.
+    With ``moving_base`` actions drive the hands' bases (52 actions); if it is False, the bases are fixed (40 actions).
+    None takes the class's default. With ``touch`` the hands have touch sensors, which observations show. ``options``
+    depend on the class, e.g. ``water=30`` for PourWater or ``object="block"`` for CatchUnderarm.
 
     Raises BidexError if there is no such class or option; the message gives the nearest name and the list.
     """

@@ -101,16 +101,17 @@ def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: NonNeg
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled scene with its addresses.
+    """The compiled MuJoCo scene of a task class, with the positions of its quantities in MuJoCo's arrays.
 
     Attributes:
-        task: The class of the scene.
+        task: The task class.
         model: The compiled model.
         sensors: Slice of each sensor in ``sensordata``, by the sensor's name.
-        qpos: Slice of each part in a start position (``qpos``, then the poses of movable fixtures), by the part's name.
-            Parts are ``right/base`` (7 numbers, moving bases only), ``right/joints`` (24), ``left/...``, each free
-            object or movable fixture (7), and each joint of an object (1), e.g. ``bottle/slide``.
-        base_bodies: Body ids of the two bases, right and left.
+        qpos: Slice of each part in a start position, by the part's name. A start position is MuJoCo's ``qpos`` followed
+            by the poses of movable fixtures. Parts are ``right/base`` (7 numbers, moving bases only), ``right/joints``
+            (24), the same for ``left``, each free object or movable fixture (7), and each joint of an object (1), e.g.
+            ``bottle/slide``.
+        base_bodies: Body ids of the right and the left base.
     """
 
     task: "TaskClass"
@@ -157,7 +158,10 @@ class Scene:
 
     @cached_property
     def dressed(self) -> mujoco.MjModel:
-        """Return the model for pictures: the same bodies and joints with hands as ``looks.dress`` shows them."""
+        """Return the model for pictures, in which skins cover the hands' colliding geoms.
+
+        Its bodies and joints are those of ``model``.
+        """
         return dressed_spec(self.task).compile()
 
     @cached_property
@@ -173,7 +177,10 @@ class Scene:
 
 
 def build_spec(task: "TaskClass") -> mujoco.MjSpec:
-    """Build the editable scene of a task class: floor, hands, objects. Only objects have weight, as in the original."""
+    """Build the editable scene of a task class, with floor, hands and objects.
+
+    As in the original, gravity acts on the objects but not on the hands.
+    """
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
     spec.option.iterations = task.solver.iterations
@@ -196,7 +203,7 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
 
 
 def dressed_spec(task: "TaskClass") -> mujoco.MjSpec:
-    """Build the editable scene of ``Scene.dressed``."""
+    """Build the editable scene of a task class for pictures, in which skins cover the hands' colliding geoms."""
     spec = build_spec(task)
     dress(spec)
     return spec

@@ -1,4 +1,4 @@
-"""The state that a task class reads: sensor values and frozen values of the class's environments."""
+"""The state that a task class reads: sensor values, and the values that the environments' tasks fix."""
 
 from collections.abc import Callable, Iterable
 
@@ -41,7 +41,10 @@ class TaskState:
         return self.once(("quaternion", name), lambda: xyzw(self[name]))
 
     def once(self, key: object, compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value that reward, success and observation share; it is computed at the first use of ``key``."""
+        """Return the result of ``compute``, which is called only for the first request of each ``key``.
+
+        This lets reward, success and observation share values of the same state.
+        """
         if key not in self._known:
             self._known[key] = compute()
         return self._known[key]

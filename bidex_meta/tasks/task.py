@@ -15,9 +15,11 @@ Entry = TypeVar("Entry")
 
 
 class Task(NamedTuple):
-    """One task class with one variation. `data` holds plain numbers; reading it runs no code.
+    """A task of a suite: a task class together with one variation.
 
-    Tasks are equal if their class and variation are equal; their sentences do not matter.
+    The variation is a vector of numbers, such as goal coordinates, in which the class's tasks differ. `data` holds
+    plain numbers; reading it runs no code. Tasks are equal if their class and variation are equal, even if their
+    instructions differ.
 
     Examples:
         >>> from bidex_meta import Benchmark
@@ -51,7 +53,10 @@ class Task(NamedTuple):
 
     @property
     def variation(self) -> np.ndarray:
-        """Return a copy of the numbers in `data`, shape (size,), float64; raise BidexError for other data."""
+        """Return the numbers in `data` as a new array, shape (size,), float64.
+
+        Raises BidexError if `data` is not bytes of float64 numbers.
+        """
         try:
             return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
         except (TypeError, ValueError):
@@ -62,7 +67,10 @@ class Task(NamedTuple):
 
 
 class ByClass(dict[str, Entry]):
-    """Entries by classes' names; in a suite of version 2 `CatchUnderarm` and `CatchUnderarm-v2` are the same key."""
+    """A dict whose keys are names of task classes.
+
+    In a suite of version 2 `CatchUnderarm` and `CatchUnderarm-v2` are the same key.
+    """
 
     def __init__(self, entries: Mapping[str, Entry], rules: Rules) -> None:
         super().__init__(entries)

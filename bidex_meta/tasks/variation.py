@@ -1,4 +1,4 @@
-"""The variation of a task: a vector of named numbers that the task freezes."""
+"""The variation of a task: a vector of named numbers, e.g. goal coordinates, in which tasks of one class differ."""
 
 from collections.abc import Collection
 from dataclasses import dataclass

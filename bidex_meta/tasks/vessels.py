@@ -1,4 +1,7 @@
-"""Classes with a pot, a bottle and a cup (appendix A.2.6, A.2.9 and A.2.11; docs/figures.md, classes)."""
+"""Task classes with a pot, a bottle and a cup: LiftUnderarm, BottleCap and SwingCup.
+
+Sources: A.2.6, A.2.9 and A.2.11 of the paper's appendix, and docs/figures.md, section Classes.
+"""
 
 import math
 from collections.abc import Mapping
@@ -29,10 +32,14 @@ _START = (0.0, -0.6, 0.465)
 class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
-    Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's start pose and up to 5
-    cm to its sides, and has the start's orientation, including yaw. In version 2 the goal is relative to the nominal
-    start instead. The pot starts at rest on the table; at the original's height it would start 1.5 cm inside the table.
-    The friction is 3 between pot and table, and 2 between the pot's wall and a hand.
+    Observation: Table 18 of the paper's appendix, size (428). Reward: equation 6.
+
+    In version 1 the goal lies 25 to 45 cm above the pot's start in the task, and up to 5 cm to each side along x and y.
+    It has the start's orientation, including yaw. In version 2 the goal is relative to the nominal start instead, and
+    varies more.
+
+    The pot starts at rest on the table; at the original's height it would start 1.5 cm inside the table. The friction
+    is 3 between pot and table, and 2 between the pot's wall and a hand.
     """
 
     needs = Capacity(36, 4, 82)
@@ -73,7 +80,11 @@ class LiftUnderarm(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``object``: shift and yaw (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return the values that a task fixes: the place of the pot and its goal.
+
+        * ``object``: shift and yaw of the pot from its nominal start (n, 3).
+        * ``goal``: goal pose of the pot (n, 7); ``goal_inverse``: inverse of its rotation (n, 4).
+        """
         placement = variation[:, :3]
         if self.rules.wide:
             placement = torch.zeros_like(placement)  # episodes draw the placement, so a goal must not depend on it
@@ -122,11 +133,13 @@ _DROPPED = 0.25
 class BottleCap(OwnObjectClass):
     """Pull the cap off a bottle with the left hand, while the bottle lies in the right hand.
 
-    Observation: Table 24 (414). Reward: equation 11, with the distances from the left hand to the cap and from the
-    right hand to the bottle, as printed. The cap's point is its centre; the original measures from a link frame near
-    the bottle's origin. Tasks shift the bottle in the palm's plane: by up to 3 cm in both directions along its axis
-    (``bottle_x``), and by up to 1 cm towards the fingers (``bottle_y``), but not the other way, because the thumb is
-    there.
+    Observation: Table 24 of the paper's appendix, size (414). Reward: equation 11. As printed, d_left is the distance
+    from the left hand to the cap, and d_right the distance from the right hand to the bottle. The cap's point is its
+    centre; the original measures from a link frame near the bottle's origin.
+
+    The bottle's start is shifted in the palm's plane. Along the bottle's axis (``bottle_x``), the shift is at most 3 cm
+    in both directions. Towards the fingers (``bottle_y``), it is at most 1 cm; the bottle is never shifted the other
+    way, because the thumb is there.
     """
 
     needs = Capacity(47, 4, 65)
@@ -161,14 +174,19 @@ class BottleCap(OwnObjectClass):
     blocks = (*object_blocks("bottle"), point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"))
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``bottle``: shift and yaw (n, 3).
+        """Return the values that a task fixes: the place of the bottle and, in version 2, the target of its cap.
 
-        With wide variation also return ``slide``: target travel of the cap (n, 1), metres.
+        * ``bottle``: shift and yaw of the bottle from its nominal start (n, 3).
+        * ``slide``: target travel of the cap along the bottle (n, 1), metres; only with wide variation (version 2).
         """
         return super().freeze(variation) | ({"slide": variation[:, 3:]} if self.rules.wide else {})
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Return, with wide variation, the cap's target travel and the difference from it; otherwise an empty dict."""
+        """Return the observation's goal blocks if the suite uses wide variation (version 2), otherwise an empty dict.
+
+        ``goal_pose`` starts with the target travel of the cap, metres. ``goal_rotation_difference`` starts with the
+        cap's present travel minus the target. All other entries of both blocks are 0.
+        """
         if not self.rules.wide:
             return {}
         slide = state.frozen["slide"]
@@ -195,7 +213,10 @@ class BottleCap(OwnObjectClass):
         return [at_least(slide, 0.03, 0.005)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return the goal of the cap on the bottle with wide variation, otherwise an empty list."""
+        """Return the goal to draw in pictures: the place of the cap, on the bottle, at its target travel.
+
+        Without wide variation (version 1) there is no target travel, and the list is empty.
+        """
         if not self.rules.wide:
             return []
         turn = state.quaternion("bottle/quaternion")
@@ -221,9 +242,10 @@ class BottleCap(OwnObjectClass):
         return state["bottle/slide"][:, 0] > 0.03
 
     def failed(self, state: TaskState) -> Tensor:
-        """Return whether the bottle fell; without wide variation return False.
+        """Return whether the bottle fell out of the hand, shape (n,), bool.
 
-        A fallen bottle ends the episode, because on the table a fast spin may add energy to it.
+        Without wide variation (version 1) the result is always False. A fallen bottle ends the episode, because on the
+        table a fast spin may add energy to it.
         """
         dropped = state["bottle/position"][:, 2] < _DROPPED
         return dropped & self.rules.wide
@@ -235,10 +257,12 @@ _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 class SwingCup(OwnObjectClass):
     """Turn a two-handled cup about the vertical axis, with one hand at each handle.
 
-    Observation: Table 28 (428). Reward: equation 13. The goal's yaw is measured from the nominal start (yaw 90
-    degrees), not from the task's start yaw. The goal is at least 72 degrees away, so no start is a success. The
-    original's goal, half a turn away, is one end of the range. The goal position is the task's start position; the
-    reward does not read it.
+    Observation: Table 28 of the paper's appendix, size (428). Reward: equation 13.
+
+    The goal's yaw is measured from the nominal start (yaw 90 degrees), not from the task's start yaw. In version 1 the
+    goal is at least 72 degrees away from every start, so no start is a success. The original's goal, half a turn away,
+    is one end of the range. The goal position is the task's start position in version 1, and the nominal start position
+    in version 2. The reward does not read the goal position.
     """
 
     needs = Capacity(34, 4, 87)
@@ -274,7 +298,11 @@ class SwingCup(OwnObjectClass):
     )
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Return ``cup``: shift and yaw (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
+        """Return the values that a task fixes: the place of the cup and its goal.
+
+        * ``cup``: shift and yaw of the cup from its nominal start (n, 3).
+        * ``goal``: goal pose of the cup (n, 7); ``goal_inverse``: inverse of its rotation (n, 4).
+        """
         position = constant(_CUP.position, variation).repeat(len(variation), 1)
         if not self.rules.wide:
             position[:, :2] += variation[:, :2]

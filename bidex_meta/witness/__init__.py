@@ -1,1 +1,4 @@
-"""Witnesses: recorded actions that solve task 0 of each class of ``Benchmark("MT20", seed=0)``, and their replay."""
+"""Witnesses, and their replay. A witness is a recording of actions that solve one task of a class.
+
+The task is task 0 of the class in ``Benchmark("MT20", seed=0)``.
+"""

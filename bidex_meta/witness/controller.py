@@ -59,10 +59,10 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Moves both hands of one environment to points, based on the environment's present state.
+    """Lets a script move both hands of one environment to points, based on the environment's present state.
 
-    ``sensor`` returns a sensor's present values, (k,) in double precision, by the sensor's name. ``frozen`` returns a
-    frozen value of the task, (k,), by the value's name.
+    ``sensor`` is a function that returns the present values (k,) of a sensor by name, in double precision. ``frozen``
+    is a function that returns a value (k,) that the task fixes, such as its goal, by name.
     """
 
     def __init__(self, task: TaskClass, sensor: Callable[[str], Tensor], frozen: Callable[[str], Tensor]):
@@ -86,21 +86,23 @@ class HandController:
         return self.episode_steps - self.taken
 
     def at(self, side: str) -> Tensor:
-        """Return the position of a hand's point, metres, (3,)."""
+        """Return the position of a hand's point (docs/figures.md, section Hand point), world, metres, (3,)."""
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
         """Set the target angles of a hand's joints, rad.
 
-        The four fingers bend by ``knuckles`` and ``middles``. ``others`` are angles by joint; all other joints get 0.
+        ``knuckles`` is the angle of the knuckles of all four fingers, and ``middles`` the angle of their middle joints.
+        ``others`` gives the angles of further joints by name. All other joints get the angle 0.
         """
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
 
     def hold(self, side: str, roll: float = 0.0, yaw: float = 0.0) -> None:
-        """Hold, from now on, a hand's start orientation turned by ``roll`` and ``yaw`` about the world's axes, rad.
+        """Set the orientation that a hand keeps from now on: its start orientation, turned by ``roll`` and ``yaw``.
 
-        A hand may turn freely until a script calls this method or ``turn``.
+        Both are angles about the world's axes, rad. A hand may turn freely until a script calls this method or
+        ``turn``.
         """
         self._held[side] = quaternion_product(quaternion_from_rpy((roll, 0.0, yaw)), self._first[side])
 
@@ -114,7 +116,11 @@ class HandController:
         self._held[side] = quaternion_product(turn, _numbers(now / now.norm()))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Move the hands' points towards ``right`` and ``left`` (world, metres), at most at ``speed`` (m/s)."""
+        """Yield the targets that move the hands' points towards ``right`` and ``left`` (world, metres).
+
+        The targets are the same for each of ``steps`` control steps; the end of the episode ends them earlier. The
+        hands move at ``speed`` (m/s) at most.
+        """
         a, b = SIDES
         for _ in range(min(steps, self.steps_left)):
             self.taken += 1
@@ -123,7 +129,11 @@ class HandController:
             yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
-        """Move the hands for one step towards ``points``: one for the right and one for the left hand."""
+        """Yield the targets of one control step, which move the hands' points towards ``points``.
+
+        The first point is for the right hand, the second for the left hand (world, metres). ``speed`` is the limit in
+        m/s.
+        """
         right, left = points
         yield from self.lead(right, left, 1, speed)
 

@@ -1,4 +1,7 @@
-"""Witnesses and scripted policies as agents, and the shifted starts from which demonstrations begin."""
+"""Agents that play recorded actions (witnesses) or scripts, and a world that starts near the start of a witness.
+
+Demonstrations are recorded with these agents, and in this world.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 
@@ -18,11 +21,11 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class OpenLoopReplay:
-    """Plays the witness of each environment's class and ignores observations.
+    """An agent that plays the witness (recorded actions) of each environment's class and ignores observations.
 
-    Classes without a witness get zero actions. ``task_names`` are the classes of the world's slots, and ``task_id`` is
-    the slot of each environment. ``actions`` is the size of the world's actions, which may be padded. ``noise`` is the
-    standard deviation of noise on actions.
+    In classes without a witness all actions are zero. ``task_names`` are the classes of the world's slots, and
+    ``task_id`` is the slot of each environment. ``actions`` is the size of the world's actions; a witness with smaller
+    actions is padded with zeros. ``noise`` is the standard deviation of noise that is added to the actions.
     """
 
     def __init__(
@@ -51,18 +54,19 @@ class OpenLoopReplay:
         return action
 
     def reset(self, env_mask: Tensor) -> None:
-        """Restart the sequences of the environments of a mask."""
+        """Begin the recorded actions again in the environments that ``env_mask`` (num_envs,) selects."""
         self._step[env_mask] = 0
 
 
 class Scripted:
-    """Plays the scripts of a world's classes; each script reads the present state of its environment.
+    """An agent that plays the scripted policies of a world's classes.
 
-    ``world`` runs on C MuJoCo and has moving bases. ``names`` are the slots whose scripts play (None: all); other slots
-    get zero actions. A script begins with its environment's episode. Because it reads the state, it corrects for
-    ``noise`` on the actions (a standard deviation) or for the actions of another policy. When a script has ended, its
-    last action is repeated. With ``misled`` each script is given the next task of the pool instead of its own task, as
-    if it had to guess the goal. Raises BidexError for a class without a script.
+    A script begins when an episode of its environment begins. It reads the present state in every step, and therefore
+    corrects for ``noise`` on the actions (a standard deviation), or for actions of another policy. When a script has
+    ended, its last action is repeated. ``world`` must run on C MuJoCo and have moving bases. ``names`` are the slots in
+    which scripts play (None: all slots); other slots get zero actions. With ``misled`` each script is given the next
+    task of the pool instead of its own task, as if it had to guess the goal. Raises BidexError for a class without a
+    script.
     """
 
     def __init__(
@@ -91,7 +95,10 @@ class Scripted:
         return (self._actions + self._noise * noise).clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Restart the scripts of the environments of a mask, which are at the start of an episode."""
+        """Begin new scripts in the environments that ``env_mask`` (num_envs,) selects.
+
+        These environments must be at the start of an episode.
+        """
         for each in self._classes:
             each.begin(env_mask)
 
@@ -113,7 +120,10 @@ class _Class:
         self._sensors = part.group.engine.sensordata[member.engine_rows]
 
     def write(self, actions: Tensor) -> None:
-        """Write the next actions of scripts that have not ended into the world's actions (N, a)."""
+        """Write the next action of each script into ``actions`` (N, a), the actions of all the world's environments.
+
+        If a script has ended, its row stays as it is.
+        """
         self._sensors = self._part.group.engine.sensordata[self._member.engine_rows].clone()
         leads = {row: lead for row, script in self._playing.items() if (lead := next(script, None)) is not None}
         if leads:
@@ -128,7 +138,11 @@ class _Class:
             self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
-        """Play the script of an environment; the state is first read when the first action is requested."""
+        """Start the script of an environment of this class, and yield its targets.
+
+        The script first reads the state when the first target is requested. ``row`` counts the environments of the
+        class.
+        """
         place = self._member.env_ids.start + row
         tasks = self._world.num_slot_tasks[self._member.slot]
         given = (self._world.task_index[place : place + 1] + self._ahead) % tasks
@@ -139,9 +153,10 @@ class _Class:
 
 
 class ShiftedStarts(PooledWorldWrapper):
-    """Environments of a class's task 0, which start near the start of the class's witness.
+    """Environments that play task 0 of one class and start near the start of the class's witness.
 
-    Objects and fixtures are shifted at random within a disc of radius ``shift``, metres.
+    A witness is a recording of actions that solve this task. Each start moves every object and fixture horizontally to
+    a random point within ``shift`` metres.
     """
 
     world: World
@@ -153,7 +168,10 @@ class ShiftedStarts(PooledWorldWrapper):
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Start episodes in all environments; the seed determines the shifts. Raises BidexError for options."""
+        """Start episodes in all environments, with shifts that ``seed`` determines.
+
+        Raises BidexError if ``options`` are given.
+        """
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)

@@ -1,4 +1,7 @@
-"""Replays of witnesses from the start at which they were found, and from starts shifted by a tenth of a millimetre."""
+"""Replay of witnesses (recorded actions that solve a task), from their own start and from slightly shifted starts.
+
+The shifts are a tenth of a millimetre; they show whether a witness succeeds by more than luck.
+"""
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -35,9 +38,10 @@ class Trace:
 
 
 def task_slot(name: str) -> Slot:
-    """Return the slot of a class with the witness's task as its only task; raises BidexError for an unknown class.
+    """Return a slot (a class with its tasks) whose only task is the one that the class's witness solves.
 
-    ``DoorOpenInward-v2`` has the rules of version 2, and a task drawn by these rules.
+    A witness is a recording of actions that solve a task. For a name such as ``DoorOpenInward-v2``, class and task have
+    the rules of version 2. Raises BidexError for an unknown class.
     """
     plain = plain_name(name)
     benchmark = Benchmark(SUITE if plain == name else f"{SUITE}-v2", seed=SEED)
@@ -48,9 +52,9 @@ def task_slot(name: str) -> Slot:
 
 
 class Simulator:
-    """``num`` environments of a class's task 0, all at the same start.
+    """``num`` environments of a class that all play the task of the class's witness, from the same start.
 
-    They have the physics and the rewards of the world, but no episodes.
+    They have the world's physics and rewards, but no episodes, so they never reset themselves.
     """
 
     def __init__(self, name: str, num: int, threads: int | None = None):
@@ -119,9 +123,9 @@ class Simulator:
         return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
 
     def led(self, script: Callable[[HandController], Actions]) -> Iterator[tuple[Tensor, Trace]]:
-        """Play a script in all environments; the script reads the means of the sensors over all environments.
+        """Play one script in all environments at once; yield the action (action_size,) and the results of each step.
 
-        Yields the actions (action_size,) and the trace of each step.
+        All environments get the same action. The script reads the mean of each sensor over the environments.
         """
         hands = HandController(self.task, lambda name: self.sensor(name).mean(0), lambda name: self.frozen(name)[0])
         actions = HandActions(self.task)
@@ -134,7 +138,7 @@ class Simulator:
         return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
 
     def frozen(self, name: str) -> Tensor:
-        """Return a frozen value of the task, (N, k), by name."""
+        """Return a value that the task fixes, such as its goal, by name, (N, k)."""
         return self._part.frozen(0, self._world.task_index)[name]
 
     def contact_depth(self, row: int) -> float:
@@ -161,14 +165,17 @@ class Replay:
 
     @property
     def deepest(self) -> float:
-        """Return the deepest contact from the unshifted start, metres; large if one body passed through another."""
+        """Return the depth of the deepest contact in the replay from the unshifted start, metres.
+
+        A large depth shows that one body passed through another.
+        """
         return float(self.depths[:, 0].max())
 
     @property
     def found(self) -> bool:
-        """Return whether the actions count as a witness.
+        """Return whether the replayed actions are good enough for a witness.
 
-        They must succeed from the start and from at least eight of ten shifted starts.
+        The replay must succeed from the unshifted start and from at least eight of the ten shifted starts.
         """
         return self.first_success is not None and self.succeeded >= 8
 
@@ -176,9 +183,10 @@ class Replay:
 def frames(
     name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
 ) -> Iterator[np.ndarray]:
-    """Yield pictures (height, width, 3) uint8 of a witness's replay.
+    """Replay a witness, which is a recording of actions, and yield pictures (height, width, 3), uint8.
 
-    ``at`` lists the numbers of played steps (0, 1, ...) after which a picture is drawn; None draws after every step.
+    A picture is drawn before the first step and after every step. If ``at`` is given, pictures are drawn only after
+    these numbers of played steps; 0 stands for the start. ``size`` may give ``width`` and ``height`` in pixels.
     """
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):
@@ -190,7 +198,7 @@ def frames(
 
 
 def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
-    """Play a witness of a class from its start and from ten shifted starts."""
+    """Play a witness (recorded actions) from its own start and from ten shifted starts, and return the results."""
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
     actions = torch.from_numpy(witness.actions)[:, None].expand(-1, simulator.num, -1)

@@ -41,7 +41,7 @@ def quantised(actions: "Tensor") -> "Tensor":
 
 
 def witness_path(name: str) -> Path:
-    """Return the path of a class's witness in this installation; nothing is written there by default."""
+    """Return the path at which this installation has the witness of a class, if there is one."""
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
@@ -66,7 +66,10 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
 
 
 def save_witness(path: Path, actions: np.ndarray, made: JsonObject) -> Path:
-    """Write a witness; actions (T, action_size) must be multiples of 1/127."""
+    """Write a witness file and return its path.
+
+    ``actions`` (T, action_size) must be multiples of 1/127. ``made`` says how the witness was made.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)
     write_atomic(path, lambda file: np.savez_compressed(file, actions=levels, made=np.array(json.dumps(made))))

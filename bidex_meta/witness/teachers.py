@@ -1,4 +1,7 @@
-"""Teachers: policies and scripts that label the states of a world with actions, whichever policy acts there."""
+"""Teachers: policies and scripts that say which actions they would take in the states of a world.
+
+These actions are labels for imitation; another policy may act in the world.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +16,11 @@ from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 
 @dataclass(frozen=True)
 class Tutor:
-    """A policy, the environments that it labels, int64 (k,), and the number of observation entries that it reads.
+    """A policy that teaches in some environments of a world.
 
-    A policy of one class reads only the first entries of a suite's observation, which padding and the task id follow.
+    ``rows`` (k,), int64, are these environments. ``width`` is the number of observation entries that the policy reads,
+    from the first on. A policy of one class does not read the padding and the task id, with which a suite's observation
+    ends.
     """
 
     policy: Agent
@@ -24,11 +29,12 @@ class Tutor:
 
 
 class Teachers:
-    """Labels the states of a world's environments with actions.
+    """An agent that returns the actions of teachers, which label the states of a world's environments for imitation.
 
-    Use it like an agent: call ``eval_action`` in every step and ``reset`` when episodes begin. ``known``: the
-    environments that have a teacher, bool (N,). ``scripted`` labels the environments in ``scripted_rows``, bool (N,);
-    each of the ``tutors`` labels its own environments. ``privileged`` shows the tutors the goals that the world hides.
+    Use it like any agent: call ``eval_action`` in every step and ``reset`` when episodes begin. Scripts (``scripted``)
+    label the environments in ``scripted_rows``, bool (N,). Each policy in ``tutors`` labels its own environments.
+    ``privileged`` is a world that shows the policies the goals that it hides in its observations. The attribute
+    ``known``, bool (N,), says which environments have a teacher.
     """
 
     def __init__(
@@ -51,11 +57,17 @@ class Teachers:
 
     @property
     def follow(self) -> bool:
-        """Return whether a teacher depends on more than the state: a script must follow each episode from its start."""
+        """Return whether a teacher must follow each episode from its start, because it is a script.
+
+        Such a teacher cannot begin in the middle of an episode.
+        """
         return self._scripted is not None
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Return the teachers' actions, (N, a) in [-1, 1], for observations (N, d); zeros outside ``known``."""
+        """Return the teachers' actions (N, a), in [-1, 1], for observations (N, d).
+
+        The actions are zero in environments without a teacher.
+        """
         if self._scripted is None:
             labels = obs.new_zeros(self._shape)
         else:
@@ -68,7 +80,7 @@ class Teachers:
         return labels
 
     def reset(self, env_mask: Tensor) -> None:
-        """Restart the teachers in the environments of a mask, which are at the start of an episode."""
+        """Tell the teachers that an episode begins in the environments that ``env_mask`` selects, bool (N,)."""
         if self._scripted is not None:
             self._scripted.reset(env_mask)
         for tutor in self._tutors:

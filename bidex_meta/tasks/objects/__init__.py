@@ -1,1 +1,1 @@
-"""Objects that a config chooses, from files of the package or of users; each is checked and may be laid on a hand."""
+"""Objects from the package or from users' MJCF files, which replace the usual objects of task classes."""

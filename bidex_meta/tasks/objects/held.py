@@ -33,12 +33,15 @@ _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
 @dataclass(frozen=True)
 class HeldObject:
-    """An object that lies on a hand; mass in kg, lengths in metres, in the object's frame.
+    """An object that can lie on a hand instead of an egg.
+
+    The mass is in kg. Lengths are in metres, in the object's frame.
 
     Attributes:
-        low: Lower corner of the box around the object's colliding geoms; ``high``: upper corner.
-        geoms: Number of the object's geoms that collide.
-        centres: Centres (k, 3) of balls whose convex hull contains these geoms; ``radii``: radii (k,) of the balls.
+        low: Lower corner of the box around the object's colliding geoms; ``high``: upper corner of the box.
+        geoms: Number of colliding geoms.
+        centres: Centres (k, 3) of balls whose convex hull contains the colliding geoms.
+        radii: Radii (k,) of these balls.
     """
 
     name: str
@@ -52,12 +55,16 @@ class HeldObject:
 
     @property
     def half_extents(self) -> Point:
-        """Return the extent from the origin along the object's axes, metres."""
+        """Return how far the object extends from its origin along each axis, in the farther direction, metres."""
         x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
     def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
-        """Add the object to a scene as a free body; arguments are those of ``SceneObject``."""
+        """Add the object to a scene as a free body.
+
+        ``name``, ``position`` (the nominal start in the world, metres) and ``colour`` are the fields of
+        ``SceneObject``.
+        """
         part = read_own(self.file)
         body = part.worldbody.first_body()
         body.name = "object"
@@ -74,17 +81,21 @@ class HeldObject:
         SceneObject(name, self.name, position, colour=colour).attach(scene, part)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
-        """Return the contact buffer sizes of a class with ``count`` such objects, given the sizes that eggs need."""
+        """Return the contact buffer sizes that a class needs if it has ``count`` of these objects instead of eggs.
+
+        ``egg`` holds the sizes that the class needs with eggs.
+        """
         # A flat face meets its support in four points, and each geom may meet palm and fingers at the same time.
         more = count * (8 + 4 * self.geoms)
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
 
     def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
-        """Lay the object on a broad side and turn it about the palm's normal at random.
+        """Lay the object on a broad side, and turn it about the palm's normal at random.
 
-        Its shortest extent is then along the normal. The object's poses (n, 7), quaternion (w, x, y, z), are written in
-        place. Draws in [-1, 1], (n, 2), give the angle and the side that faces down. If the hand's start pose is not
-        given, the palm is assumed to be level.
+        The object's shortest side is then along the palm's normal. The orientations in the object's poses ``place``
+        (n, 7), quaternion (w, x, y, z), are changed in place. ``draws`` (n, 2) in [-1, 1] select the angle, and which
+        of the two broad sides faces down. ``pose`` is the hand's start pose; without it the palm is assumed to be
+        level.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
         half = 0.5 * math.pi * draws[:, 0]
@@ -97,7 +108,10 @@ class HeldObject:
 
     @property
     def _laid(self) -> tuple[float, float, float, float]:
-        """Return the rotation (x, y, z, w) that takes the longest side to z and the shortest to y, the palm normal."""
+        """Return the rotation (x, y, z, w) that lays the object on a broad side in the hand's frame.
+
+        It turns the longest side to the z axis, and the shortest side to the y axis, which is the palm's normal.
+        """
         shortest, middle, longest = np.argsort(np.subtract(self.high, self.low), kind="stable")
         turn = np.zeros((3, 3))
         turn[0, middle] = turn[1, shortest] = turn[2, longest] = 1.0
@@ -134,10 +148,10 @@ def shelf() -> list[str]:
 
 
 def held_object(name: object) -> HeldObject | None:
-    """Return the object with a name on the shelf, or the object in an MJCF file, whose path ends in ``.xml``.
+    """Return the object that replaces the egg, or None if ``name`` is ``"egg"``.
 
-    The name's case is ignored. Return None for ``"egg"``. Raises BidexError for an unknown name, or a file without an
-    object that a hand can hold.
+    ``name`` is the name of an object in the package, in any case, or the path of an MJCF file, which ends in ``.xml``.
+    Raises BidexError for an unknown name, or for a file without an object that a hand can hold.
     """
     if not isinstance(name, str) or not name.isprintable():
         raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")

@@ -1,7 +1,7 @@
-"""Users' MJCF files with objects, which are checked before MuJoCo reads them, and outlines of their colliding geoms.
+"""Reading and checking of users' MJCF files with objects, and balls that enclose the objects' colliding geoms.
 
-MuJoCo opens any file that a model names, so only listed tags are allowed: no entities, no includes, no file from
-another folder.
+MuJoCo opens any file that a model names. Each file is therefore checked before MuJoCo reads it: it may contain listed
+tags only, no entities and no includes, and may name no file outside its own folder.
 """
 
 import math
@@ -34,10 +34,11 @@ _MOST_FRICTION = 5.0
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
-    """Read the specification in an MJCF file, with absolute paths of the files it names; ``points`` allows sensors.
+    """Check and read an MJCF file with an object.
 
-    Raises BidexError if the file cannot be read, is no MJCF, has a tag that no object needs, or names a file that is
-    missing or outside its folder.
+    The returned specification names meshes and textures by absolute paths. With ``points`` the file may contain
+    sensors. Raises BidexError if the file cannot be read, is no MJCF, has a tag that no object needs, or names a file
+    that is missing or outside its folder.
     """
     content = read_bytes(path, "an object's MJCF file", _MOST_BYTES)
     _check_tags(path, content, _TAGS | _SENSOR_TAGS if points else _TAGS)
@@ -54,7 +55,10 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
 
 
 def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Return the model of a specification; raise BidexError if MuJoCo refuses it or its numbers are not finite."""
+    """Return the compiled model of a specification that was read from ``path``.
+
+    Raises BidexError if MuJoCo cannot compile the specification, or if masses, inertias or sizes are not finite.
+    """
     try:
         model = spec.copy().compile()
     except ValueError as error:
@@ -65,7 +69,10 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def set_contacts(spec: mujoco.MjSpec) -> None:
-    """Give geoms the softness and the margin that the world's time steps need; the file's friction is kept."""
+    """Set the contact softness and the contact margin of all geoms to the values that the world's time steps need.
+
+    Friction stays as in the file.
+    """
     for geom in spec.geoms:
         geom.solref[:2] = _SOLREF
         geom.solimp[:3] = _SOLIMP
@@ -79,7 +86,10 @@ def colliding(model: mujoco.MjModel) -> int:
 
 
 def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
-    """Return the number of colliding geoms; raise BidexError for 0, more than ``most``, or too much friction."""
+    """Return the number of geoms that collide in the model of an MJCF file.
+
+    Raises BidexError if this number is 0 or above ``most``, or if a geom has too much friction.
+    """
     geoms = colliding(model)
     if not 0 < geoms <= most:
         raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Fix it.")
@@ -109,7 +119,12 @@ def _beside(path: Path, name: Path) -> Path:
 
 
 def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
-    """Refuse entities, which may expand without end, and every tag that is not allowed."""
+    """Raise BidexError if an MJCF file has content that may do harm or that an object does not need.
+
+    This check comes before MuJoCo reads the file. The file may contain ``allowed`` tags only, and not too many or too
+    deeply nested. It must not contain a document type, because entities may expand without end. Numbers must be finite,
+    and folders of assets must be relative paths.
+    """
 
     def refuse(expected: str, received: str, mend: str) -> NoReturn:
         raise BidexError(f"{path}: expected {expected}, got {received}. {mend}")
@@ -171,9 +186,10 @@ def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]
 
 
 def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres (k, 3) and radii (k,), m, body frame, of balls whose convex hull holds all colliding geoms.
+    """Return balls whose convex hull holds all colliding geoms of a body: their centres (k, 3) and radii (k,).
 
-    Ellipsoids and meshes may protrude by 1 % of their size. Without colliding geoms both arrays are empty.
+    Both are in metres, in the body's frame. Ellipsoids and meshes may protrude by 1 % of their size. If no geom
+    collides, both arrays are empty.
     """
     centres = [np.zeros((0, 3))]
     radii = [np.zeros(0)]
@@ -201,7 +217,10 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
-    """Return the centres of balls (k, 3) in the geom's frame, and the radius of the balls."""
+    """Return balls whose convex hull holds one geom: their centres (k, 3) in the geom's frame, and their common radius.
+
+    Lengths are in metres. An ellipsoid or a mesh may protrude by 1 % of its size.
+    """
     kind = mujoco.mjtGeom(model.geom_type[geom])
     size = model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:

@@ -33,7 +33,10 @@ _DEEPEST = 0.005
 
 @dataclass(frozen=True)
 class PointedObject(SceneObject):
-    """A user's object; ``asset`` is the path of its file, ``digest`` changes with the file's model."""
+    """An object from a user's MJCF file.
+
+    ``asset`` is the path of the file. ``digest`` is a hash of the compiled model, so it changes when the model changes.
+    """
 
     digest: str = ""
 
@@ -52,10 +55,11 @@ class OwnObjectClass(ReachTask):
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
-        """Choose the base and the object: the path of an MJCF file (docs/objects.md), or None for the usual object.
+        """Create the class with its usual object, or with an object from a user's MJCF file.
 
-        Raises BidexError if the file does not meet the rules of docs/objects.md, or if the object starts inside hands
-        or table.
+        ``object`` is the path of the file (docs/objects.md); None takes the usual object. ``moving_base`` says whether
+        the hands' bases move; None takes the class's default. Raises BidexError if the file does not meet the rules of
+        docs/objects.md, or if the object starts inside the hands or the table.
         """
         super().__init__(moving_base)
         (usual,) = self.objects
@@ -148,7 +152,10 @@ def _usual_model(usual: SceneObject) -> mujoco.MjModel:
 
 
 def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:
-    """Return types of joints or sizes of sensors, by name."""
+    """Return the types of all joints by name, or the sizes of all sensors by name.
+
+    ``kind`` is ``"joint"`` or ``"sensor"``.
+    """
     if kind == "joint":
         return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
     return {model.sensor(i).name: int(model.sensor_dim[i]) for i in range(model.nsensor)}

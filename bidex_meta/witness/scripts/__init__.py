@@ -45,12 +45,15 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
 
 
 def scripts_of(rules: Rules) -> dict[str, Script]:
-    """Return the scripts for a suite's rules, by the class's name."""
+    """Return the scripted policies for a suite with these rules, by the name of the task class."""
     return WIDE_SCRIPTS if rules.wide else SCRIPTS
 
 
 def script_of(task: TaskClass) -> Script:
-    """Return the script for a class and its rules; raises BidexError if there is none, or if the bases are fixed."""
+    """Return the script of a task class.
+
+    Raises BidexError if the class has no script under its rules, or if its hands have fixed bases.
+    """
     known = scripts_of(task.rules)
     if not task.moving_base:
         raise BidexError(f"Expected moving bases for the script of {task.name}, got fixed ones: moving_base=True.")

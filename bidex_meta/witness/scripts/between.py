@@ -1,7 +1,8 @@
-"""Steps of the policies that carry an object between both hands, with one hand on each side of the object along y.
+"""Steps of scripted policies in which two hands hold an object between them and carry it.
 
-Every step is a function of the present state, and changes little when the state changes little. A policy without memory
-can therefore learn the steps, and a policy that is late or drops the object can continue.
+The hands are on both sides of the object along y. Every step is a function of the present state, and changes little
+when the state changes little. A policy without memory can therefore learn the steps, and a policy that is late or drops
+the object can continue.
 """
 
 import math
@@ -15,18 +16,18 @@ from bidex_meta.witness.controller import HandController, Point, point
 
 @dataclass(frozen=True)
 class Take:
-    """The way in which two hands take an object; lengths in metres.
+    """Parameters for taking an object between two hands. Lengths are in metres.
 
     Attributes:
-        ahead: Offset along x from the object to the points of the hands; ``above``: the same along z.
+        ahead: Offset along x from the object to the points of the hands; ``above``: their offset along z.
         high: Height at which the hands' points pass over all objects.
         apart: Distance along y from the object to each hand's point before the hands close.
-        aim: Largest horizontal distance of the hands' middle from its target while the hands go down.
-        joints: One joint of each hand, right then left, that gives way when the hand presses the object.
-        free: Angles of these joints while nothing is touched, rad.
-        firm: Angles of these joints while the object is held firmly, rad. The hands close until the joints have these
-            angles. Forces on the bases would hold an object too hard or too loosely, because a newton is only 0.1 to
-            0.3 % of a base's range.
+        aim: Largest horizontal distance between the midpoint of the hands and its target while the hands go down.
+        joints: For the right and the left hand, one joint that gives way when the hand presses the object.
+        free: Angles of these two joints while the hands touch nothing, rad.
+        firm: Angles of these two joints while the hands hold the object firmly, rad. The hands close until the joints
+            have these angles. The forces on the bases are not used for this, because one newton is only 0.1 to 0.3 % of
+            a base's range, so the hold would be too hard or too loose.
     """
 
     ahead: float
@@ -43,7 +44,10 @@ _CLOSING = 0.015  # distance by which the target leads a hand that does not pres
 
 
 def ramp(value: float, first: float, last: float) -> float:
-    """Return 0 for values up to ``first``, 1 from ``last`` on, and interpolate linearly between."""
+    """Return a number that is 0 for values up to ``first``, rises linearly, and is 1 for values from ``last`` upwards.
+
+    If ``last`` is less than ``first``, the number is 1 for low and 0 for high values.
+    """
     return min(1.0, max(0.0, (value - first) / (last - first)))
 
 
@@ -51,10 +55,11 @@ class Between:
     """Both hands and an object that they take, in their present state."""
 
     def __init__(self, hands: HandController, thing: str, take: Take, room: tuple[float, float] = (1.0, 1.0)) -> None:
-        """Read the state of the hands and of the object called ``thing``.
+        """Read the present state of the hands and of the object called ``thing``.
 
-        ``room`` bounds the distances of the right and the left hand's point from the object before the hands close,
-        metres.
+        ``take`` says how the hands take the object. ``room`` limits the distances from the object to the right and the
+        left hand's point before the hands close, metres. The distances are smaller than ``take.apart`` if there is less
+        room.
         """
         right, left = (min(take.apart, each) for each in room)
         self.take = take
@@ -83,9 +88,9 @@ class Between:
         return math.hypot(float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1])
 
     def carry(self, goal: Tensor, carried: float, lowered: float) -> tuple[Point, Point]:
-        """Return the next targets of the hands' points, to take the object to ``goal`` and set it down there.
+        """Return the next target points of both hands, right then left, to take the object to ``goal`` and set it down.
 
-        The object travels at height ``carried`` and is set down at height ``lowered``.
+        The object travels at the height ``carried`` and is set down at the height ``lowered``, metres.
         """
         aside = self._get()
         held = self._bring(goal, carried, lowered)
@@ -93,7 +98,7 @@ class Between:
         return self._points(x, y, z, half)
 
     def leave(self) -> tuple[Point, Point]:
-        """Return the next targets of the hands' points, to let go of the object and then go up."""
+        """Return the next target points of both hands, right then left, to let go of the object and then go up."""
         x, y, _ = self.middle
         return self._points(x, y, self._rise(self.take.high), self.apart)
 
@@ -102,19 +107,25 @@ class Between:
         return (x, y + half, z), (x, y - half, z)
 
     def _rise(self, height: float) -> float:
-        """Return the hands' next height; they rise only when they are apart, so that they do not lift anything."""
+        """Return the next height of the hands on the way to ``height``, metres.
+
+        The hands go up only when they are apart, so that they do not lift anything.
+        """
         way = height - self.middle[2]
         apart = ramp(self.half, self.apart - 0.02, self.apart - 0.005)
         return self.middle[2] + way * (apart if way > 0.0 else 1.0)
 
     def _close(self) -> float:
-        """Return half the distance that the hands should have next, in order to hold the object firmly."""
+        """Return half of the distance that the hands should have in the next step, metres.
+
+        The hands come closer until they hold the object firmly.
+        """
         return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
-        """Return where the middle of the hands moves next to take the object, and half the hands' distance.
+        """Return the next targets, x, y and z of the hands' midpoint and half the hands' distance, to take the object.
 
-        The hands go from above to both sides of the object, then closer together until they hold it.
+        The hands go from above to both sides of the object. Then they close until they hold it.
         """
         take = self.take
         x, y, height = self.middle
@@ -126,7 +137,10 @@ class Between:
         return x + near * self.way[0], y + near * self.way[1], over, half
 
     def _bring(self, goal: Tensor, carried: float, lowered: float) -> tuple[float, float, float, float]:
-        """Return where the hands' middle moves next, over the goal and then down, and half the hands' distance."""
+        """Return the next targets, x, y and z of the hands' midpoint and half the hands' distance, to carry the object.
+
+        The hands carry the object over ``goal`` at the height ``carried``, and then lower it to the height ``lowered``.
+        """
         x, y, height = self.middle
         way = float(goal[0]) - self.thing[0], float(goal[1]) - self.thing[1]
         far = math.hypot(*way)

@@ -24,7 +24,10 @@ def pull_cap(hands: HandController) -> Actions:
     ahead = _ahead(hands)
 
     def poke(back: float) -> Point:
-        """Return where the left hand's point must be for the little finger to end ``back`` metres before the cap."""
+        """Return the left hand's point at which the little finger's tip is ``back`` metres short of the cap's centre.
+
+        The distance is measured in the direction in which the fingers point.
+        """
         cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
         return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
 
@@ -74,7 +77,10 @@ _FINGERTIP = 0.031  # distance in metres from a finger's last joint to its tip
 
 
 def swing_cup(hands: HandController) -> Actions:
-    """Pull the left handle around with the left little finger as a peg, then push it on with the right fingers."""
+    """Turn a cup to its goal angle by moving its left handle.
+
+    The left little finger, bent like a peg, first pulls the handle around. Then the right fingers push the handle on.
+    """
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
     away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
     hands.hold("left", roll=-0.5 * math.pi)
@@ -83,9 +89,10 @@ def swing_cup(hands: HandController) -> Actions:
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """Return where the left hand's point must be for the little finger to be at a place near the handle.
+        """Return the left hand's point at which its little finger is near the cup's handle.
 
-        The place is an angle ``behind`` the handle, rad, and a ``height`` above the cup's origin, metres.
+        The finger is then on a circle of this ``radius`` about the cup, at an angle ``behind`` the handle (rad), and
+        ``height`` above the cup's origin. Lengths are in metres.
         """
         return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
@@ -107,15 +114,16 @@ def swing_cup(hands: HandController) -> Actions:
 
 
 def _push_on(hands: HandController) -> Actions:
-    """Move the left hand aside, and push the handle to its goal with the right hand's straight fingers."""
+    """Push the cup's left handle to its goal with the right hand's straight fingers; the left hand moves aside."""
     x, y, z = hands.at("left").tolist()
     back = (x + 0.05, y - 0.08, z)
     aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
-        """Return where the right hand's point must be for the middle fingertip to be near the handle.
+        """Return the right hand's point at which its middle fingertip is near the cup's handle.
 
-        The fingertip is an angle ``behind`` the handle, rad, and then ``before`` metres back towards the hand.
+        The fingertip is then at an angle ``behind`` the handle (rad), but ``before`` metres short of this place along
+        x.
         """
         way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
         return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
@@ -131,9 +139,10 @@ def _push_on(hands: HandController) -> Actions:
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """Return a point on a circle about the cup, an ``angle`` behind the left handle, rad.
+    """Return a point (3,) on a horizontal circle about the cup, world, metres.
 
-    The circle lies ``height`` metres above the cup's origin.
+    The point is ``angle`` (rad) behind the left handle: clockwise from it, because the cup is turned counterclockwise.
+    ``radius`` is the circle's radius, and ``height`` is its height above the cup's origin, metres.
     """
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle

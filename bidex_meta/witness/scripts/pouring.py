@@ -32,9 +32,11 @@ def pour_water(hands: HandController) -> Actions:
     back = back / back.norm()
 
     def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
-        """Move the hands to where they hold a kettle at ``origin``.
+        """Move both hands to the places where they hold a kettle.
 
-        The hands keep a distance of ``loose`` metres from the kettle and are shifted by ``aside`` metres along x.
+        ``origin`` is the kettle's origin, and ``tilt`` its tilt towards the spout, rad. The hands keep a distance of
+        ``loose`` metres from the kettle, or press it if ``loose`` is negative. They are shifted by ``aside`` metres
+        along x.
         """
 
         def at(x: float, along: float, up: float) -> Point:
@@ -123,9 +125,12 @@ def _beside(way: Tensor, sign: float) -> float:
 
 
 def _next(way: Tensor, sign: float, half: float) -> Tensor:
-    """Return the hand's next waypoint on its way over the bucket, to the bucket's side and down.
+    """Return the next waypoint (3,) of a hand that goes over the bucket to its side, and then down.
 
-    The waypoint (3,) and the hand's present position ``way`` are offsets from the bucket, in metres.
+    ``way`` is the vector from the bucket to the hand's present position. The waypoint's x and y are offsets from the
+    bucket, too. Its z is measured from the height at which the hands clamp a bucket that stands on the table. Lengths
+    are in metres. ``sign`` is 1 for the side at +y and -1 for -y; ``half`` is the distance along y that the hand should
+    have from the bucket.
     """
     x, y, z = way.tolist()
     over = z - _UP

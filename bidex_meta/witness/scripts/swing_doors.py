@@ -16,10 +16,12 @@ _TO_PALM = 0.02
 
 @dataclass(frozen=True)
 class _Leaf:
-    """Geometry of a door leaf seen from above, for the leaf on the right hand's side, where y points outwards.
+    """Geometry of one door leaf, seen from above. Lengths are in metres.
 
-    ``hinge`` is the hinge's x and y; y is measured from the middle of the door. ``along`` and ``over`` are the offsets
-    from the hinge to the bar that faces the hands. Lengths are in metres and come from assets/objects/door.xml.
+    The values come from assets/objects/door.xml. They are written for a leaf on the right hand's side, where y points
+    outwards from the middle of the door. ``hinge`` holds the hinge's x and y. ``along`` is the distance from the hinge
+    to the handle's bar along the leaf, and ``over`` the bar's offset from the hinge perpendicular to the leaf. The bar
+    is the one that faces the hands.
     """
 
     hinge: tuple[float, float]
@@ -41,15 +43,19 @@ _OUTWARD = _Leaf((-0.0085, 0.4265), 0.3752, 0.0830), _Leaf((-0.0056, 0.4204), 0.
 
 
 def open_inward(hands: HandController) -> Actions:
-    """Put bent fingers behind the bars from the side, and pull the leaves open; the hands turn with them."""
+    """Put bent fingers behind the bars of both door handles from the side, and pull the leaves open.
+
+    The hands turn with the leaves.
+    """
     # One open and one shut leaf earn as much reward as two half-open leaves.
 
     def go(
         angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
     ) -> Actions:
-        """Move the bent fingers behind the bars of leaves opened by ``angles``, rad.
+        """Move the bent fingers behind the handle bars of leaves that are open towards the hands by ``angles``, rad.
 
-        The fingers are shifted from there towards the hinge by ``aside``, and off the leaf by ``back``, metres.
+        From there the fingers are shifted by ``aside`` metres towards the hinge, and by ``back`` metres away from the
+        leaf.
         """
         pairs = zip(_INWARD, angles, strict=True)
         at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle) for leaf, angle in pairs]
@@ -68,15 +74,18 @@ def open_inward(hands: HandController) -> Actions:
 
 
 def close_outward(hands: HandController) -> Actions:
-    """Put straight fingers between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
+    """Put straight fingers between each door leaf and the bar of its handle, and pull the leaves shut.
+
+    The hands turn with the leaves.
+    """
     # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded,
     # because more force straightens bent fingers.
     start = _angles(hands)
 
     def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Move the fingers behind the bars of leaves opened by ``angles``, or to points ``back`` metres off the bars.
+        """Move the fingers behind the handle bars of leaves that are open away from the hands by ``angles``, rad.
 
-        Angles are in rad; the leaves are open away from the hands.
+        From there the hands are shifted by ``back`` metres, against the direction in which they point.
         """
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
@@ -101,7 +110,7 @@ def close_outward(hands: HandController) -> Actions:
 
 
 def push(hands: HandController) -> Actions:
-    """Push each leaf to its angle with a fist above the bars, and then let go of it."""
+    """Push each door leaf to its target angle with a fist above the handle's bar, and then let go of the leaf."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     if inward:
@@ -115,7 +124,10 @@ def push(hands: HandController) -> Actions:
     goals = [sign * goal for goal in _goals(hands, usual)]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
-        """Move the fists to leaves opened towards the hands by ``angles``, or to points ``back`` metres off them."""
+        """Move the fists to the places where they touch leaves that are open towards the hands by ``angles``, rad.
+
+        From there the fists are shifted by ``back`` metres away from the leaves.
+        """
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
         yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 
@@ -154,9 +166,9 @@ def _lead(
     speed: float,
     height: float = _DOOR_HEIGHT,
 ) -> Actions:
-    """Move each hand to its point in ``at``, turned outwards by its yaw, rad.
+    """Move each hand to its point in ``at``, and turn it outwards by its angle in ``yaws``, rad.
 
-    A point is x, and y measured outwards from the middle of the door, metres.
+    A point is x and y in metres, where y points outwards from the middle of the door. ``height`` is the point's height.
     """
     middle = float(hands.where("object/position")[1])
     points: list[Point] = []

@@ -48,7 +48,7 @@ def _button(hands: HandController, name: str) -> Tensor:
 
 
 def _tip(hands: HandController, side: str, target: Tensor, height: float, finger: str = "mf") -> Point:
-    """Return where the hand's point must be so that a finger's last joint is ``height`` metres above a target."""
+    """Return the hand's point at which the last joint of a finger is ``height`` metres above ``target``."""
     goal = target + torch.tensor([0.0, 0.0, height], dtype=target.dtype)
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
@@ -73,7 +73,11 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Return the next target of a hand's point: an end of the pen; if ``closed``, ``way`` metres along the pen."""
+    """Bend a hand's fingers around its end of the pen, and return the next target of the hand's point.
+
+    ``closed`` rises from 0 to 1 as both hands close. At 0 the hand moves to its end of the pen; at 1 it moves ``way``
+    metres along the pen, in the direction ``along``.
+    """
     end = hands.where(_ENDS[side]).clone()
     at = hands.at(side)
     end[0] -= 0.008

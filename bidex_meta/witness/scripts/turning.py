@@ -18,7 +18,10 @@ _FOLLOW = 0.5
 
 
 def turn_cubes(hands: HandController) -> Actions:
-    """Keep each hand below its cube until the cube lies in the hand, close the hand, and turn the cube at its goal."""
+    """Let each hand follow its cube from below until the cube lies in the hand, then close the hand and turn the cube.
+
+    A closed hand brings its cube to the goal's position and orientation.
+    """
     # Noise on the bases throws cubes off open hands. A turn moves its cube, which costs as much as it earns. All values
     # are functions of the state alone, so that the script can be cloned.
     while hands.steps_left:
@@ -27,7 +30,7 @@ def turn_cubes(hands: HandController) -> Actions:
 
 
 def _next(hands: HandController, side: str) -> Point:
-    """Bend the fingers of a hand and turn it; return the next target of the hand's point."""
+    """Bend a hand's fingers, set the hand's next orientation, and return the next target of the hand's point."""
     cube, goal = _CUBES[side]
     place = hands.where(f"{cube}/position")
     knuckles = _knuckles(hands, side, "position")
@@ -56,5 +59,5 @@ def _knuckles(hands: HandController, side: str, what: str) -> float:
 
 
 def _falls(value: float, low: float, high: float) -> float:
-    """Return 1 for values up to ``low``, 0 from ``high`` on, and interpolate linearly between."""
+    """Return a number that is 1 for values up to ``low``, falls linearly, and is 0 for values from ``high`` upwards."""
     return min(1.0, max(0.0, (high - value) / (high - low)))
