@@ -115,6 +115,12 @@ class HandController:
         now = self.where(f"{side}/mount_quaternion")
         self._held[side] = quaternion_product(turn, _numbers(now / now.norm()))
 
+    def still_to_turn(self, side: str) -> float:
+        """Return the angle between a hand's orientation and the one that it holds, rad."""
+        now = _numbers(self.where(f"{side}/mount_quaternion"))
+        same = abs(sum(a * b for a, b in zip(now, self._held[side], strict=True)))
+        return 2.0 * math.acos(min(1.0, same))
+
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
         """Yield the targets that move the hands' points towards ``right`` and ``left`` (world, metres).
 

@@ -134,7 +134,7 @@ SOLVED = (
 )  # fmt: skip
 
 
-STATELESS = ("GraspAndPlace", "OpenPenCap", "StackBlock")
+STATELESS = ("BottleCap", "GraspAndPlace", "OpenPenCap", "StackBlock", "SwingCup")
 """Scripts that follow from the present state alone: a student that sees no past can do what they do."""
 
 

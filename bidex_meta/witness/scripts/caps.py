@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.utils.maths import rotate
-from bidex_meta.witness.controller import Actions, HandController, Point, beside, point
+from bidex_meta.witness.controller import Actions, HandController, Point, point
+from bidex_meta.witness.scripts.between import ramp
 
 _TIP = 0.035  # distance in metres from a finger's last joint to the part of its tip that touches a cap's axis
 # Joint angles, rad, at which the right thumb stays behind the bottle.
@@ -15,43 +16,55 @@ _HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 _FIST = {f"{finger}J{joint}": 1.4 for finger, joint in product(("FF", "MF", "RF"), (1, 2))}
 
 
+_STAYS: Point = (0.0076, -0.62, 0.4564)  # start of the right hand, in which the bottle lies, metres
+# Distances in metres between the fingertip and the cap's side along the finger: while the hand comes near, from which
+# on the finger drags the cap, and after the hand has let go.
+_BEFORE = 0.04
+_TOUCHES = 0.014
+_GONE = 0.03
+# Errors of the cap's travel in metres at which the hand lets go, and up to which it does not come back.
+_DONE = 0.0015
+_GOOD = 0.004
+
+
 def pull_cap(hands: HandController) -> Actions:
     """Press the left little finger on the cap's side, and drag the cap along the bottle by friction."""
+    # All targets are functions of the present state, so that a policy without memory can learn them.
     slide = float(hands.frozen("slide"))
-    stay = point(hands.at("right"))
     for side in ("right", "left"):
         hands.hold(side)
-    ahead = _ahead(hands)
-
-    def poke(back: float) -> Point:
-        """Return the left hand's point at which the little finger's tip is ``back`` metres short of the cap's centre.
-
-        The distance is measured in the direction in which the fingers point.
-        """
-        cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
-        return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
-
-    hands.bend("right", 0.5, 0.6, **_HELD)
     hands.bend("left", 0.0, 0.0, **_FIST)
-    first = hands.at("left") - 0.07 * ahead
-    yield from hands.lead(stay, point(first), 10, speed=0.4)
-    hands.bend("right", 0.9, 1.0, **_HELD)
-    for _ in range(27):
-        yield from hands.lead(stay, poke(0.04), speed=0.4)
-    for _ in range(11):
-        yield from hands.lead(stay, poke(-0.002), speed=0.2)
-    still = 0
     while hands.steps_left:
-        left = slide - float(hands.where("bottle/slide"))
-        if abs(left) < 0.0015 or still > 3:
-            still = still + 1
-        else:
-            still = 0
-        if still > 3:
-            yield from hands.lead(stay, point(hands.at("left") - 0.01 * ahead), speed=0.2)
-            continue
-        way = max(-0.012, min(0.012, 0.45 * left)) * _axis(hands) + 0.0012 * ahead
-        yield from hands.lead(stay, point(hands.at("left") + way), speed=0.3)
+        thumb = ramp(-float(hands.where("right/THJ4_position")), 0.7, 1.0)
+        hands.bend("right", 0.5 + 0.4 * thumb, 0.6 + 0.4 * thumb, **_HELD)
+        missing = slide - float(hands.where("bottle/slide"))
+        yield from hands.lead(_STAYS, point(hands.at("left") + _to_cap(hands, missing)), speed=0.4)
+
+
+def _to_cap(hands: HandController, missing: float) -> Tensor:
+    """Return the next way of the left hand (3,), metres: to the cap's side, along the bottle with the cap, and back.
+
+    ``missing`` is the distance by which the cap must still be pulled, metres.
+    """
+    ahead = _ahead(hands)
+    axis = _axis(hands)
+    way = hands.where("bottle/cap_position") - _TIP * ahead - hands.where("left/lfdistal_position")
+    before = float(way.dot(ahead))
+    if float(hands.where("left/MFJ2_position")) < 1.05:  # the other fingers must bend before the hand comes near
+        return -0.02 * ahead
+    if abs(missing) < _DONE or (abs(missing) < _GOOD and before > 0.02):
+        return (before - _GONE) * ahead
+    aside = way - before * ahead
+    along = float(aside.dot(axis))
+    off = float((aside - along * axis).norm())
+    near = ramp(off, 0.02, 0.01) * ramp(abs(along), 0.025, 0.015)
+    advance = aside + (before - (1.0 - near) * _BEFORE) * ahead
+    if near > 0.5:  # a fast finger would knock the bottle out of the hand
+        advance *= min(1.0, 0.025 / (float(advance.norm()) + 1e-9))
+    pressed = 0.0012 + 0.6 * max(0.0, before - 0.006)
+    drag = max(-0.016, min(0.016, 0.8 * missing)) * axis + pressed * ahead
+    touch = near * ramp(before, 0.02, _TOUCHES)
+    return touch * drag + (1.0 - touch) * advance
 
 
 def _axis(hands: HandController) -> Tensor:
@@ -73,6 +86,9 @@ _RADIUS = 0.068
 _TIP_RADIUS = 0.078
 _TOUCH = 0.2
 _FAR = 0.5
+# Places in metres at which the right hand is out of the way and the left hand rolls.
+_AWAY: Point = (0.23, 0.16, 0.7)
+_UP: Point = (-0.02, -0.24, 0.9)
 _FINGERTIP = 0.031  # distance in metres from a finger's last joint to its tip
 
 
@@ -81,68 +97,91 @@ def swing_cup(hands: HandController) -> Actions:
 
     The left little finger, bent like a peg, first pulls the handle around. Then the right fingers push the handle on.
     """
-    # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
-    away = 0.23, 0.16, float(hands.at("right")[2]) - 0.1
+    # At an ear, friction on the foot lets the cup turn on its place sooner than slide. All targets are functions of the
+    # present state, so that a policy without memory can learn them.
     hands.hold("left", roll=-0.5 * math.pi)
     hands.hold("right")
     hands.bend("right", 0.0, 0.0)
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
-
-    def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """Return the left hand's point at which its little finger is near the cup's handle.
-
-        The finger is then on a circle of this ``radius`` about the cup, at an angle ``behind`` the handle (rad), and
-        ``height`` above the cup's origin. Lengths are in metres.
-        """
-        return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
-
-    x, y, z = hands.at("left").tolist()
-    yield from hands.lead(away, (x, y - 0.05, z + 0.1), 65, speed=0.3)
-    for _ in range(30):
-        yield from hands.lead(away, peg(0.9, 0.12, 0.1), speed=0.4)
-    for _ in range(20):
-        yield from hands.lead(away, peg(0.8, _PEG, 0.1), speed=0.4)
     while hands.steps_left:
         missing = _missing(hands)
-        missing += 2.0 * math.pi if missing < -1.0 else 0.0
-        if missing < 0.05 + 0.08 * float(hands.where("cup/angular_velocity")[2]):
-            yield from hands.lead(away, peg(_TOUCH + 0.4, _PEG, 0.1), speed=0.2)
-        elif _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
-            yield from _push_on(hands)
+        if missing < -1.0:
+            missing += 2.0 * math.pi
+        if _yaw(hands) % (2.0 * math.pi) - math.pi > _FAR:
+            right = _push(hands, missing)
+            left = _aside(hands)
         else:
-            yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
+            right = _AWAY
+            left = _pull(hands, missing)
+        around, height = _peg(hands)
+        speed = 0.2 if around < 0.09 and height < 0.04 else 0.4  # a fast peg tips the cup
+        yield from hands.lead(right, left, speed=speed)
 
 
-def _push_on(hands: HandController) -> Actions:
-    """Push the cup's left handle to its goal with the right hand's straight fingers; the left hand moves aside."""
+def _peg(hands: HandController) -> tuple[float, float]:
+    """Return the peg's distance from the cup's axis and its height above the cup's origin, metres."""
+    gap = hands.where("left/lfdistal_position") - hands.where("cup/position")
+    return float(gap[:2].norm()), float(gap[2])
+
+
+def _pull(hands: HandController, missing: float) -> Point:
+    """Return the next target of the left hand: over the cup, down behind the handle, around with it, and back.
+
+    ``missing`` is the angle by which the cup must still turn, rad. The hand first waits high above its start until it
+    has rolled and the right hand has left.
+    """
+    if hands.still_to_turn("left") > 0.15 or float(hands.at("right")[0]) < 0.18:
+        return _UP
+    around, height = _peg(hands)
+
+    def way(behind: float, height: float, radius: float = _RADIUS) -> Tensor:
+        """Return the way of the peg to an angle ``behind`` the handle, rad, and a ``height`` above the cup's origin."""
+        return _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position")
+
+    if height > 0.04 or (height > 0.027 and around > 0.085):
+        over = way(0.9, 0.12, 0.1)
+        if height > 0.1:
+            down = ramp(float(over[:2].norm()), 0.03, 0.015)
+        else:
+            down = 1.0
+        return point(hands.at("left") + over + down * (way(0.8, _PEG, 0.1) - over))
+    if missing < 0.05 + 0.08 * float(hands.where("cup/angular_velocity")[2]):
+        return point(hands.at("left") + way(_TOUCH + 0.4, _PEG, 0.1))
+    return point(hands.at("left") + way(_TOUCH - min(0.3, missing), _PEG))
+
+
+def _aside(hands: HandController) -> Point:
+    """Return the next target of the left hand: away from the handle, then to a place beside the table."""
+    free = ramp(_peg(hands)[0], 0.09, 0.13)
     x, y, z = hands.at("left").tolist()
-    back = (x + 0.05, y - 0.08, z)
-    aside = (x + 0.05, y - 0.3, z + 0.1)
+    return x + 0.05 + free * (0.1 - x), y - 0.08 - free * (0.27 + y), z + free * (0.86 - z)
 
-    def tip(behind: float, before: float = 0.0) -> Point:
-        """Return the right hand's point at which its middle fingertip is near the cup's handle.
 
-        The fingertip is then at an angle ``behind`` the handle (rad), but ``before`` metres short of this place along
-        x.
-        """
-        way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
-        return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
+def _push(hands: HandController, missing: float) -> Point:
+    """Return the next target of the right hand: behind the handle, then push it on with straight fingers.
 
-    for _ in range(8):
-        yield from hands.lead(tip(_TOUCH, 0.1), back, speed=0.4)
-    for _ in range(12):
-        yield from hands.lead(tip(_TOUCH, 0.03), aside, speed=0.4)
-    while hands.steps_left and _missing(hands) > 0.05:
-        yield from hands.lead(tip(_TOUCH - min(0.3, _missing(hands))), aside, speed=0.2)
-    # The hand stays, because a cup that is touched on the way back turns further.
-    yield from hands.lead(point(hands.at("right")), aside, hands.episode_steps)
+    ``missing`` is the angle by which the cup must still turn, rad.
+    """
+    if missing < 0.05:  # the hand stays, because a cup that is touched on the way back turns further
+        return point(hands.at("right"))
+
+    def way(behind: float) -> Tensor:
+        """Return the way of the middle fingertip to an angle ``behind`` the handle, rad."""
+        found = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
+        found[0] += _FINGERTIP
+        return found
+
+    near = ramp(abs(float(way(_TOUCH)[1])), 0.04, 0.02)
+    # The last 0.12 rad overcome the friction on the cup's foot.
+    target = way(_TOUCH - near * min(0.35, missing + 0.12))
+    target[0] += 0.1 * (1.0 - near)
+    return point(hands.at("right") + target)
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """Return a point (3,) on a horizontal circle about the cup, world, metres.
+    """Return a point on a circle about the cup, an ``angle`` behind the left handle, rad.
 
-    The point is ``angle`` (rad) behind the left handle: clockwise from it, because the cup is turned counterclockwise.
-    ``radius`` is the circle's radius, and ``height`` is its height above the cup's origin, metres.
+    The circle lies ``height`` metres above the cup's origin.
     """
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle
