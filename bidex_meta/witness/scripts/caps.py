@@ -179,9 +179,10 @@ def _push(hands: HandController, missing: float) -> Point:
 
 
 def _behind(hands: HandController, angle: float, radius: float, height: float) -> Tensor:
-    """Return a point on a circle about the cup, an ``angle`` behind the left handle, rad.
+    """Return a point (3,) on a horizontal circle about the cup, world, metres.
 
-    The circle lies ``height`` metres above the cup's origin.
+    The point is ``angle`` (rad) behind the left handle: clockwise from it, because the cup is turned counterclockwise.
+    ``radius`` is the circle's radius, and ``height`` is its height above the cup's origin, metres.
     """
     cup = hands.where("cup/position")
     at = _yaw(hands) + math.pi - angle
