@@ -89,10 +89,10 @@ def swing_cup(hands: HandController) -> Actions:
     hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """Return the left hand's point at which its little finger is near the cup's handle.
+        """Return the left hand's point at which the hand's little finger is near the cup's handle.
 
-        The finger is then on a circle of this ``radius`` about the cup, at an angle ``behind`` the handle (rad), and
-        ``height`` above the cup's origin. Lengths are in metres.
+        At this point the finger is on a circle of this ``radius`` about the cup, at an angle ``behind`` the handle
+        (rad), and ``height`` above the cup's origin. Lengths are in metres.
         """
         return point(hands.at("left") + _behind(hands, behind, radius, height) - hands.where("left/lfdistal_position"))
 
@@ -120,10 +120,10 @@ def _push_on(hands: HandController) -> Actions:
     aside = (x + 0.05, y - 0.3, z + 0.1)
 
     def tip(behind: float, before: float = 0.0) -> Point:
-        """Return the right hand's point at which its middle fingertip is near the cup's handle.
+        """Return the right hand's point at which the hand's middle fingertip is near the cup's handle.
 
-        The fingertip is then at an angle ``behind`` the handle (rad), but ``before`` metres short of this place along
-        x.
+        At this point the fingertip is at an angle ``behind`` the handle (rad), but ``before`` metres short of this
+        place along x.
         """
         way = _behind(hands, behind, _TIP_RADIUS, 0.0) - hands.where("right/mfdistal_position")
         return beside(hands.at("right") + way, _FINGERTIP + before, 0.0, float((hands.at("right") + way)[2]))
