@@ -96,7 +96,7 @@ class _KnownRewards:
         return -0.5 * off.square().masked_fill(~known[:, None], 0.0)
 
     def believed(self, state: Tensor) -> Tensor:
-        """Return the means of the beliefs."""
+        """Return the means (N, n) of the beliefs."""
         return state.softmax(-1) @ self.candidates
 
 
@@ -108,7 +108,7 @@ class _ShownGoal:
         self.candidates = torch.zeros(1, world.hidden_size)
 
     def evidence(self, obs: Tensor, reward: Tensor, known: Tensor) -> Tensor:
-        """Return zeros."""
+        """Return zeros (N, 1), because the belief needs no evidence."""
         return torch.zeros(len(obs), 1)
 
     def believed(self, state: Tensor) -> Tensor:

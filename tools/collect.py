@@ -193,9 +193,9 @@ def _engine(config: Json) -> str:
 
 
 def _evaluation(evaluation: Evaluated) -> Json:
-    """Return the content of an evaluation, rounded to five significant digits and without some measures.
+    """Return the content of an evaluation, rounded to five significant digits.
 
-    Only a few measures are kept of random actions and of each shot of a meta-test.
+    The results of random actions, and of each shot of a meta-test, keep only a few measures.
     """
     content = evaluation_json(replace(evaluation, run=None))
     if "random" in content:

@@ -28,7 +28,7 @@ _QUESTIONS = ("what", "whether", "which", "who")
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence that breaks a rule."""
+    """A sentence on a page that breaks a rule of plain English."""
 
     page: str
     line: int
@@ -108,7 +108,7 @@ def _broken(sentence: str) -> Iterator[str]:
 
 
 def check(page: str, text: str) -> Iterator[Finding]:
-    """Yield all findings on a page."""
+    """Yield a finding for each rule that is broken on a page."""
     text = _blanked(_GENERATED, text)
     for line, sentence in sentences(text):
         for rule in _broken(sentence):

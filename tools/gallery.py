@@ -93,7 +93,7 @@ def moments(first_success: int, steps: int) -> list[int]:
 
 
 def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
-    """Draw the frames of a witness that ``moments`` chooses, side by side, (height, STRIP * width, 3) uint8."""
+    """Draw side by side the frames that ``moments`` selects from a witness: (height, STRIP * width, 3), uint8."""
     first = replay(name, witness).first_success  # the file's value may be from older physics
     if first is None:
         raise BidexError(f"The witness of {name} does not succeed any more. Search for a new one.")
@@ -104,7 +104,7 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
 
 
 def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
-    """Draw three tasks of version 2 side by side, (height, 3 * width, 3) uint8.
+    """Draw three tasks of version 2 side by side: (height, 3 * width, 3), uint8.
 
     The pictures show the end of an episode of the script, or the start if there is no script.
     """

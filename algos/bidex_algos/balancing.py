@@ -165,8 +165,8 @@ class Famo(Balance):
     FAMO needs no separate gradient per task. Let l_i be the loss of task i minus the smallest value that this loss can
     reach, so that l_i is not negative. The parameters descend along sum_i (z_i / l_i) grad l_i / sum_j (z_j / l_j),
     with z = softmax(xi). The logits xi descend along J^T (log l before the step - log l after the step), with
-    J = dz / dxi. Adam moves xi (``logits``, float64) with step size ``rate``. Adam's weight decay ``decay`` draws the
-    weights towards equal ones.
+    J = dz / dxi. Adam moves xi (``logits``, float64) with step size ``rate``. Adam's weight decay ``decay`` pulls the
+    logits towards 0, and so the task weights z towards equal values.
     """
 
     tag = "Policy/largest_weight"

@@ -140,7 +140,7 @@ class Learner(Contract):
         self._collected += time.perf_counter() - began
 
     def _first_observations(self) -> Tensor:
-        """Begin the training: return raw observations (N, d) of the world's first reset."""
+        """Begin training: return raw observations (N, d) of the world's first reset."""
         # The same seed gives the same weights in every process, unless machines compute differently.
         modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
         broadcast(list(chain.from_iterable(module.parameters() for module in modules)))

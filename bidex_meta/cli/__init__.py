@@ -30,7 +30,7 @@ _LONGEST = 2000  # most letters of an error message, which may quote any input
 
 
 class Command(NamedTuple):
-    """Module and summary of a subcommand."""
+    """Module and summary of a subcommand of ``bidex-meta``."""
 
     module: str
     summary: str

@@ -35,7 +35,7 @@ class PlayFlags(LookFlags):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play until the view is closed."""
+    """Play a policy in a viewer until the viewer is closed."""
     flags = parse(PlayFlags, arguments, "play")
     tour = not (flags.run or flags.task or flags.suite) and flags.policy == PlayFlags.policy
     if tour:

@@ -41,7 +41,7 @@ class PullFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Download and print the folder."""
+    """Download a policy or a data set, and print the path of its folder."""
     flags = parse(PullFlags, arguments, "pull")
     wanted = (*OF_A_RUN, *OF_DATA, SUITES, CARD)
     if flags.name.startswith(FOLDER):

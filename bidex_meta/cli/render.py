@@ -43,7 +43,7 @@ class RenderFlags(LookFlags):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render and print the file's path."""
+    """Render a picture or a film, and print the path of the file."""
     flags = parse(RenderFlags, arguments, "render")
     out = flags.out or _film_of_run(flags)
     video.check_suffix(out)

@@ -53,7 +53,7 @@ def _check_printed(flags: RunFlags) -> None:
 
 
 def _evaluate(flags: RunFlags, folder: RunFolder) -> None:
-    """Evaluate on the device of the training, write evaluation.json and print the tables."""
+    """Evaluate on the device that training used, write evaluation.json and print the tables."""
     found = flags.final.play(folder, flags.config)
     if isinstance(found, RunMetaTest):
         print_meta_test(found)

@@ -1,4 +1,4 @@
-"""``bidex-meta submit``: write a leaderboard entry, of runs or of the stored meta-test of another agent."""
+"""``bidex-meta submit``: write a leaderboard entry for runs, or for the meta-test of an agent that is not a run."""
 
 import re
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from bidex_meta.utils.validation import Few
 
 @dataclass(frozen=True)
 class SubmitFlags:
-    """Write a leaderboard entry, of runs or of the stored meta-test of another agent.
+    """Write a leaderboard entry for runs, or for the stored meta-test of an agent that is not a run.
 
     Example: bidex-meta submit runs/MT20/mtppo/* --tuning 12x1
 
     The command evaluates runs on their own tasks and on the same number of new tasks. The runs may differ only in the
-    seed. The results of a meta-test of an agent that is not a run are entered without verification.
+    seed. The results of a stored meta-test are entered without verification.
     """
 
     runs: RunPaths  # Run folders, one for each seed.

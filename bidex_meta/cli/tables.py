@@ -276,7 +276,7 @@ def _print_played(title: str, played: "PlayedTasks", brief: bool) -> None:
 
 
 def print_meta_test(found: "RunMetaTest") -> None:
-    """Print a table for each split."""
+    """Print the tables of a meta-test, one for each split."""
     subject = f"{found.algo} on {found.worlds.name}"
     if found.steps is not None:
         subject += f", {found.steps:,} steps"
@@ -338,7 +338,7 @@ def _percents(value: float, interval: Interval | None, sign: bool = False) -> st
 
 
 def percent(value: float) -> str:
-    """Format 0.123 as ``12.3 %``."""
+    """Format a share in per cent: 0.123 becomes ``12.3 %``."""
     return f"{100 * value:.1f} %"
 
 

@@ -86,7 +86,7 @@ class SB3VecEnv(vec_env.VecEnv):
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
         """Return for each environment whether a wrapper is present: True only for `Monitor`.
 
-        SB3's evaluation then takes returns and lengths from `infos`, which report whole episodes.
+        SB3's evaluation therefore takes returns and lengths from `infos`, which report whole episodes.
         """
         return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
 

@@ -150,8 +150,8 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     trial. All tasks of the split are equally likely; in a suite with `tasks_per_class = 0` the train split draws new
     tasks. `seed` chooses the tasks. It also seeds the order and the starts of the trials, until `reset(seed=...)` sets
     another seed. Without `seed`, the tasks are those of seed 0, and the trials differ from environment to environment.
-    `render_mode` is None or `"rgb_array"`. `task` is the task of the running trial, and `max_episode_steps` the length
-    of the longest trial, that is, the sum of the time limits of its episodes.
+    `render_mode` is None or `"rgb_array"`. `task` is the task of the running trial, and `max_episode_steps` is the
+    length of the longest trial, that is, the sum of the time limits of its episodes.
 
     `info` has `success`, `unscaled_reward` and `unstable`. At the end of each episode it also has `episode_success`, by
     the suite's rule. At the end of the trial it also has `is_success`, the success of the last episode. The trial

@@ -39,7 +39,7 @@ _Shown = dict[str, tuple[slice, float]]
 
 @dataclass
 class Findings:
-    """Result of a check."""
+    """Result of the check of a data set."""
 
     episodes: int = 0  # checked episodes
     steps: int = 0  # checked transitions
@@ -183,7 +183,7 @@ class _Formulas:
     def _class(self, name: str) -> TaskClass:
         """Return the task class ``name`` with fixed or with moving bases, whichever has the data's number of actions.
 
-        Raises BidexError if neither has.
+        Raises BidexError if neither class has this number of actions.
         """
         classes = [registry.get(name, base, self._touch) for base in self._bases]
         actions = self._dataset.action_size

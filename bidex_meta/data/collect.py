@@ -90,7 +90,7 @@ class Progress:
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
-    """Return the progress of a collection; raise BidexError if a part is damaged."""
+    """Return the progress of a collection; raise BidexError if a part file of the collection is damaged."""
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
     owner = _column(tables, "policy")
@@ -114,7 +114,10 @@ def _mean(column: np.ndarray) -> float:
 
 
 def resumed_writer(folder: Path) -> DatasetWriter:
-    """Return the writer of a new or interrupted collection; delete the parts after a missing part."""
+    """Return the writer of a new or interrupted collection.
+
+    If a part file of the collection is missing, all part files with higher numbers are deleted.
+    """
     names = [path.name for path in part_files.parts_of(folder / "data", 0)]
     keep = next((n for n, name in enumerate(names) if not name.endswith(f"-{n:05d}.hdf5")), len(names))
     return DatasetWriter(folder, keep=keep)
@@ -132,8 +135,8 @@ def collect(
 
     ``world`` must be in autoreset mode DISABLED. One actor acts in each round, and each of the writer's parts counts as
     a round. The last episodes may exceed ``size`` slightly. All draws follow from ``seed``. After each round ``report``
-    receives the progress and the seconds since the call. BidexError is raised if a part is damaged, or if no transition
-    can be recorded.
+    receives the progress and the seconds since the call. BidexError is raised if a part file is damaged, or if no
+    transition can be recorded.
     """
     began = time.monotonic()
     share = math.ceil(size / len(actors))
@@ -158,7 +161,7 @@ def collect(
 
 
 def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[np.ndarray, int]:
-    """Return the environments of the next round, bool (N,), and the number of episodes that each plays."""
+    """Return the environments of the next round, bool (N,), and the number of episodes that each of them plays."""
     known = now.episodes[which] > 0
     if known:
         mean = now.steps[which] / now.episodes[which]
@@ -198,7 +201,7 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
 
 @torch.no_grad()
 def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writer: DatasetWriter, seed: int) -> None:
-    """Play one round, an episode in every environment, and store the successful episodes as a part.
+    """Play one round, an episode in every environment, and store the successful episodes as one part file.
 
     ``world`` must be in autoreset mode DISABLED. ``agent_of`` makes the agent of a round from a seed, after the world
     has been reset. The round's draws follow from the collection's seed and the writer's number of parts.

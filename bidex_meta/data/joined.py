@@ -148,8 +148,8 @@ class _Columns(NamedTuple):
 class _Form:
     """Converts a data set's episodes to the form of a world's observations, actions and rewards.
 
-    ``plain`` is the size of the world's observations without the task id, and ``actions`` the number of its actions.
-    ``slots`` has the world's slot (class or listed task) for each slot of the data set.
+    ``plain`` is the size of the world's observations without the task id, and ``actions`` is the number of the world's
+    actions. ``slots`` has the world's slot (class or listed task) for each slot of the data set.
     """
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:

@@ -81,18 +81,22 @@ def hdf5() -> ModuleType:
 
 
 def parts_of(folder: Path, process: int | None = None) -> list[Path]:
-    """List the parts in a folder ``data``, of all processes or of one, sorted by process and number."""
+    """List the part files in a folder ``data``, sorted by process and number.
+
+    A part file holds a part of the data set's episodes. If ``process`` is given, only the files of this process are
+    listed.
+    """
     parts = [(int(match[1]), int(match[2]), path) for path in _files(folder) if (match := _PART.fullmatch(path.name))]
     return [path for owner, _, path in sorted(parts) if process in (None, owner)]
 
 
 def part_path(folder: Path, process: int, number: int) -> Path:
-    """Return the path of a part."""
+    """Return the path of the file with part ``number`` of the episodes that ``process`` stores in a data set."""
     return folder / f"part-{process}-{number:05d}.hdf5"
 
 
 def remove_parts(folder: Path, process: int, keep: int) -> None:
-    """Delete a process's parts with number ``keep`` or higher, and its half-written files."""
+    """Delete the part files of a process with number ``keep`` or higher, and the half-written files of this process."""
     for path in _files(folder):
         match = _PART.fullmatch(path.name)
         if (match and int(match[1]) == process and int(match[2]) >= keep) or path.name.startswith(f".part-{process}-"):
@@ -205,7 +209,7 @@ class PartWriter:
         self.steps += len(episode)
 
     def commit(self, counts: dict[str, int]) -> None:
-        """Complete the part, with counts of the left-out transitions and episodes by reason."""
+        """Complete the part file, and store ``counts`` in it: the left-out transitions and episodes by reason."""
         width = max(map(len, self._variations), default=0)
         variations = np.full((len(self._rows), width), np.nan)
         for row, variation in zip(variations, self._variations, strict=True):

@@ -32,10 +32,10 @@ class CpuEngine(Engine):
     state, and a persistent batch need not repeat these stages in its next step. If ``refresh`` is False, the stages
     are left out, as in ``mj_step``: derived values are then from before the last substep.
 
-    If a number of a simulation is not finite or too large, ``unstable`` reports the simulation. The simulation is put
-    at rest at the model's reference pose: before a step by ``_quarantine``, and within a step by MuJoCo's autoreset.
-    Without this measure, NaN would make all geoms of the simulation touch. Solving for their contacts would take up to
-    thousands of times as long as a normal step, and all other simulations would wait.
+    If any number in a simulation's state is too large, infinite or NaN, ``unstable`` reports the simulation. The
+    simulation is put at rest at the model's reference pose: before a step by ``_quarantine``, and within a step by
+    MuJoCo's autoreset. Without this measure, NaN would make all geoms of the simulation touch. Solving for their
+    contacts would take up to thousands of times as long as a normal step, and all other simulations would wait.
     """
 
     device = torch.device("cpu")

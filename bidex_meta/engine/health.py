@@ -88,7 +88,7 @@ def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
 
 
 def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Return, for each simulation in ``rows``, whether one of its numbers is not finite or too large, bool (k,).
+    """Return, for each simulation in ``rows``, whether one of its numbers is too large, infinite or NaN, bool (k,).
 
     ``rows`` (k,) are indices of simulations. ``fields`` are the tensors of the state, with one row per simulation.
     """

@@ -25,7 +25,7 @@ Wrenches = wp.array2d[wp.spatial_vector]
 
 @wp.kernel(enable_backward=False)
 def watch(qpos: Numbers, qvel: Numbers, qacc: Numbers, limit: float, limit_of_qacc: float, failed: Flags):
-    """Set ``failed`` for each world with a position, velocity or acceleration that is not finite or beyond its limit.
+    """Set ``failed`` for each world with a position, velocity or acceleration that is NaN or beyond its limit.
 
     The conditions are negated, because a comparison with NaN is false.
     """
@@ -42,7 +42,7 @@ def examine(
     time: Times, warmstart: Numbers, ctrl: Numbers, qfrc_applied: Numbers, xfrc_applied: Wrenches, limit: float,
     failed: Flags
 ):  # fmt: skip
-    """Mark worlds whose time, controls, forces or warm start are not finite or beyond the limit."""
+    """Mark worlds whose time, controls, forces or warm start are NaN or beyond the limit."""
     world, i = wp.tid()
     if not (wp.abs(time[world]) <= limit):
         failed[world] = True
@@ -119,7 +119,7 @@ def place(
     """Write a start state into each world whose mask entry is true.
 
     A row of ``start`` holds ``qpos``, then the position and quaternion of each mocap body. A row with a number that is
-    not finite or beyond the limit is not written: its world stays at the reference pose, and ``failed`` is set.
+    NaN or beyond the limit is not written: its world stays at the reference pose, and ``failed`` is set.
     """
     world = wp.tid()
     if not mask[world]:
@@ -186,7 +186,7 @@ class Guard:
             wp.copy(kept, now)
 
     def examine(self, d: mjw.Data) -> None:
-        """Mark worlds whose time, controls, applied forces, warm start or poses are not finite or out of bounds.
+        """Mark worlds whose time, controls, applied forces, warm start or poses are NaN or out of bounds.
 
         This runs before each control step, because callers write these fields and no substep checks them. In all marked
         worlds, time, controls and forces are set to zero, and mocap bodies return to the poses stored by ``keep``.

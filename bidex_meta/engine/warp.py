@@ -51,9 +51,9 @@ class WarpEngine(Engine):
     model. On a CUDA device, graphs run on the engine's own stream. They start after all work that was queued on torch's
     current stream before the call, and later work on that stream waits for them.
 
-    If a number of a world is not finite or too large, ``unstable`` reports the world, and the world is kept at the
-    model's reference pose until its reset. Without this measure, its NaNs would pass every broadphase test and fill
-    the buffers that other worlds' contacts need.
+    If any number in a world's state is too large, infinite or NaN, ``unstable`` reports the world, and the world is
+    kept at the model's reference pose until its reset. Without this measure, its NaNs would pass every broadphase test
+    and fill the buffers that other worlds' contacts need.
     """
 
     masked = True
@@ -304,7 +304,7 @@ class WarpEngine(Engine):
     def _on_device(self) -> Iterator[None]:
         """Run Warp on the engine's stream.
 
-        First that stream waits for torch's stream, and afterwards torch's stream waits for it.
+        The engine's stream first waits for torch's stream. Afterwards torch's stream waits for the engine's stream.
         """
         if self._lent is None:
             with wp.ScopedDevice(self._device):

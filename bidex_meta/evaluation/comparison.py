@@ -131,7 +131,7 @@ def _arms_of(runs: Sequence[Run]) -> set[str | None]:
 def _differing_settings(kind: Json, kinds: Iterable[Json]) -> str:
     """Return a label: the learner's name, and the settings in which groups of runs with this learner differ.
 
-    ``kind`` holds the settings of the group that is labelled, ``kinds`` those of all groups.
+    ``kind`` holds the settings of the group that is labelled, and ``kinds`` holds the settings of all groups.
     """
     others = [other for other in kinds if other["algo"] == kind["algo"]]
     texts = [kind["algo"]]

@@ -62,7 +62,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of the evaluation."""
+    """Conditions under which the results of a leaderboard entry were measured."""
 
     device: _Name
     engine: Literal["auto", "c", "warp"]

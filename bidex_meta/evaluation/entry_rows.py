@@ -18,7 +18,7 @@ _Interval = tuple[Fraction, Fraction]
 
 @dataclass(frozen=True)
 class ClassRow:
-    """The results of a class."""
+    """The results of a class in a leaderboard entry."""
 
     success: Fraction
     interval: _Interval | None  # 95 % interval of the mean over runs and tasks; None with a single episode
@@ -27,7 +27,7 @@ class ClassRow:
 
 
 def class_row(solved: list[list[int]], episodes: int) -> Json:
-    """Return the results of a class for JSON.
+    """Return the results of a class in a leaderboard entry, ready for JSON.
 
     ``solved`` has the number of successes of each run and task, in ``episodes`` episodes of the task.
     """

@@ -19,7 +19,7 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class Look(TypedDict, total=False):
-    """Arguments of ``render``."""
+    """Size and camera of a picture: the arguments of ``RenderedWorld.render``."""
 
     width: int
     height: int

@@ -39,7 +39,7 @@ class Reference:
 
     @property
     def floor(self) -> float:
-        """Return the return that scores 0: the better return of random actions and zero actions."""
+        """Return the floor: the better return of random actions and zero actions, which gets the score 0."""
         if self.zero is None:
             return self.random
         return max(self.random, self.zero)
@@ -60,9 +60,9 @@ def counted_returns(
     """Correct the returns (episodes,) of a class's episodes so that breaking physics gains nothing.
 
     A ``broken`` episode (bool) ends early, which would be an advantage if rewards are negative. Such an episode
-    therefore counts with the return of random actions. If that is unknown, it counts with the return of the worst
-    ``finished`` episode (n,) of this policy and of the policies that are compared with it. If the episode's own return
-    is lower, it is not changed.
+    therefore counts with the return of random actions. If the return of random actions is unknown, the episode counts
+    with the return of the worst ``finished`` episode (n,) of this policy and of the policies that are compared with it.
+    An episode whose own return is lower keeps its own return.
     """
     if reference is None:
         others = finished

@@ -87,7 +87,7 @@ def coverage_lines(spread: Json) -> list[str]:
 
 
 def findings_lines(findings: Findings) -> list[str]:
-    """Return lines of text about the result of a check."""
+    """Return lines of text about the result of the check of a data set."""
     lines = [f"{findings.episodes:,} episodes of {findings.steps:,} transitions checked, {findings.count:,} wrong."]
     for name, count in findings.recomputed.items():
         lines.append(f"{name}: {count:,} rewards computed again, largest difference {findings.largest[name]:.2g}")

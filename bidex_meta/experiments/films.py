@@ -37,7 +37,7 @@ class Film:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Return width and height."""
+        """Return the width and the height of the film, or of each tile, in pixels."""
         width = self.width or (240 if self.tiled else 640)
         return width, self.height or width * 3 // 4
 

@@ -28,7 +28,7 @@ def checkpoint(folder: RunFolder, which: str = "last", noted: bool = False) -> t
     run's folder of checkpoints.
 
     A line is logged if the run was made with other versions than those of this installation. The caller sets ``noted``
-    if such a line was logged before; it is then left out.
+    if such a line was logged before; in this case the line is left out.
     """
     loaded = _loaded(folder, which)
     if not noted:

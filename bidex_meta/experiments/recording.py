@@ -253,8 +253,8 @@ def _episodes(settings: RecordConfig, kind: str) -> _Collection:
 def _report(size: int, before: int, now: Progress, seconds: float) -> None:
     """Log the progress of a recording, after each round of episodes.
 
-    ``size`` is the requested number of transitions, and ``before`` the number of transitions when this process began.
-    ``seconds`` is the time since then.
+    ``size`` is the requested number of transitions. ``before`` is the number of transitions when this process began,
+    and ``seconds`` is the time since this moment.
     """
     done = sum(now.steps)
     speed = (done - before) / max(seconds, 1e-9)

@@ -1,4 +1,4 @@
-"""Recording of a run's transitions (``RunConfig.record``) by a collector around the world."""
+"""Recording of a run's transitions (``RunConfig.record``): a collector wraps the run's world and stores them."""
 
 from pathlib import Path
 

@@ -165,7 +165,7 @@ def check(path: Path, folders: Sequence[RunFolder], device: str) -> Check:
 def submit_agent(
     file: Path, out: Path, *, name: str | None, track: AdaptationTrack | None, tuning: tuple[int, int]
 ) -> Path:  # fmt: skip
-    """Write the leaderboard's entry of a meta-test of somebody's agent, and return the entry's path.
+    """Write a leaderboard entry for the meta-test of a user's own agent, and return the entry's path.
 
     We do not have the agent, so its results are not verified.
 
@@ -311,7 +311,7 @@ def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, de
 
 
 def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
-    """Open the suite of a run twice: with the tasks that the run was trained on, and with as many new tasks.
+    """Open the suite of a run twice: with the tasks that the run was trained on, and with the same number of new tasks.
 
     ``seed`` draws the new tasks.
     """
@@ -342,7 +342,7 @@ def judged(run: SubmittedRun, worlds: Worlds, episodes: int, seed: int) -> _Play
 def _adapted(
     run: SubmittedRun, worlds: Worlds, adaptation: Adaptation, split: str, episodes: int, seed: int
 ) -> _Played:
-    """Play a meta-test."""
+    """Play the meta-test of a run's policy on one split."""
     # An agent that adapts to its own episodes is evaluated in the environments in which it explored.
     rollouts = episodes if adaptation.is_per_environment else None
     options = Options(shots=SHOTS, tasks=TASKS, episodes=episodes, rollouts=rollouts, seed=seed)

@@ -43,8 +43,8 @@ _FACTS = ("suite", "algorithm", "train_tasks", "steps", "start", "scratch", "see
 class _Transfer:
     """A pretrained run, and the runs that then learned the held-out classes of its suite.
 
-    ``transferred`` holds the runs that started from the pretrained policy, and ``scratch`` the runs that started from
-    scratch. Both map a class to its runs, sorted by seed.
+    ``transferred`` holds the runs that started from the pretrained policy, and ``scratch`` holds the runs that started
+    from scratch. Both dicts map a class to its runs, sorted by seed.
     """
 
     run: SubmittedRun

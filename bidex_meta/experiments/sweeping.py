@@ -38,7 +38,7 @@ _STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
 
 
 class State(NamedTuple):
-    """Progress of a run."""
+    """Progress of one run of a sweep."""
 
     run: PlannedRun
     state: Literal["done", "runs", "failed", "left"]
@@ -79,7 +79,7 @@ def sweep(plan: SweepPlan, *, workers: Few | None = None, cores: str | None = No
     Args:
         plan: ``SweepPlan.of(folder, configs)``, or ``SweepPlan.read(file)`` for a study file.
         workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
-        cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
+        cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first cores.
 
     Raises BidexError for bad values in any run, before the first one begins, and if another sweep works in the folder.
     A run that fails is logged and counted in the result.
@@ -284,8 +284,8 @@ class QueuedJob(Job):
 def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
     """Run all runs in order, one at a time on each core; return the number of failed runs.
 
-    A failed run stops only the runs that start from it. A run that a signal stopped counts as failed. After Ctrl-C or
-    SIGTERM of the sweep each run saves and stops.
+    A failed run stops only the runs that start from it. A run that a signal stopped counts as failed. If the sweep
+    receives SIGTERM or Ctrl-C, each run saves and stops.
     """
     waiting = list(runs)
     failed = dict[Path | None, str]()

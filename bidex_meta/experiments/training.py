@@ -40,7 +40,7 @@ Checkpoint = tuple[Json, int]  # a state and its environment steps
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a training, passed to the callback of :func:`train` in process 0."""
+    """An event during training, passed to the callback of :func:`train` in process 0."""
 
     kind: Literal["started", "iteration", "ended"]
     folder: RunFolder
@@ -51,7 +51,7 @@ class Event:
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal ended the training early. The run has saved and can be resumed."""
+    """A signal ended training early. The run has saved and can be resumed."""
 
     def __init__(self, folder: RunFolder, step: int, number: int) -> None:
         super().__init__(f"{signal.Signals(number).name} after {step:,} steps")
@@ -82,8 +82,8 @@ def train(
         on_event: Called when training starts, after each iteration, and when training has ended.
         show_progress: Whether a table, or a line every few seconds, is printed on stderr.
 
-    Raises BidexError for bad input, before anything is written; Stopped if a signal ended the training, after the run
-    has saved; FloatingPointError if the training diverged; LostProcess if another process is gone.
+    Raises BidexError for bad input, before anything is written; Stopped if a signal ended training, after the run has
+    saved; FloatingPointError if training diverged; LostProcess if another process is gone.
     """
     distributed.init_from_environment()
     folder = None
@@ -110,7 +110,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Run:
-    """The parts of a training in this process."""
+    """The objects with which one process trains a run: the run's folder, its learner and its worlds."""
 
     folder: RunFolder
     kind: LearnerKind
@@ -140,7 +140,7 @@ def _checked(config: AnyConfig | None, old: RunFolder | None) -> AnyConfig:
 
 
 def _lock(config: AnyConfig, old: RunFolder | None, new: Path | None, held: contextlib.ExitStack) -> None:
-    """Lock the run's folder, and raise an error at once for configs that would fail in the middle of the training."""
+    """Lock the run's folder, and raise an error at once for configs that would fail in the middle of training."""
     kind = learner_kind(config.algo, config.task)
     worlds = open_worlds(config.to_json())
     if launch().rank == 0:
@@ -227,8 +227,8 @@ def _begin(
 def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
     """Return the learner of a config, with its data sets, demonstrations and teachers.
 
-    If the training is ``fresh``, that is, not resumed, the learner starts from the policy of ``config.start_from``, if
-    that is set.
+    If the run is ``fresh``, that is, not resumed, the learner starts from the policy of ``config.start_from``, if that
+    is set.
     """
     sources = _sources(config, worlds, world)
     # A learner of another package that takes no sources may lack this argument.
@@ -271,7 +271,7 @@ def _new_folder(config: AnyConfig, path: Path | None, worlds: Worlds, held: cont
 def _train(
     run: _Run, config: AnyConfig, loaded: Checkpoint | None, on_event: Callable[[Event], None] | None, progress: bool
 ) -> int:
-    """Train to the end; return the signal that ended the training early, or 0."""
+    """Train to the end; return the signal that ended training early, or 0."""
     folder = run.folder
     learner = run.learner
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
@@ -345,7 +345,7 @@ def _nothing_left(config: AnyConfig, steps: int, minutes: float) -> str:
 
 
 def _early_end(config: AnyConfig) -> Callable[[Mapping[str, float]], bool] | None:
-    """Return a function that checks whether the metrics of an iteration reach a limit that ends the training early.
+    """Return a function that checks whether the metrics of an iteration reach a limit that ends training early.
 
     Returns None if the config sets no limit of return, success or score.
     """

@@ -50,7 +50,7 @@ class Cell:
 
 
 class Arm(NamedTuple):
-    """An initial policy of training: the policy of a run, or a fresh policy."""
+    """A policy from which training starts: the policy of a run, or a fresh policy."""
 
     name: str
     path: Path | None  # the run's folder; None: a fresh policy

@@ -85,7 +85,7 @@ def transfer(
             initial policy.
         final: The evaluation at the end of every run.
         workers: Number of simultaneous runs, each on its own core; None: 1, or one for each of ``cores``.
-        cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first ones.
+        cores: Cores that runs are bound to (Linux), such as ``1`` or ``0,2-3``; None: the first cores.
 
     Raises BidexError for bad input, before anything is written. A run that fails is logged and counted in the result.
     """

@@ -149,7 +149,7 @@ def _where(device: str, engine: str | None, then: Conditions, config: AnyConfig)
 
 
 def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
-    """Return the checkpoint that was evaluated."""
+    """Return the run's checkpoint at ``steps`` environment steps, with which the recorded evaluation was made."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         if there:

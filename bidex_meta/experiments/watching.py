@@ -1,4 +1,4 @@
-"""Evaluations, films and the best policy of a learner during training. They do not influence the training."""
+"""Evaluations, films and the best policy of a learner during training. None of these influences training."""
 
 import math
 import random
@@ -136,7 +136,7 @@ class Watch:
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
 
     def _film(self) -> None:
-        """Film an environment of each class side by side; report a failure without ending the training."""
+        """Film an environment of each class side by side; report a failure without ending training."""
         try:
             if "film" not in self._worlds:
                 worlds = open_worlds({**self._config.to_json(), "device": "cpu", "engine": "auto"})
@@ -175,7 +175,7 @@ def undisturbed(device: torch.device) -> Iterator[None]:
 
 
 def _metrics(found: Evaluation) -> dict[str, float]:
-    """Return metrics for each class and means over classes."""
+    """Return the metrics of an evaluation, for each class and as means over classes."""
     classes = found.classes
     metrics = {
         "Eval/success_rate": float(np.mean([result.success for result in classes.values()])),

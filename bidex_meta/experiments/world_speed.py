@@ -17,10 +17,10 @@ def world_speed(
 ) -> Json:  # fmt: skip
     """Measure environment steps per second, for a suite's complete world and for its physics engines alone.
 
-    Both are measured in turns within one process, ``repeats`` times. The results are medians over these; ``ratio`` is
-    the median of the ratios. The bare engines belong to a second world, with the same states, controls, threads,
-    sensors and substeps. When the first world resets environments, the bare engines are reset to the same states,
-    outside the timed region. ``groups`` has the number of environments in each engine batch.
+    The world and the engines are measured alternately in one process, ``repeats`` times. The results are medians over
+    the repeats; ``ratio`` is the median of the repeats' ratios. The bare engines belong to a second world, with the
+    same states, controls, threads, sensors and substeps. When the first world resets environments, the bare engines are
+    reset to the same states, outside the timed region. ``groups`` has the number of environments in each engine batch.
     """
     options = {"device": device, "num_envs": num_envs, "threads": threads, "engine": engine}
     options |= {"deterministic": deterministic, "switches": switches}
@@ -41,7 +41,7 @@ def world_speed(
 
 
 def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
-    """Step two identical worlds with the same random actions, and return the seconds that each took.
+    """Step two identical worlds with the same random actions, and return the seconds that each world took.
 
     The world ``full`` takes complete steps. In the world ``bare``, only the physics engines are stepped, and only their
     steps are timed.

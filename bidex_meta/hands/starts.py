@@ -84,11 +84,11 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
 def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
     """Lift an egg off the palm and open the fingers that noise would push into it.
 
-    ``joints`` (n, 24) are the joint angles, rad. ``position`` (n, 3) is the egg's centre, and ``axis`` (n, 3) the unit
-    vector along its long axis, both in the mount frame. ``radius`` and ``half`` are the egg's short and long semi-axes.
-    Returns the joint angles with opened fingers (n, 24), and the egg's shift in the mount frame (n, 3). Lengths are in
-    metres. For the distances of the egg from the palm's plane and from the fingers' capsules, lower bounds are used.
-    They are computed from the egg's extent (support) towards the palm or the finger.
+    ``joints`` (n, 24) are the joint angles, rad. ``position`` (n, 3) is the egg's centre, and ``axis`` (n, 3) is the
+    unit vector along its long axis; both are in the mount frame. ``radius`` and ``half`` are the egg's short and long
+    semi-axes. Returns the joint angles with opened fingers (n, 24), and the egg's shift in the mount frame (n, 3).
+    Lengths are in metres. For the distances of the egg from the palm's plane and from the fingers' capsules, lower
+    bounds are used. They are computed from the egg's extent (support) towards the palm or the finger.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)

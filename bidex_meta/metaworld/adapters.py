@@ -153,7 +153,7 @@ class MetaWorldEnvs(VectorEnv):
 
     It exchanges NumPy arrays, resets an environment in the step in which its episode ends (Gymnasium's mode SAME_STEP),
     and has the attributes and methods that Meta-World calls. Raises BidexError unless the world's own autoreset mode is
-    DISABLED, because success may end episodes and this class then starts new ones.
+    DISABLED, because success may end episodes and this class then starts new episodes.
     """
 
     @checked_arguments
@@ -231,7 +231,7 @@ class MetaWorldEnvs(VectorEnv):
         self._samples += 1
 
     def get_attr(self, name: str) -> tuple[object, ...]:
-        """Return an attribute for each environment."""
+        """Return the value of an attribute for each environment."""
         value = getattr(self, name)
         if name == "task_name":
             return tuple(value)
@@ -245,7 +245,7 @@ class MetaWorldEnvs(VectorEnv):
         return self.get_attr(name)
 
     def set_attr(self, name: str, values: object) -> None:
-        """Set an attribute."""
+        """Set an attribute of this vector environment."""
         setattr(self, name, values)
 
     def close_extras(self, **kwargs: object) -> None:

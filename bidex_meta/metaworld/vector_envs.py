@@ -61,9 +61,9 @@ def make_ml_envs(
     """Make environments of a class or meta suite with hidden goals, each with an equal share of its class's tasks.
 
     `meta_batch_size` is the number of environments, which are split evenly over the classes; by default each class has
-    one. `total_tasks_per_cls` is the number of tasks of each class that its environments share, by default all. `seed`
-    and `options` are as in `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its goals, or
-    environments or tasks that cannot be split evenly.
+    one environment. `total_tasks_per_cls` is the number of tasks of each class that its environments share, by default
+    all. `seed` and `options` are as in `make_mt_envs`. Raises BidexError for an unknown name, a suite that shows its
+    goals, or environments or tasks that cannot be split evenly.
     """
     if _is_class(name):
         benchmark = ML1(name, seed)

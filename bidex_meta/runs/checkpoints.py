@@ -56,8 +56,8 @@ class Checkpoints:
     def room(self, size: int) -> Iterator[None]:
         """Reserve disk space for the first checkpoint, so that saving it cannot fail for lack of space.
 
-        ``size`` is its size in bytes. The space is reserved until the checkpoint is saved. Raises BidexError if there
-        is not enough space.
+        ``size`` is the checkpoint's size in bytes. The space is reserved until the checkpoint is saved. Raises
+        BidexError if there is not enough space.
         """
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)
@@ -67,8 +67,8 @@ class Checkpoints:
     def finish(self, step: int) -> None:
         """Complete a :meth:`save` during which the process was killed.
 
-        ``step`` is the step of the checkpoint that was loaded. If there is a checkpoint with a later step, that one
-        could not be loaded because it is damaged; in this case no checkpoint is changed or deleted.
+        ``step`` is the step of the checkpoint that was loaded. A checkpoint with a later step could not be loaded
+        because it is damaged. If there is such a checkpoint, no checkpoint is changed or deleted.
         """
         if not self.folder.is_dir():
             return

@@ -22,7 +22,7 @@ Engine = Literal["auto", "c", "warp"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its uncertainty."""
+    """A number with its confidence interval."""
 
     value: Finite
     interval: Interval | None  # 95 % bootstrap interval; None with fewer than two entries to resample

@@ -69,9 +69,9 @@ class RunFolder:
     ) -> "RunFolder":
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
-        The folder is ``path``, or one under ``root`` named after the resolved config. ``identity`` distinguishes the
-        run's worlds from other worlds of the same name; it goes into ``versions.json``. Raises BidexError if ``path``
-        is not empty.
+        The folder is ``path``, or a new folder under ``root`` that is named after the resolved config. ``identity``
+        distinguishes the run's worlds from other worlds of the same name; it goes into ``versions.json``. Raises
+        BidexError if ``path`` is not empty.
         """
         if path is None:
             path = _new_folder(config, root)
@@ -180,9 +180,10 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self, message: str | None = None) -> Iterator[None]:
-        """Keep other processes from training here; the lock ends with its process, and leaves no file.
+        """Keep other processes from training in this folder while the block runs.
 
-        Raises BidexError, with ``message``, if another process holds the lock.
+        The lock also ends if this process is killed, and leaves no file. Raises BidexError, with ``message``, if
+        another process holds the lock.
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
@@ -231,7 +232,7 @@ def _torn_start(path: Path) -> bool:
 
 
 def _is_of_a_start(entry: Path) -> bool:
-    """Return whether an entry of a run folder can be there before the end of the first iteration."""
+    """Return whether an entry of a run folder can exist before the end of the first iteration."""
     if entry.is_symlink():
         return False
     if entry.name in ("checkpoints", "videos"):  # temporary files reserve space for a checkpoint

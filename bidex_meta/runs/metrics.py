@@ -27,8 +27,8 @@ _TAIL = 65_536
 class MetricsWriter:
     """Appends to ``metrics.jsonl`` in the run folder, and to a logger of ``bidex_meta.runs.writers``.
 
-    In a resumed run, the points after ``resume_step``, the step of the checkpoint, are dropped from both, because they
-    are logged again.
+    In a resumed run, the file and the logger drop the points after ``resume_step``, the step of the checkpoint, because
+    these points are logged again.
     """
 
     @checked_arguments
@@ -81,9 +81,10 @@ def last_rows(path: Path) -> list[Json]:
 
 @checked_arguments
 def training_seconds(rows: Sequence[Json]) -> float:
-    """Return the wall time of the training, s, over all resumes, from the lines of a ``metrics.jsonl``.
+    """Return the wall time of a run's training, s, over all resumes, from the lines of a ``metrics.jsonl``.
 
-    Older runs did not log the training time. For them the result is the time of the iterations, without checkpoints.
+    Older runs did not log the training time. For these runs the result is the time of the iterations, without
+    checkpoints.
     """
     logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
     unlogged = []

@@ -35,7 +35,7 @@ class PlainConsole(Console):
 
 
 class Progress:
-    """Displays the progress of a training on stderr or ``stream``.
+    """Displays the progress of training on stderr or ``stream``.
 
     It shows steps per second, the time left, and return and success, as means and per task. ``total_steps`` and
     ``total_seconds`` are limits of the whole run, including parts before a resume; the time so far is the metric

@@ -34,7 +34,8 @@ class Difference(NamedTuple):
     def is_of_worlds(self) -> bool:
         """Return True if the difference is in the physics or the suite.
 
-        Rewards and successes from the two records then do not come from the same distribution.
+        In this case rewards and successes that were measured with the two versions do not come from the same
+        distribution.
         """
         return self.name in _ENGINES or self.name.replace(" ", "_") in _WORLD
 
@@ -107,7 +108,7 @@ def _values(record: Record) -> dict[str, Value]:
 def _of_worlds(run: Run) -> Iterator[tuple[str, Value]]:
     """Yield names and versions of the physics engines and the suite that a run was made with.
 
-    Those of the training come first, then those of the evaluation, if there is one.
+    The versions at training come first, followed by the versions at the evaluation, if there is an evaluation.
     """
     config = run.config()
     trained = _values(versions_of(run))

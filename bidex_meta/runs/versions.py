@@ -76,8 +76,8 @@ def package_versions() -> dict[str, str | None]:
 def git_state(folder: Path) -> Json | None:
     """Return the commit and whether files changed since; None if ``folder`` is not tracked by git.
 
-    If this package is installed inside somebody's project, it lies in that project's repository without being tracked.
-    The project's commit would not describe this package, so the function checks that the folder's files are tracked.
+    If this package is installed inside a user's project, it lies in the project's repository without being tracked. The
+    project's commit would not describe this package, so the function checks that the folder's files are tracked.
     """
     if not _git(folder, "ls-files", "."):
         return None

@@ -84,7 +84,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; return the frame count.
 
     Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError if imageio-ffmpeg is missing, and
-    OSError if the file cannot be written; an earlier file is then kept.
+    OSError if the file cannot be written; in both cases an earlier file is kept.
     """
     check_films()
     import imageio

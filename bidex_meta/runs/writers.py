@@ -54,7 +54,7 @@ def check_logger(logger: str) -> None:
 
 
 class TensorBoardWriter(Writer):
-    """An event file in the run folder; ``tensorboard --logdir runs`` shows it. Films are animated pictures."""
+    """An event file in the run folder; ``tensorboard --logdir runs`` shows it. Films are written as animated GIFs."""
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:
         from torch.utils.tensorboard.writer import SummaryWriter

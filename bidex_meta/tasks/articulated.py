@@ -83,8 +83,8 @@ class OpenScissors(ReachTask):
         """Return the values that a task fixes: the place of the shears and the target angle of the hinge.
 
         * ``scissors``: shift and yaw of the shears from their nominal start (n, 3).
-        * ``target``: target angle of the hinge (n, 1), rad; ``turn``: the same angle as a quaternion (x, y, z, w),
-          (n, 4).
+        * ``target``: target angle of the hinge (n, 1), rad; ``turn``: the same angle as a quaternion (n, 4) in the
+          order (x, y, z, w).
         * ``ghost``: pose (n, 7) of the right handle at the target angle while the shears lie at the task's start.
         """
         root = constant((*_SCISSORS.position, *_SCISSORS.quaternion), variation).repeat(len(variation), 1)
@@ -160,11 +160,11 @@ class OpenPenCap(ReachTask):
 
     Observation: Table 34 of the paper's appendix, size (428). Reward: equation 16.
 
-    In version 1 success requires the points on body and cap to be more than 0.3 m apart. The cap, which is 13 cm long,
-    has then been pulled by its own length. The goal position, for the cap's point, is 0.3 m from the place of the
-    body's point at the task's start. The goal orientation is the pen's orientation at the task's start. Reward and
-    success do not read this goal pose. With wide variation, as in version 2, each task has its own distance between the
-    points instead of 0.3 m.
+    In version 1 success requires the points on body and cap to be more than 0.3 m apart. At this distance the cap,
+    which is 13 cm long, has been pulled by its own length. The goal position, for the cap's point, is 0.3 m from the
+    place of the body's point at the task's start. The goal orientation is the pen's orientation at the task's start.
+    Reward and success do not read this goal pose. With wide variation, as in version 2, each task has its own distance
+    between the points instead of 0.3 m.
     """
 
     needs = Capacity(56, 0, 121)

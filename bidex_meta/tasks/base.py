@@ -204,7 +204,7 @@ class TaskClass(ABC):
     def varied(self, shares: Tensor) -> Tensor:
         """Return the variations (n, variation_space.size) that ``shares`` select from the variation space.
 
-        ``shares``, in [0, 1), has shape (n, at least variation_space.size). A share of 0 selects the lower end of a
+        ``shares`` (n, k) are in [0, 1), with k >= variation_space.size. A share of 0 selects the lower end of a
         component's range, and 0.5 selects its middle.
         """
         space = self.variation_space
@@ -215,8 +215,8 @@ class TaskClass(ABC):
     def frozen(self, variation: Tensor, draws: Tensor | None = None) -> dict[str, Tensor]:
         """Return the values that ``freeze`` computes from tasks' variations and the components that episodes draw.
 
-        ``variation`` has shape (n, variation_space.size). ``draws``, in [-1, 1], has shape (n, at least
-        episode_space.size); its first columns select values from ``episode_space``. Without ``draws``, the middle of
+        ``variation`` has shape (n, variation_space.size). ``draws`` (n, k) are in [-1, 1], with k >=
+        episode_space.size; their first columns select values from ``episode_space``. Without ``draws``, the middle of
         ``episode_space`` is used. This is allowed for rewards, success and observations, because ``episode_space`` only
         affects the start of an episode.
         """

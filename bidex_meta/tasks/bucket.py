@@ -34,7 +34,7 @@ _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
 
 
 def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
-    """Return whether points lie in a bucket, that is, between its floor and rim and within its wall. (n, k), bool.
+    """Return whether points lie in a bucket, between its floor and rim and within its wall. Shape (n, k), bool.
 
     ``points`` (n, k, 3) and the buckets' origins ``bucket`` (n, 3) are in the world frame, metres. ``quaternion``
     (n, 4) holds the buckets' orientations (x, y, z, w).
@@ -274,7 +274,7 @@ class PourWater(ReachTask):
         """Return the values that a task fixes: the places of kettle and bucket, and their goals.
 
         * ``kettle`` and ``bucket``: shift and yaw from the nominal start (n, 3) each.
-        * ``goal_rotation``: goal orientation of the kettle, a quaternion (x, y, z, w), (n, 4).
+        * ``goal_rotation``: goal orientation (n, 4) of the kettle, a quaternion (x, y, z, w).
         * ``goal_rotation_inverse``: the inverse of ``goal_rotation`` (n, 4).
         * ``goal``: goal pose of the bucket (n, 7); ``goal_inverse``: inverse of its rotation (n, 4); only with wide
           variation (version 2).

@@ -54,7 +54,8 @@ class _Door(ReachTask):
 
     In version 1 the opening classes measure success along y, because a single leaf that is open by 1.26 rad already
     brings the handles 0.5 m apart in space. The Inward classes have the same door upside down, so that it swings
-    towards the hands. The points that their hands must reach lie behind the pulls that then face the hands.
+    towards the hands. The points that their hands must reach lie behind the pulls, which face the hands in these
+    classes.
     """
 
     inward: ClassVar[bool]

@@ -85,7 +85,7 @@ def lay_egg_on_hand(
 ) -> None:
     """Lift an egg off the palm and open fingers, so that the egg does not penetrate the hand at the start.
 
-    ``egg`` holds the egg's poses (n, 7), quaternion (w, x, y, z), and ``joints`` the joint angles (n, 24) of the hand,
+    ``egg`` holds the egg's poses (n, 7), quaternion (w, x, y, z), and ``joints`` holds the hand's joint angles (n, 24),
     rad. Both are changed in place. The hand starts at ``pose``. ``radius`` and ``half`` are the short and the long
     semi-axis of the egg, or of the spheroid around another object, metres.
     """
@@ -103,10 +103,11 @@ def put_down(
 ) -> None:
     """Write the start pose of an egg or another object, so that it does not penetrate the hand below.
 
-    ``held`` is the other object, or None for an egg. An egg gets any orientation; another object lies on a broad side.
-    The object's poses ``place`` (n, 7) and the hand's joint angles ``joints`` (n, 24), rad, are changed in place; the
-    hand starts at ``pose``. If ``joints`` is None, there is no hand below. An object that extends further down than an
-    egg then starts higher by the difference. ``draws`` and ``noise`` are those of ``start_egg``.
+    If ``held`` is None, the object is an egg, which gets any orientation. Otherwise the object is ``held``, which lies
+    on a broad side. ``place`` (n, 7) holds the object's poses, and ``joints`` (n, 24) holds the hand's joint angles,
+    rad; both are modified in place. The hand starts at ``pose``. If ``joints`` is None, there is no hand below the
+    object. In this case an object that extends further below its origin than an egg starts higher by the difference.
+    ``draws`` and ``noise`` are those of ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)

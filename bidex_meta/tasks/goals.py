@@ -24,7 +24,7 @@ class Ghost(NamedTuple):
 
 
 def posed(position: Tensor, quaternion: Tensor) -> Tensor:
-    """Return poses (n, 7) of positions (n, 3) with orientations (x, y, z, w), (n, 4)."""
+    """Return poses (n, 7) of positions (n, 3) and orientations (n, 4), which are quaternions (x, y, z, w)."""
     return torch.cat((position, quaternion), dim=1)
 
 
@@ -37,7 +37,10 @@ def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
 
 
 def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Tensor:
-    """Return a body's quaternion, from ``sensor``, times the inverse quaternion of its goal, (x, y, z, w), (n, 4)."""
+    """Return a body's quaternion, which ``sensor`` measures, times the inverse quaternion of the body's goal.
+
+    Quaternions (n, 4) are (x, y, z, w).
+    """
     inverse = state.frozen[f"{goal}_inverse"]
     return state.once(("difference", sensor, goal), lambda: multiply(state.quaternion(sensor), inverse))
 

@@ -36,8 +36,8 @@ def placed(name: Text, shift: NonNegative = SHIFT, turn: NonNegative = TURN) -> 
 def yaw_quaternion(yaw: Tensor) -> Tensor:
     """Return rotations about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
 
-    Vectorised sines and the scalar sines at the end of an array may differ in the last bit of double precision, and a
-    row's start must not depend on its place in a batch.
+    Vectorised sines, and the scalar sines that are computed for the last entries of an array, may differ in the last
+    bit of double precision. Without rounding, an environment's start could therefore depend on its position in a batch.
     """
     half = 0.5 * yaw
     zero = torch.zeros_like(yaw)

@@ -210,8 +210,8 @@ def gather(state: State) -> list[State] | None:
 def together(function: Callable[[], Value]) -> Value:
     """Call ``function()`` in all processes and return its result, or end all processes.
 
-    If the function raises BidexError in some processes, the first of these raises it again and all other processes
-    raise SystemExit.
+    If the function raises BidexError in some processes, the first of these processes raises the error again, and all
+    other processes raise SystemExit.
     """
     error = None
     value = None

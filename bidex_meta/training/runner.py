@@ -63,13 +63,13 @@ def train(
             always saved at the end.
         watch: Evaluates the learner after each iteration without changing it, and returns metrics. Its time does not
             count as training time.
-        enough: Returns whether the metrics of an iteration end the training; process 0 decides. It is None in all
-            processes or in none.
+        enough: Returns whether the metrics of an iteration end training; process 0 decides. It is None in all processes
+            or in none.
         last: Metrics of the last iteration of the run that is resumed. If ``enough`` accepts them, nothing is trained.
 
-    Returns the number of the signal that ended the training early, else 0. The number is that of SIGPIPE if nobody
-    reads the output, and that of SIGTERM if another process received the signal. Raises LostProcess if another process
-    is gone; existing checkpoints are kept.
+    Returns the number of the signal that ended training early, else 0. The number is that of SIGPIPE if nobody reads
+    the output, and that of SIGTERM if another process received the signal. Raises LostProcess if another process is
+    gone; existing checkpoints are kept.
     """
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
         return 0  # the run was stopped between its last iteration and the end of its evaluation
@@ -206,7 +206,7 @@ def _stop_requests() -> Iterator["_Stop"]:
 
     After the first SIGINT or SIGTERM, the old handlers of these two signals are restored, so that another SIGINT or
     SIGTERM acts at once. The other signals never break off an iteration: a single cause may send the same signal twice,
-    or send SIGTERM after it.
+    or send SIGTERM after this signal.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():

@@ -105,7 +105,10 @@ def rotation_angle(q: Tensor) -> Tensor:
 
 
 def uprightness(q: Tensor) -> Tensor:
-    """Return the cosine of the angle between a body's z axis and the vertical, from (x, y, z, w). (..., 4) to (...)."""
+    """Return the cosine of the angle between a body's z axis and the vertical.
+
+    ``q`` (..., 4) is the body's orientation (x, y, z, w); the result has the shape (...).
+    """
     x, y, _, _ = q.unbind(-1)
     return 1.0 - 2.0 * (x * x + y * y)
 

@@ -50,7 +50,8 @@ Text = Annotated[str, Meta(min_length=1, max_length=4096, pattern=r"^[^\0]*$")]
 class Checked:
     """Base of a dataclass of settings: raises BidexError for fields that do not fit their annotations.
 
-    A class with conditions between fields checks them in its own ``__post_init__``, after it has called this one.
+    A class with conditions between fields checks them in its own ``__post_init__``, after it has called the method of
+    this base class.
     """
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from bidex_meta.world.rendering import DrawnGhost, ghosts, pose, simulation
 
 
 class Stage:
-    """The episodes that a viewer shows: a policy acts in all environments of a world, and one is shown.
+    """The episodes that a viewer shows: a policy acts in all environments of a world, and one environment is shown.
 
     The world must be in autoreset mode DISABLED and have one environment per slot (class or listed task). ``row`` is
     the index of the shown environment; callers may change it. On a ``tour`` the next environment is shown after each

@@ -92,8 +92,8 @@ class HandController:
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
         """Set the target angles of a hand's joints, rad.
 
-        ``knuckles`` is the angle of the knuckles of all four fingers, and ``middles`` the angle of their middle joints.
-        ``others`` gives the angles of further joints by name. All other joints get the angle 0.
+        ``knuckles`` is the angle of the knuckles of all four fingers, and ``middles`` is the angle of their middle
+        joints. ``others`` gives the angles of further joints by name. All other joints get the angle 0.
         """
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
         self._fingers[side] = _joint_actions(bent.items())
@@ -124,8 +124,8 @@ class HandController:
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
         """Yield the targets that move the hands' points towards ``right`` and ``left`` (world, metres).
 
-        The targets are the same for each of ``steps`` control steps; the end of the episode ends them earlier. The
-        hands move at ``speed`` (m/s) at most.
+        The same targets are yielded for ``steps`` control steps, or until the episode ends. The hands move at ``speed``
+        (m/s) at most.
         """
         a, b = SIDES
         for _ in range(min(steps, self.steps_left)):

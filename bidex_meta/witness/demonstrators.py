@@ -140,8 +140,8 @@ class _Class:
     def _begin(self, row: int) -> Actions:
         """Start the script of an environment of this class, and yield its targets.
 
-        The script first reads the state when the first target is requested. ``row`` counts the environments of the
-        class.
+        The script first reads the state when the first target is requested. ``row`` is the index of the environment
+        among the environments of the class.
         """
         place = self._member.env_ids.start + row
         tasks = self._world.num_slot_tasks[self._member.slot]

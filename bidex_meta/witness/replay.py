@@ -138,7 +138,7 @@ class Simulator:
         return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
 
     def frozen(self, name: str) -> Tensor:
-        """Return a value that the task fixes, such as its goal, by name, (N, k)."""
+        """Return the value ``name`` (N, k) that the task fixes, such as the goal."""
         return self._part.frozen(0, self._world.task_index)[name]
 
     def contact_depth(self, row: int) -> float:
@@ -156,7 +156,7 @@ class Simulator:
 
 @dataclass(frozen=True)
 class Replay:
-    """Result of a replay."""
+    """Result of replaying a witness (recorded actions) from its own start and from shifted starts."""
 
     total: float  # return from the unshifted start
     first_success: int | None  # index of the first successful step from the unshifted start

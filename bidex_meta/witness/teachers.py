@@ -18,9 +18,8 @@ from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 class Tutor:
     """A policy that teaches in some environments of a world.
 
-    ``rows`` (k,), int64, are these environments. ``width`` is the number of observation entries that the policy reads,
-    from the first on. A policy of one class does not read the padding and the task id, with which a suite's observation
-    ends.
+    ``rows`` (k,), int64, are these environments. The policy reads the first ``width`` entries of an observation. A
+    policy of one class does not read the padding and the task id, which are the last entries of a suite's observation.
     """
 
     policy: Agent

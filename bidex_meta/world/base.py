@@ -60,8 +60,8 @@ class BatchedWorld(VectorEnv, ABC):
     """A ``contract.TaskWorld`` that splits its environments evenly over slots, into contiguous ranges.
 
     A slot is a task class, or in MT1 a single task. Worlds can be pickled and copied. A copy is built from the
-    original's arguments and gets its state, so that it continues bit for bit. Of the attributes that a user may set,
-    only ``stagger`` is copied.
+    original's arguments and gets the original's state, so that it continues bit for bit. Of the attributes that a user
+    may set, only ``stagger`` is copied.
     """
 
     single_observation_space: Box

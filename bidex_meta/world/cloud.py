@@ -138,9 +138,9 @@ class Cloud:
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the candidates' positions relative to the camera, and the camera's distances from their surfaces.
 
-        Candidates are the points that the camera may see. Returns four tensors, (n, P) each, in metres. The first three
-        are the position relative to the camera: to the right, down and forward. The fourth is the distance from the
-        camera to the candidate's tangent plane; it is positive if the surface faces the camera.
+        Candidates are the points that the camera may see. Returns four tensors (n, P), in metres. The first three are
+        the position relative to the camera: to the right, down and forward. The fourth is the distance from the camera
+        to the candidate's tangent plane; it is positive if the surface faces the camera.
         """
         turn = rotation.index_select(1, self._bodies).float()
         offset = position.index_select(1, self._bodies).float() - self._eye
@@ -203,7 +203,7 @@ def beside(camera: Camera) -> Camera:
 
 
 def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
-    """Draw a cloud, (n, 4), and return the picture, (height, width, 3), uint8.
+    """Draw a cloud (n, 4), and return the picture (height, width, 3), uint8.
 
     The cloud's rows hold a position (world frame, metres) and a kind (``surfaces.FIXTURE``, ...). The camera's field of
     view fits the smaller side of the picture.

@@ -127,7 +127,7 @@ class Clock:
         self._began = torch.full((num,), time.perf_counter(), dtype=torch.float64, device=device)
 
     def begin(self, mask: Tensor) -> None:
-        """Note that episodes of the environments of a mask begin now."""
+        """Set the start time of the episodes in the environments of a mask to the present time."""
         self._began = torch.where(mask, time.perf_counter(), self._began)
 
     def stamp(self, info: Info) -> None:

@@ -134,7 +134,10 @@ def build_groups(slots: list[Slot], env_ids: list[slice], make_engine: EngineMak
 
 
 def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
-    """Return the depth sensor of each slot, in the slots' order; clouds begin at entry ``first`` of observations."""
+    """Return the depth sensor of each slot, in the order of the slots.
+
+    A sensor writes its point cloud into the entries of an observation from ``first`` on.
+    """
     by_scene: dict[int, DepthSensor] = {}
     by_slot: dict[int, DepthSensor] = {}
     for group in groups:

@@ -21,13 +21,13 @@ power."""
 
 
 def object_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies belong to objects, (nbody,), bool: the bodies that follow those of the hands."""
+    """Return a mask (nbody,), bool, of the bodies of objects, which follow the bodies of the hands."""
     names = [model.body(i).name for i in range(model.nbody)]
     return np.array([i > 0 and name.partition("/")[0] not in SIDES for i, name in enumerate(names)])
 
 
 def _free(model: mujoco.MjModel) -> np.ndarray:
-    """Return which bodies are objects with a single, free joint and without child bodies, (nbody,), bool."""
+    """Return a mask (nbody,), bool, of the objects' bodies with a single, free joint and without child bodies."""
     parents = np.isin(np.arange(model.nbody), model.body_parentid)
     free = np.array(
         [n == 1 and model.jnt_type[a] == 0 for n, a in zip(model.body_jntnum, model.body_jntadr, strict=True)]

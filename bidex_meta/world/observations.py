@@ -110,7 +110,7 @@ class Observer:
     def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
         """Return the orientations of both hands' mounts, and the inverses of their start orientations.
 
-        Both are quaternions (x, y, z, w), (n, 2, 4), for the engine rows ``rows``.
+        Both results (n, 2, 4) hold quaternions (x, y, z, w) for the engine rows ``rows``.
         """
         return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
 

@@ -127,9 +127,10 @@ class Part:
     def renew(self, mask: Tensor, shares: Tensor) -> None:
         """Give new tasks to the environments of a mask (num,).
 
-        Environment j of a slot plays entry j of its slot's pool. ``shares`` in [0, 1), (num, at least the size of each
-        variation), give the tasks' positions in the ranges of their variation spaces. Pools are rewritten in place and
-        for all environments, because recorded graphs read them and have fixed shapes.
+        Environment j of a slot plays entry j of its slot's pool. ``shares`` (num, k), in [0, 1), give the tasks'
+        positions in the ranges of their variation spaces; k is at least the size of the largest space. Entire pools are
+        rewritten in place, although only the entries in the mask change, because recorded graphs read the pools and
+        have fixed shapes.
         """
         for member, tasks, pool in zip(self.group.members, self.tasks, self._pools, strict=True):
             task = member.scene.task
@@ -271,7 +272,7 @@ class Part:
 
         Args:
             rows: Engine rows (n,), ascending. None: all rows, with n / num successive starts for each row.
-            draws: Uniform numbers in [-1, 1], (n, at least the classes' draws).
+            draws: Uniform numbers (n, k) in [-1, 1]; k is at least the number of draws that each class takes.
             task_index: Task of each start in its pool, (n,).
             shares: Positions of new tasks in their variation spaces, as in ``renew``. None: tasks come from the pools.
         """
@@ -334,7 +335,7 @@ def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None =
 
 
 class Judgement(NamedTuple):
-    """The results of one class's formulas for a step; see ``Transition``."""
+    """Reward terms, reward, success and failure that one task class computes for a step; see ``Transition``."""
 
     terms: dict[str, Tensor]
     reward: Tensor

@@ -97,7 +97,8 @@ class Randomiser:
     def act(self, action: Tensor, past: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         """Push objects; return the actions (n, a) that the engines get, and the actions to remember.
 
-        ``past``: the remembered actions, newest first, (n, ``remembered``, a); ``elapsed``: steps since the start (n,).
+        ``past`` (n, ``remembered``, a) holds the remembered actions, newest first. ``elapsed`` (n,) is the number of
+        steps since the start of each episode.
         """
         if self.remembered:
             past = torch.cat((action[:, None], past[:, :-1]), dim=1)
@@ -127,7 +128,7 @@ class Randomiser:
 
 
 class _Models:
-    """Applies random factors and pushes to the models of the environments of one part."""
+    """Applies random factors and pushes to the models of the environments of one ``Part`` of the world."""
 
     def __init__(self, part: Part, varied: Sequence[str]) -> None:
         engine = part.group.engine
@@ -164,7 +165,7 @@ class _Models:
                 field[rows] = torch.where(new[rows], value.to(field.dtype), field[rows])
 
     def lift(self, start: Tensor, size: Tensor, mask: Tensor) -> None:
-        """Lift the objects of this part; see ``Randomiser.lift``."""
+        """Lift the objects in the start positions of this ``Part``; see ``Randomiser.lift``."""
         size = self._part.group.take(size)
         for i, _, where, rows in self._part.members(self._part.rows_in(mask)):
             for column, height in self._heights[i].items():

@@ -73,7 +73,7 @@ class Painter(threading.local):
         return self._draw(world, env_id, name, (width, height), scene, engine.placement()[engine_row])
 
     def pictures(self, world: "PartedWorld", size: int) -> torch.Tensor:
-        """Draw all environments by their classes' own cameras, (num_envs, size, size, 3), uint8.
+        """Return pictures (num_envs, size, size, 3), uint8, of all environments from their classes' own cameras.
 
         Environments of mujoco_warp are drawn on the engine's device, all of a slot at once. Environments of C MuJoCo
         are drawn one after another on the CPU.
@@ -183,7 +183,7 @@ def simulation(world: "PartedWorld", env_id: int) -> "tuple[Engine, int, Scene]"
 
 
 def _part(world: "PartedWorld", env_id: int) -> "tuple[Part, int]":
-    """Return the part that has an environment, and its row in the part's engine."""
+    """Return the ``Part`` of the world that holds an environment, and the environment's row in the part's engine."""
     part = next(p for p in world.parts if bool((p.group.env_ids == env_id).any()))
     return part, int((part.group.env_ids == env_id).nonzero()[0])
 

@@ -43,7 +43,7 @@ class Starts:
         """Allocate memory for the draws.
 
         Args:
-            parts: The world's parts.
+            parts: The world's groups of environments (``Part``), one per engine.
             keys: Random keys of the environments, (n, 2).
             start_draws: Maximum number of draws that the start of an episode takes in any class.
             pool_size: Number of tasks in the pool of each environment's slot, (n,), if episodes draw tasks; None if
@@ -73,7 +73,7 @@ class Starts:
         self._takes = 0
 
     def prepare(self, stepper: Stepper, mask: Tensor, number: Tensor, task_index: Tensor) -> None:
-        """Draw episodes ahead of time if the next call of ``take`` needs new ones.
+        """Draw episodes ahead of time if the next call of ``take`` needs new episodes.
 
         That call must get the same mask, number and task_index.
         """
@@ -91,7 +91,7 @@ class Starts:
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Return tasks, elapsed shares and start positions of the next episodes in ``mask``, bool (n,).
 
-        Call ``prepare`` before. If episodes draw new tasks, this method writes them into the pools. ``number`` (n,):
+        Call ``prepare`` first. If episodes draw new tasks, this method writes them into the pools. ``number`` (n,):
         number of the episode that begins, or would begin next, in each environment. ``task_index`` (n,): task that an
         environment keeps if none is drawn.
 

@@ -204,8 +204,8 @@ _BURIED = 5e-4
 class Surfaces:
     """P points that are fixed to bodies; the points of a body are adjacent.
 
-    ``bodies`` (k,) are the bodies with points, ascending, and ``ends`` (k,) the index after each body's last point.
-    ``points`` (metres) and outward unit ``normals`` are (P, 3), in the body's frame. ``kinds`` (FIXTURE, HAND or
+    ``bodies`` (k,) are the bodies with points, ascending, and ``ends`` (k,) are the indices after each body's last
+    point. ``points`` (metres) and outward unit ``normals`` are (P, 3), in the body's frame. ``kinds`` (FIXTURE, HAND or
     OBJECT) and ``geoms`` are (P,).
     """
 

@@ -442,7 +442,7 @@ class World(BatchedWorld):
 
     @property
     def randomised(self) -> dict[str, Tensor]:
-        """Random factors, and the delay of actions in control steps, of the running episodes, (num_envs,) each."""
+        """Random factors and action delays (control steps) of the running episodes: tensors (num_envs,) by name."""
         if self._randomiser is None:
             return {}
         return {name: value.clone() for name, value in self._randomiser.drawn.items()}

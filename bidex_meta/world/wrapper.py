@@ -108,8 +108,8 @@ class NumpyWorld(VectorEnv):
     In DISABLED mode an environment may be stepped after its episode ended, as in the world. The end is reported only in
     the step in which it happens; otherwise wrappers would count each later step as an episode.
 
-    With ``stagger`` a training world shortens the first episode of each environment by a random number of steps.
-    Wrappers that count steps then report episodes that are too short.
+    With ``stagger`` a training world shortens the first episode of each environment by a random number of steps. In
+    this case wrappers that count steps report episodes that are too short.
     """
 
     @checked_arguments

@@ -29,7 +29,7 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 class WorldsConfig:
     """The worlds of a run, and how they run.
 
-    ``suite`` names a suite, or ``task`` a single class; ``base`` and ``object`` apply to a single class only.
+    ``suite`` names a suite, or ``task`` names a single class; ``base`` and ``object`` apply only to a single class.
     """
 
     suite: str | None = None
@@ -136,12 +136,12 @@ class Worlds(ABC):
     def others(self) -> "Worlds":
         """Return worlds of the same suite or class whose tasks are drawn with another seed.
 
-        They have the same number of tasks. The tasks are unseen, because no run is trained with this seed.
+        These worlds have the same number of tasks. The tasks are unseen, because no run is trained with this seed.
         """
         return type(self)(self._opened_as, replace(self.config, task_seed=self.seed + OTHER_SEED))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
-        """Return the default number of environments and the default number of environment steps of a training.
+        """Return the default numbers of environments and of environment steps for training.
 
         ``adapts`` says whether the learner adapts to tasks.
         """

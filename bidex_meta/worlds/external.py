@@ -25,7 +25,10 @@ _HUMANOIDS = 50
 
 
 class Foreign(Worlds):
-    """Classes of another library. They have only the split ``"train"``, and neither references nor pictures."""
+    """Worlds of task classes that come from another library.
+
+    These worlds have only the split ``"train"``, no reference returns and no pictures.
+    """
 
     on_gpu = False
     bytes_per_environment: int

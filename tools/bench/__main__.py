@@ -30,7 +30,10 @@ KINDS: dict[str, Callable[..., Json]] = {kind.__name__: kind for kind in _MEASUR
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure and print; ``--json`` may stand at any position. An error is printed as one line and ends the process."""
+    """Run the measurement that the arguments select, and print its result as a table or, with ``--json``, as JSON.
+
+    ``--json`` may appear anywhere among the arguments. An error is printed as one line and ends the process.
+    """
     flags = [word for word in arguments if word != "--json"]
     try:
         result = tyro.extras.subcommand_cli_from_dict(KINDS, args=flags, prog="python -m tools.bench")

@@ -1,4 +1,4 @@
-"""Measure how many contacts and constraint rows the classes need, the source of ``TaskClass.needs``."""
+"""Measure how many contacts and constraint rows the classes need; ``TaskClass.needs`` holds the measured numbers."""
 
 import math
 

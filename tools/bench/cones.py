@@ -29,8 +29,9 @@ def cones(
 
     A contact can change its zone (satisfied, quadratic or cone) and its part of the Hessian.
 
-    C MuJoCo plays the class's script, or rough actions if it has none. At every ``every``-th control step mujoco_warp
-    takes over the states on Warp's CPU device and plays one control step. Classes with pyramidal cones are left out.
+    C MuJoCo plays the class's script, or rough actions if the class has no script. At every ``every``-th control step
+    mujoco_warp takes over the states on Warp's CPU device and plays one control step. Classes with pyramidal cones are
+    left out.
 
     Args:
         suite: Measure the classes of this suite.

@@ -42,7 +42,8 @@ def gpu(
         suite: Suite to step.
         tasks: Classes to step on their own.
         sizes: Numbers of environments.
-        steps: Number of control steps of each measurement. As many steps, but at least 32, come first, to warm up.
+        steps: Number of control steps of each measurement. The same number of steps, but at least 32, comes first, to
+            warm up.
         device: Device of the worlds.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.

@@ -22,10 +22,11 @@ def launches(
 ) -> Json:
     """List the kernels of a physics substep, sorted by the size of the arrays that they access.
 
-    C MuJoCo plays the class's script, or rough actions if it has none. mujoco_warp takes over the states on Warp's CPU
-    device, where the kernels are counted. The memory of a kernel is the size of its array arguments whose first
-    dimension is the world. It is the allocated size, of which only a part may be in use. A world that has converged
-    reads almost nothing. Kernels in Newton's iterations are therefore counted only for worlds that still iterate.
+    C MuJoCo plays the class's script, or rough actions if the class has no script. mujoco_warp takes over the states on
+    Warp's CPU device, where the kernels are counted. The memory of a kernel is the size of its array arguments whose
+    first dimension is the world. It is the allocated size, of which only a part may be in use. A world that has
+    converged reads almost nothing. Kernels in Newton's iterations are therefore counted only for worlds that still
+    iterate.
 
     Args:
         task: Class to play.

@@ -53,18 +53,18 @@ def quarter(
 ) -> Json:
     """Measure and train what needs a GPU, in steps that fit into a given time.
 
-    The steps are: compile kernels, run tests, measure switches and pictures, run short trainings, and use the remaining
-    time for a longer training. Each step is a process with its own time limit. The next step begins even if a step
-    fails or reaches its limit. Another call repeats such steps, continues their trainings, and skips completed steps.
+    The steps are: compile kernels, run tests, measure switches and pictures, train some short runs, and use the
+    remaining time for a longer run. Each step is a process with its own time limit. The next step begins even if a step
+    fails or reaches its limit. Another call repeats such steps, continues their runs, and skips completed steps.
 
     Args:
         out: Folder for ``quarter.json`` (all results), logs and run folders.
         device: Where everything runs; on ``cpu`` the worlds of the measurements use Warp's CPU device.
-        suite: Multi-task suite whose world is measured and on which the last training trains.
+        suite: Multi-task suite whose world is measured and on which the last run trains.
         sizes: Numbers of environments of the measurements.
-        num_envs: Number of environments of the trainings.
-        seconds: Training time of each short training, seconds.
-        rest: Training time of the last training, seconds; None: until ``minutes`` have passed.
+        num_envs: Number of environments of the training runs.
+        seconds: Training time of each short run, seconds.
+        rest: Training time of the last run, seconds; None: until ``minutes`` have passed.
         minutes: Time limit of this call.
         slack: Factor of the steps' time limits, for a dry run on a busy machine.
 
@@ -99,7 +99,7 @@ def _steps(
     rest: float | None,
     end: float,
 ) -> Iterator[_Step]:
-    """Yield the steps; the time for the last training is computed when the previous steps have run."""
+    """Yield the steps; the time for the last training run is computed when the previous steps have run."""
     bench = ["-m", "tools.bench"]
     world = ["--device", device, "--suite", suite]
     tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
@@ -148,7 +148,7 @@ def _run(step: _Step, limit: float, log: Path) -> Json:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and its children: interrupt them, so that a training saves, and later kill them."""
+    """End a process and its children: interrupt them, so that a training run saves, and later kill them."""
     for number in (signal.SIGINT, signal.SIGKILL):
         try:
             os.killpg(process.pid, number)

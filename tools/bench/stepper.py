@@ -1,7 +1,7 @@
 """The worker of ``tools.bench.against``, which steps the worlds of the checkout that is first on the import path.
 
 The worker is started by its file name and imports another commit's ``bidex_meta``, so the worker may use only names
-that commit e0e28c4 has too. A command is a line of JSON on stdin, the answer a line of JSON on stdout.
+that commit e0e28c4 has too. A command is a line of JSON on stdin, and the answer is a line of JSON on stdout.
 """
 
 import json

@@ -60,7 +60,7 @@ _DIGEST = "Description"
 
 @dataclass(frozen=True)
 class Block:
-    """The options of a block."""
+    """Options of a marked block of a page: the table or picture that fills the block."""
 
     study: str = ""  # Name of a study, or of several studies with commas between for a joint table or picture.
     show: str = "table"  # Kind of the table or picture.
@@ -100,7 +100,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
 
 def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path]) -> Iterator[str]:
-    """Yield the Markdown lines of a block, and draw the block's pictures."""
+    """Yield the Markdown lines that fill a marked block of a page, and draw the block's pictures."""
     if block.show == "references":
         yield from tables.references_table()
         return

@@ -45,7 +45,7 @@ _SEEDS_AT_LEAST = 3
 
 @dataclass
 class Line:
-    """The seeds of one learner on one suite."""
+    """The results of one learner on one suite, for each seed."""
 
     given: str
     shares: list[list[float]] = field(default_factory=list)

@@ -25,8 +25,9 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 def offline_table(study: Study) -> Iterator[str]:
     """Yield a table with a row per kind of data and a column per learner.
 
-    A cell shows the score, as mean over seeds (least to most), and the mean success. The study's online runs are the
-    experts. Raises BidexError if the runs of one cell differ in more than the seed.
+    A cell shows the mean score over seeds, the lowest and the highest score of a seed in brackets, and the mean
+    success. The study's online runs are the experts. Raises BidexError if the runs of one cell differ in more than the
+    seed.
     """
     cells: dict[str, dict[str, list[StoredRun]]] = {}
     experts = []

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def rows_table(study: Study) -> Iterator[str]:
     """Yield a table of evaluated returns with a row per number of environments and a column per learner.
 
-    A cell shows the mean over seeds (least to most). Raises BidexError if the runs of one cell differ in more than the
-    seed, or if the runs are on several classes.
+    A cell shows the mean over seeds, followed in brackets by the lowest and the highest value of a seed. Raises
+    BidexError if the runs of one cell differ in more than the seed, or if the runs are on several classes.
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))

@@ -29,7 +29,7 @@ _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", 
 
 @dataclass(frozen=True)
 class Arm:
-    """One setting of a study, on several seeds."""
+    """The runs of a study that have the same settings but different seeds."""
 
     group: Group  # Final evaluations of the arm's runs, labelled with the arm's name.
     runs: list[StoredRun]  # Runs of the arm, one or more.
@@ -59,7 +59,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Study:
-    """Arms on one suite or class."""
+    """A study on one suite or class. Its runs are grouped into arms, one for each setting."""
 
     name: str  # Name of the study's file, without suffix.
     on: str  # The suite or class.

@@ -42,7 +42,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str:
-    """Format values (seeds,) as ``mean (least to most)``, or a single seed's value."""
+    """Format values (seeds,) as their mean, followed by ``(minimum to maximum)`` if there are several seeds."""
     ends = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
     return f"{values.mean():{form}}{unit}{ends}"
 
@@ -92,9 +92,10 @@ def _over_seeds(success: np.ndarray | None) -> str:
 
 
 def classes_table(study: Study) -> Iterator[str]:
-    """Yield a table of success and return per class, as mean over seeds (least to most).
+    """Yield a table of success and return per class.
 
-    The classes are columns, or rows if there are more than ``_MANY``.
+    A cell shows the mean over seeds, followed in brackets by the lowest and the highest value of a seed. The classes
+    are the table's columns, or its rows if there are more than ``_MANY`` classes.
     """
     if len(study.classes) > _MANY:
         return _classes_as_rows(study)

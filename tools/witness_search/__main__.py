@@ -32,9 +32,9 @@ class Search:
     def keep(self, actions: np.ndarray, made: Json, above: float = -float("inf")) -> Replay:
         """Replay an episode (T, action_size), print the result, and store the episode if it is good enough.
 
-        An episode holds if it succeeds from its start and from most of the shifted starts; it is always stored. Any
-        other episode is stored only if ``file`` is given and the return is higher than ``above``. ``made`` contains
-        facts about the search, which are stored with the episode.
+        An episode holds if it succeeds from its start and from most of the shifted starts. Episodes that hold are
+        always stored. Other episodes are stored only if the attribute ``file`` is set and the return is higher than
+        ``above``. ``made`` contains facts about the search, which are stored with the episode.
         """
         result = replay(self.task, Witness(actions, {}), self.threads)
         print(

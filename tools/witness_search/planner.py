@@ -56,7 +56,7 @@ class PlannerConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """Result of a search."""
+    """The episode that a search found: its actions and their rewards."""
 
     actions: np.ndarray  # Actions of the whole episode, (T, action_size), multiples of 1/127.
     rewards: np.ndarray  # Unscaled rewards of these actions, (T,).

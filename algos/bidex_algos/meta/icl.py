@@ -236,7 +236,7 @@ class ICL(TrialLearner):
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
-        """Return each class's squared error of actions, relative to the variance of the class's labels (K,).
+        """Return the squared error of actions for each class (K,), relative to the variance of the class's labels.
 
         An actor that always returns the mean label has an error of 1.
         """

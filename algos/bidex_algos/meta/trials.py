@@ -117,7 +117,7 @@ class Sampling:
         self._generator = generator
 
     def begin(self, shown: Tensor) -> None:
-        """Do nothing."""
+        """Do nothing: sampling does not depend on the episode."""
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Sample actions without clamping: the world clamps, but the density must be that of the sampled action."""
@@ -126,7 +126,7 @@ class Sampling:
         return mean + self._policy.log_std.exp() * noise, state
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
-        """Do nothing."""
+        """Do nothing: sampling does not depend on the rewards."""
 
 
 @torch.no_grad()

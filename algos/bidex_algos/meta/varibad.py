@@ -123,7 +123,7 @@ class BeliefCritic(nn.Module):
         self.values = values
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values (T, B, heads) of inputs (T, B, inputs), and the memory after these steps."""
+        """Return the critic's values (T, B, heads) for inputs (T, B, inputs), and the memory after these steps."""
         x, state = self._actor[0].knowing(x, state)
         return self.values(x), state
 

@@ -140,7 +140,7 @@ class AgentBatch:
     weights: Tensor  # weights of the samples, as in the batch (B,)
 
     def select(self, index: Tensor) -> "AgentBatch":
-        """Return the samples at ``index``."""
+        """Return the samples of this batch at ``index``."""
         return AgentBatch(**{name: torch.index_select(value, 0, index) for name, value in vars(self).items()})
 
 

@@ -59,7 +59,7 @@ class IPPO(MAPPO):
         return [*self.critic.nets]  # type: ignore[list-item]
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
-        """Return values (B, agents); with a single agent (B,)."""
+        """Return the critics' values (B, agents) for observations; with a single agent the shape is (B,)."""
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
         if self.config.value_heads:

@@ -181,5 +181,5 @@ class TeamCritic(Team):
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return values for normalised observations (B, d): float32 (B, heads, agents)."""
+        """Return the state values of normalised observations (B, d): float32 (B, heads, agents)."""
         return torch.stack(self.outputs(x), dim=-1)

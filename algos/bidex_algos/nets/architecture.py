@@ -143,7 +143,7 @@ class Critics(nn.Module):
         self.nets = nn.ModuleList(network(*given) for _ in range(count))
 
     def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
-        """Return values (count, B) of actions (B, a) for normalised observations (B, d) and tasks (B,)."""
+        """Return the critics' values (count, B) of actions (B, a) for normalised observations (B, d) and tasks (B,)."""
         x = torch.cat([obs, actions], dim=1)
         all_values = torch.stack([net(x) for net in self.nets])
         if self.heads == 1:

@@ -92,7 +92,7 @@ def own_head(x: Tensor, weight: Tensor, bias: Tensor, index: Tensor, heads: int)
 
 
 class Linear(nn.Linear):
-    """PyTorch's layer, computed by :func:`affine`."""
+    """PyTorch's linear layer, computed by :func:`affine`."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (..., inputs) to (..., outputs)."""

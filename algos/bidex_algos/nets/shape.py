@@ -43,7 +43,7 @@ class Shape:
         return {"observations": self.observations, "actions": self.actions, "num_id_columns": self.num_id_columns}
 
     def state_dict(self) -> State:
-        """Return plain values for a checkpoint."""
+        """Return the shape as plain values for a checkpoint."""
         if self.hidden:
             hidden = {"hidden": self.hidden}
         else:

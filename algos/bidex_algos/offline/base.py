@@ -50,7 +50,7 @@ class OfflineConfig(NetworkConfig):
 
 @dataclass(frozen=True)
 class CriticConfig(OfflineConfig):
-    """Additional options of learners with critics."""
+    """Additional options of offline learners with critics."""
 
     value_heads: bool = True  # Give each critic one output per task instead of one output for all tasks.
     critic_layer_norm: bool = True

@@ -95,7 +95,10 @@ class ReturnScale:
         self.stats.merge(*task_moments(self.discounted[None], self.task_id, self.num_tasks, valid[None]))
 
     def deviation(self) -> Tensor:
-        """Return the standard deviation of each task's returns (num_tasks,), at least a tenth of their mean."""
+        """Return the standard deviation of each task's returns (num_tasks,).
+
+        The result is at least a tenth of the returns' absolute mean.
+        """
         # If all returns are almost equal, dividing by their standard deviation would inflate them.
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 

@@ -134,7 +134,7 @@ class ReturnBound(ReturnScale):
     factors over successive rewards is the same in both directions. At a time limit the episode is assumed to continue
     with its mean reward, or with the mean of its most recent rewards if that is larger. ``mass`` (N,) is the sum that
     would result if all rewards had been 1. ``recent`` (2, N) holds two sums with a discount of at most :data:`RECENT`:
-    that of the rewards, and that of a 1 for each reward.
+    the sum of the rewards, and the sum that would result if all rewards had been 1.
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):

@@ -1,4 +1,4 @@
-"""Demonstrations for PPO: a term of behaviour cloning in the loss, and behaviour cloning before the training."""
+"""Demonstrations for PPO: a behaviour-cloning term in the loss, and behaviour cloning before training."""
 
 import torch
 from torch import Tensor

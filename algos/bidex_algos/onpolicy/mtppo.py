@@ -133,7 +133,7 @@ class Batch:
     weights: Tensor  # 0 if physics broke in the transition, otherwise 1 (B,)
 
     def select(self, index: Tensor) -> "Batch":
-        """Return the samples at ``index``."""
+        """Return the samples of this batch at ``index``."""
         return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 

@@ -1,8 +1,8 @@
 """MT-TRPO: trust-region policy optimisation (Schulman et al. 2015) on all tasks of a world at once.
 
 An update moves by sqrt(2 max_kl / s^T F s) along s = F^-1 g, computed by conjugate gradients; g is the gradient of the
-mean of ratio x advantage, F the Fisher matrix of means and standard deviations. A line search then shortens the step
-until surrogate and KL satisfy their conditions. Finally the critic learns in some epochs of mini-batches.
+mean of ratio x advantage, and F is the Fisher matrix of means and standard deviations. A line search then shortens the
+step until surrogate and KL satisfy their conditions. Finally the critic learns in some epochs of mini-batches.
 """
 
 import math

@@ -34,9 +34,9 @@ def pour_water(hands: HandController) -> Actions:
     def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
         """Move both hands to the places where they hold a kettle.
 
-        ``origin`` is the kettle's origin, and ``tilt`` its tilt towards the spout, rad. The hands keep a distance of
-        ``loose`` metres from the kettle, or press it if ``loose`` is negative. They are shifted by ``aside`` metres
-        along x.
+        ``origin`` is the kettle's origin, and ``tilt`` is the kettle's tilt towards the spout, rad. The hands keep a
+        distance of ``loose`` metres from the kettle, or press it if ``loose`` is negative. They are shifted by
+        ``aside`` metres along x.
         """
 
         def at(x: float, along: float, up: float) -> Point:

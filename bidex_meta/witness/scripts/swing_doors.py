@@ -19,9 +19,9 @@ class _Leaf:
     """Geometry of one door leaf, seen from above. Lengths are in metres.
 
     The values come from assets/objects/door.xml. They are written for a leaf on the right hand's side, where y points
-    outwards from the middle of the door. ``hinge`` holds the hinge's x and y. ``along`` is the distance from the hinge
-    to the handle's bar along the leaf, and ``over`` the bar's offset from the hinge perpendicular to the leaf. The bar
-    is the one that faces the hands.
+    outwards from the middle of the door. ``hinge`` holds the hinge's x and y. ``along`` and ``over`` give the position,
+    relative to the hinge, of the handle bar that faces the hands: ``along`` is the distance along the leaf, and
+    ``over`` is the distance perpendicular to the leaf.
     """
 
     hinge: tuple[float, float]
