@@ -22,7 +22,7 @@ with extra("marl"):
 
 
 class HandsEnv(ParallelEnv):
-    """A single environment of a task class with several agents, which all get the same reward, end and `info`.
+    """A single environment of a task class with several agents, which all get the same reward, termination and `info`.
 
     `agents` divides the hands among agents: `"hands"`, `"fingers"`, `"single"` (one agent for everything), a TOML file,
     or a mapping from each agent's name to its units, which are fingers and palms (docs/learners/multiagent.md). Other

@@ -1,4 +1,4 @@
-"""Write a data set: first its path and name, then its parts (each complete or absent), and finally the index."""
+"""Write a data set: choose its path and name, write its parts (each is complete or absent), and write the index last."""
 
 import contextlib
 import json

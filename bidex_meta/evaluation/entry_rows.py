@@ -36,7 +36,7 @@ def class_row(solved: list[list[int]], episodes: int) -> Json:
 
 
 def row_table(solved: list[list[int]], episodes: int) -> np.ndarray:
-    """Return success (runs, units): the units are tasks, or episodes if there are few tasks (``MANY_TASKS``)."""
+    """Return success (runs, units). Units are tasks, or episodes if there are fewer than ``MANY_TASKS`` tasks."""
     counts = np.array(solved)
     if counts.shape[1] >= MANY_TASKS:
         return counts / episodes

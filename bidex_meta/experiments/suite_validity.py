@@ -1,6 +1,6 @@
 """Measure whether a suite tests adaptation.
 
-This requires, for example, that a policy fails if it does not know the task, and that rewards reveal the task.
+It does only if, for example, a policy that does not know the task fails, and rewards reveal the task.
 """
 
 from collections.abc import Collection, Sequence

@@ -308,8 +308,8 @@ class TaskClass(ABC):
     def obstacles(self, qpos: dict[str, Tensor]) -> list[tuple[str, Tensor, tuple[float, float, float]]]:
         """Return boxes so close to a hand that joint noise might push fingers into them; empty by default.
 
-        Each entry is the hand's side, the box's poses (n, 7), quaternion (x, y, z, w), and its half sizes, metres. A
-        hand that noise would push into its box starts without noise.
+        Each entry has the hand's side, the box's poses (n, 7), and the box's half sizes (metres). A pose is a position
+        (metres) and a quaternion (x, y, z, w). A hand that noise would push into its box starts without noise.
         """
         return []
 

@@ -371,7 +371,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, state: TaskState) -> list[Ghost]:
-        """Return both goals to draw in pictures: ellipsoids, or with wide variation rods along their axes."""
+        """Return both goals to draw in pictures: ellipsoids, or rods along the goals' axes if variation is wide."""
         goals = [state.frozen[f"goal{i}"] for i in (1, 2)]
         if not self.rules.wide:
             return [Ghost(goal, _HALF) for goal in goals]

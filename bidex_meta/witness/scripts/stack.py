@@ -45,7 +45,7 @@ def stack_in_order(hands: HandController) -> Actions:
 def _between(hands: HandController, block: str, other: str) -> Between:
     """Return the present state of the hands and of the block that they take.
 
-    If the ``other`` block is near, the hand on that side has less room before the hands close.
+    If the ``other`` block is near, the hand on that side keeps closer to the taken block until the hands close.
     """
     x, y, _ = (hands.where(f"{other}/position") - hands.where(f"{block}/position")).tolist()
     if abs(x) < 0.075:
