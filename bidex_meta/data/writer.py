@@ -1,4 +1,4 @@
-"""Write a data set: choose its path and name, write its parts (each is complete or absent), and write the index last."""
+"""Write a data set: choose its path and name, write its parts (each is complete or absent), and its index last."""
 
 import contextlib
 import json
