@@ -93,12 +93,12 @@ def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
 
 
 def _by_kind(kinds: Sequence[Json], runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
-    """Group runs with equal settings (``kinds``), and return each group's label and runs, in the order of first runs.
+    """Group runs with equal settings (``kinds``), and return each group's label and runs.
 
-    Runs of a study have an arm, the name of their configuration in the study. If all runs of a group, and no other
-    runs, come from one arm, the group's label is the arm. Otherwise the label lists the settings that differ between
-    groups. Runs whose worlds differ, for example in a version, form separate groups, and their labels name the
-    difference.
+    Groups are in the order in which their first runs appear. Runs of a study have an arm, the name of their
+    configuration in the study. If all runs of a group, and no other runs, come from one arm, the group's label is the
+    arm. Otherwise the label lists the settings that differ between groups. Runs whose worlds differ, for example in a
+    version, form separate groups, and their labels name the difference.
     """
     _check_copies(runs)
     members: dict[str, list[Run]] = {}

@@ -115,7 +115,7 @@ def report_loss() -> list[int] | None:
 
 
 def on_loss(function: Callable[[], None]) -> None:
-    """Set the function that is called before this process is ended because it hangs, waiting for a lost process."""
+    """Set a function that runs before this process is ended because another process was lost."""
     if _attendance is not None:
         _attendance.on_loss = function
 

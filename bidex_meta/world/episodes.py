@@ -105,9 +105,9 @@ def ended_info(info: Info) -> Info:
     """Return the keys that Gymnasium expects in the info of a step in which episodes ended.
 
     ``info`` has the keys that ``contract`` describes. ``episode`` holds r, l, success and unscaled, (N,) each; its mask
-    ``_episode`` marks episodes that ended and count. ``final_info`` holds values of the last step and ``episode``
-    again, each with a mask. ``_final_info`` marks all environments whose episode ended. Values are zero in environments
-    that a mask does not mark.
+    ``_episode`` marks the ended episodes that statistics include. ``final_info`` holds values of the last step and
+    ``episode`` again, each with a mask. ``_final_info`` marks all environments whose episode ended. Values are zero in
+    environments that a mask does not mark.
     """
     ended = info["_final_obs"]
     episode_mask = info["episode_mask"]

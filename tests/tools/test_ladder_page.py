@@ -70,7 +70,10 @@ def test_lines_stand_between_goal_shown_and_blind() -> None:
 
 def test_pairs_are_of_learners_that_see_their_own_rewards() -> None:
     lines = table(*learners())
-    assert any(line.startswith("This suite is good (defined below). In 3 pairs of learners") for line in lines)
+    assert any(
+        line.startswith("This suite meets the criteria for a good suite, defined below. In 3 pairs of learners")
+        for line in lines
+    )
     pairs = [cells(line) for line in lines[-3:]]
     assert [(first, second, apart) for first, second, _, apart in pairs] == [
         ("a", "b", "yes"), ("a", "c", "yes"), ("b", "c", "yes")

@@ -1,4 +1,7 @@
-"""Measure and train on a GPU within a quarter of an hour; a second call continues where the first one stopped."""
+"""Measure a GPU's speed and train policies on it within a quarter of an hour.
+
+A second call continues where the first one stopped.
+"""
 
 import json
 import os

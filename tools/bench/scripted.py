@@ -1,4 +1,4 @@
-"""Measure the success of the classes' scripts with and without switches of the physics."""
+"""Measure the success of the classes' scripts with and without options that change the physics."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Compare the speed of options of the physics with the speed without options, on one device."""
+"""Compare the simulation's speed with each of several physics options to its speed with the defaults, on one device."""
 
 import multiprocessing
 import statistics

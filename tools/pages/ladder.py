@@ -252,7 +252,7 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
         reasons.append(f"{separated} pairs of reward-only learners are separated, at least {_PAIRS_AT_LEAST} are asked")
     if not reasons:
         return (
-            f"This suite is good (defined below). In {separated} pairs of learners that see only rewards, "
-            "the worst seed of one learner is better than the best seed of the other."
+            f"This suite meets the criteria for a good suite, defined below. In {separated} pairs of learners that see "
+            "only rewards, the worst seed of one learner is better than the best seed of the other."
         )
     return f"The suite does not meet the rule yet: {'; '.join(reasons)}."

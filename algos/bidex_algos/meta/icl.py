@@ -325,7 +325,7 @@ class _Pupil:
         """Store each environment's own goal, and draw other goals, whose rewards are computed in hindsight.
 
         The other goals come from the same range. A goal has k entries in [-1, 1]. Entries that a class does not use are
-        random, in the own goal as well.
+        random in all goals.
         """
         goals = self._data.goals
         world = self._learner.world

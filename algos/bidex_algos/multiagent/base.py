@@ -247,7 +247,8 @@ class MultiAgent(OnPolicy):
 class OwnAdams(MultiAgent):
     """Base of multi-agent learners with one optimiser per network.
 
-    The step size of each optimiser adapts so that the KL divergence of an agent stays near the agent's share.
+    The step size of each optimiser adapts so that the KL divergence of an agent's policy stays near an equal share of
+    the KL target.
     """
 
     config: MultiAgentPPOConfig

@@ -112,9 +112,9 @@ class Moore(Headed):
     Gram-Schmidt; w_k are the weights of the experts in task k. The task's one-hot selects w_k and is not fed to the
     experts. Heads per task are the paper's multi-head variant.
 
-    We made three additions. The mixture is multiplied by the root of its width, so that its entries are as large as the
-    entries of another layer. The mixture then passes through the config's non-linearity. Each w_k is initially a random
-    vector of unit norm.
+    We made three additions. The mixture is multiplied by the root of its width, so that its entries are as large as
+    those of a usual hidden layer. The mixture then passes through the config's non-linearity. Each w_k is initially a
+    random vector of unit norm.
     """
 
     def __init__(

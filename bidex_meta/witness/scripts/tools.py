@@ -73,7 +73,7 @@ def open_pen(hands: HandController) -> Actions:
 
 
 def _around(hands: HandController, side: str, along: Tensor, way: float, closed: float) -> Point:
-    """Bend a hand's fingers around its end of the pen, and return the next target of the hand's point.
+    """Bend a hand's fingers around its end of the pen, and return the next target of the hand, metres.
 
     ``closed`` rises from 0 to 1 as both hands close. At 0 the hand moves to its end of the pen; at 1 it moves ``way``
     metres along the pen, in the direction ``along``.

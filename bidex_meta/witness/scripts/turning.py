@@ -30,7 +30,7 @@ def turn_cubes(hands: HandController) -> Actions:
 
 
 def _next(hands: HandController, side: str) -> Point:
-    """Bend a hand's fingers, set the hand's next orientation, and return the next target of the hand's point."""
+    """Bend a hand's fingers, set the hand's next orientation, and return the next target of the hand, metres."""
     cube, goal = _CUBES[side]
     place = hands.where(f"{cube}/position")
     knuckles = _knuckles(hands, side, "position")
