@@ -13,7 +13,7 @@ from bidex_meta.world.episodes import set_stagger
 
 @contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Raise BidexError if an import in the block fails because the optional extra ``name`` is not installed."""
+    """Raise BidexError if an import in a ``with`` block fails because the optional extra ``name`` is not installed."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -126,7 +126,7 @@ def distances(part: Hidden, values: Tensor, centre: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Identified:
-    """Errors of hidden parts that were inferred from the rewards of one exploring episode."""
+    """Errors of a task's hidden values, as inferred from the rewards of one exploring episode."""
 
     share: float  # Share of episodes in which every part is fitted within its tolerance.
     errors: np.ndarray  # Largest error of a part in units of its tolerance, (episodes,).

@@ -83,7 +83,7 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
 def lay_egg_on_hand(
     egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
 ) -> None:
-    """Lift an egg off the palm and open fingers, so that the egg does not penetrate the hand at the start.
+    """Lift an egg off the palm, and open the fingers, so that the egg does not penetrate the hand at the start.
 
     ``egg`` holds the egg's poses (n, 7), quaternion (w, x, y, z), and ``joints`` holds the hand's joint angles (n, 24),
     rad. Both are changed in place. The hand starts at ``pose``. ``radius`` and ``half`` are the short and the long

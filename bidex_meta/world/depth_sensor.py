@@ -22,7 +22,7 @@ POINT_ENTRIES = {"points": 3, "kind_points": 4}
 
 @dataclass(frozen=True)
 class PointsRule:
-    """Observations with a cloud of ``count`` points (768 in the original) in place of the objects' state.
+    """Observations with a cloud of ``count`` points (768 in Bi-DexHands) in place of the objects' state.
 
     ``kinds`` says whether each point has a fourth entry: 1 for an object, 0 for a hand, -1 for a fixture.
     """

@@ -68,12 +68,12 @@ def _to_cap(hands: HandController, missing: float) -> Tensor:
 
 
 def _axis(hands: HandController) -> Tensor:
-    """Return the direction in which the cap slides, world."""
+    """Return the direction in which the cap slides, in the world frame."""
     return rotate(hands.orientation("bottle/quaternion"), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
 
 
 def _ahead(hands: HandController) -> Tensor:
-    """Return the direction in which the left hand's straight fingers point, world."""
+    """Return the direction in which the left hand's straight fingers point, in the world frame."""
     way = hands.where("left/palm_position") - hands.where("left/mount_position")
     return way / way.norm()
 
