@@ -46,6 +46,8 @@ _NAME = re.compile(rf"(MT1|ML1)-([^-]+)-(v2|{'|'.join(_VARIANTS)})")
 _Task = tuple[str, Literal["train", "test", "both"], dict[str, float]]
 _SHARED_TASKS = 50
 """Number of tasks in each split of a shared suite. The test tasks lie midway between the train tasks."""
+_STRIDE = 19
+"""Number of angles from a task of a shared suite to the next task, so that the first tasks cover the whole range."""
 
 
 HIDDEN_NUMBERS = {
@@ -130,12 +132,14 @@ class OfOneClass(NamedTuple):
         """Return the tasks of a suite in which both angles of the goal are equal.
 
         The tasks of a split are evenly spaced over the class's range of angles. Test tasks lie midway between train
-        tasks. A suite that shows its goals has only train tasks.
+        tasks. The order is not that of the angles, because evaluations may play only the first tasks. A suite that
+        shows its goals has only train tasks.
         """
         choice = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
-        for number in range(_SHARED_TASKS):
+        for place in range(_SHARED_TASKS):
+            number = place * _STRIDE % _SHARED_TASKS
             for split in splits:
                 share = (number + 0.25 + 0.5 * (split == "test")) / _SHARED_TASKS
                 angle = choice.lowest + share * (choice.highest - choice.lowest)
