@@ -244,15 +244,15 @@ def _verdict(suite: str, lines: dict[str, Line], pairs: Sequence[Sequence[str]])
     else:
         most = 1.0 / int(choices[1])
     if shown < _GOAL_SHOWN_AT_LEAST:
-        reasons.append(f"goal-shown PPO reaches {shown:.0%}, at least {_GOAL_SHOWN_AT_LEAST:.0%} is asked")
+        reasons.append(f"goal-shown PPO reaches {shown:.0%}, and {_GOAL_SHOWN_AT_LEAST:.0%} is required")
     if blind > most:
         reasons.append(f"blind PPO reaches {blind:.0%}, at most {most:.0%} is allowed")
     separated = sum(pair[-1] == "yes" for pair in pairs)
     if separated < _PAIRS_AT_LEAST:
-        reasons.append(f"{separated} pairs of reward-only learners are separated, at least {_PAIRS_AT_LEAST} are asked")
+        reasons.append(f"{separated} pairs of reward-only learners are separated, and {_PAIRS_AT_LEAST} are required")
     if not reasons:
         return (
             f"This suite meets the criteria for a good suite, defined below. In {separated} pairs of learners that see "
             "only rewards, the worst seed of one learner is better than the best seed of the other."
         )
-    return f"The suite does not meet the rule yet: {'; '.join(reasons)}."
+    return f"The suite does not yet meet the criteria for a good suite, defined below: {'; '.join(reasons)}."
