@@ -151,7 +151,7 @@ def _pull(hands: HandController, missing: float) -> Point:
 
 
 def _aside(hands: HandController) -> Point:
-    """Return the next target of the left hand: away from the handle, then to a place beside the table."""
+    """Return the next target of the left hand: away from the handle, then to a place next to the table."""
     free = ramp(_peg(hands)[0], 0.09, 0.13)
     x, y, z = hands.at("left").tolist()
     return x + 0.05 + free * (0.1 - x), y - 0.08 - free * (0.27 + y), z + free * (0.86 - z)
