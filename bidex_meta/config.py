@@ -154,8 +154,8 @@ class RunConfig(Generic[LearnerSettings]):
     """Stop as soon as this fraction of episodes succeeds, such as 0.8. It is measured in evaluations if
     --evaluate-every is given, otherwise in training with exploration noise. None: never."""
     stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
-    """Stop as soon as the normalised score in evaluations reaches this value; the expert's score is 100. Needs
-    --evaluate-every. None: never."""
+    """Stop as soon as the score in evaluations reaches this value (docs/evaluation.md). Needs --evaluate-every. None:
+    never."""
     processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
     """Processes that train together."""
     seed: Seed = 0

@@ -52,7 +52,7 @@ COMMANDS: dict[str, Command] = {
     "play": Command("bidex_meta.cli.play_live", "watch a policy live, in a window or in the browser"),
     "demo": Command("bidex_meta.cli.demo", "watch the policy that comes with bidex-meta, live or as a film"),
     "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
-    "baseline": Command("bidex_meta.cli.baseline", "measure the reference returns of the normalised score"),
+    "baseline": Command("bidex_meta.cli.baseline", "measure returns of untrained policies and known solutions"),
     "validity": Command("bidex_meta.cli.validity", "measure whether a suite's tasks must be identified to be solved"),
     "plot": Command("bidex_meta.cli.plot", "draw learning curves of runs"),
     "export": Command("bidex_meta.cli.export", "write a policy as an ONNX file and check it against torch"),

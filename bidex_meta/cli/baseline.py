@@ -1,4 +1,4 @@
-"""``bidex-meta baseline``: measure the reference returns that define the normalised score."""
+"""``bidex-meta baseline``: measure the reference returns, which define the score of version 1."""
 
 import json
 from collections.abc import Sequence
@@ -17,13 +17,15 @@ from bidex_meta.utils.validation import Few, Seed, Threads
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Measure a return that defines the normalised score: the return of an untrained policy or of a known solution.
+    """Measure a reference return: the return of an untrained policy or of a known solution.
 
     Example: bidex-meta baseline random --suite MT20 --out random.json
 
-    The score is 0 at the return of random or of zero actions, whichever is better. It is 100 at the return of the best
-    known policy, the expert. An episode in which the physics breaks gets the return of the worst finished episode of
-    its class in this command, and the stored return of random actions in other commands.
+    In version 1 the score is 0 at the return of random or of zero actions, whichever is better. It is 100 at the return
+    of the best known policy, the expert. In version 2 it needs no references.
+
+    An episode in which the physics breaks gets the return of the worst finished episode of its class in this command,
+    and the stored return of random actions in other commands.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]

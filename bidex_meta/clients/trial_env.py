@@ -109,7 +109,8 @@ class TrialWorld(PooledWorldWrapper):
     def _forget(self, mask: Tensor) -> None:
         """Clear what is stored about finished trials in the environments of ``mask``, where new trials begin.
 
-        Stored are the last step's action, reward and end of an episode, the sums over the trial, and the clock.
+        The stored values are the last step's action and reward, whether it ended an episode, the sums over the trial,
+        and the clock.
         """
         self._clock.begin(mask)
         self._last = self._last.masked_fill(mask[:, None], 0.0)

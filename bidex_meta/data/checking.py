@@ -238,7 +238,7 @@ class SlotSummary:
     length: float  # mean length of an episode, steps
     returns: tuple[float, float, float, float]  # unscaled: least, median, mean, largest
     success: float  # share of episodes that met their goal
-    score: float | None  # mean normalised score (``evaluation.references``); None if a reference is missing
+    score: float | None  # mean score (``evaluation.references``); None if a reference is missing
     tasks: int  # number of different tasks
     broken: int  # episodes ended by broken physics
 
@@ -258,7 +258,8 @@ def summary(dataset: Dataset) -> list[SlotSummary]:
         steps = table["steps"][own]
         scores = None
         if known := dataset.metadata.get("references", {}).get(name.partition("/")[0]):
-            scores = Reference(known["random"], known.get("expert"), known.get("zero")).scores(returns)
+            values = [known.get(name) for name in ("random", "expert", "zero", "episode_steps")]
+            scores = Reference(*values).scores(returns)
         summaries.append(
             SlotSummary(
                 name=name,

@@ -33,11 +33,12 @@ _CHECKED_AT_OPENING = 64_000_000
 
 @dataclass(frozen=True)
 class _Reference:
-    """Mean returns of a class's reference policies, before the suite's reward scale."""
+    """Mean returns of a class's reference policies, before the suite's reward scale; see ``evaluation.references``."""
 
-    random: Finite
+    random: Finite | None = None
     zero: Finite | None = None
     expert: Finite | None = None
+    episode_steps: Whole | None = None
 
 
 @dataclass(frozen=True)

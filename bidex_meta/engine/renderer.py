@@ -15,8 +15,9 @@ from bidex_meta.engine.protocol import CAMERA, GHOST_GROUP, Renderer
 class BatchRenderer(Renderer):
     """Draws ``num`` environments of a model, seen by the model's camera ``CAMERA``, on the engine's device.
 
-    Geoms of ``GHOST_GROUP`` are translucent: mujoco_warp draws opaque geoms only, so their pixels are mixed from a
-    picture with these geoms and a picture without them. ``on_device`` is the context in which Warp's work is launched.
+    Geoms of ``GHOST_GROUP`` are translucent: mujoco_warp draws opaque geoms only, so the pixels of translucent geoms
+    are mixed from a picture with these geoms and a picture without them. ``on_device`` is the context in which Warp's
+    work is launched.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ class Group:
     classes: list[str]  # class names, columns of the arrays below
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
-    scores: np.ndarray | None  # normalised score, (seeds, classes); None if a class has no reference
+    scores: np.ndarray | None  # score, (seeds, classes); None if a class has no reference
     steps: int  # environment steps, summed over the runs of a seed, then averaged over seeds
     steps_range: tuple[int, int]  # smallest and largest number of steps of a seed
     hours: float  # hours of training without evaluation, summed and averaged like ``steps``
@@ -153,7 +153,7 @@ def _check_copies(runs: Sequence[Run]) -> None:
 def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
     """Return the data of a plot that compares groups of runs, by the title of the panel.
 
-    A panel shows success or normalised score. It has a label, an interquartile mean and its interval for each group.
+    A panel shows success or score. It has a label, an interquartile mean and its interval for each group.
     """
     pictured: dict[str, list[tuple[str, float, Interval | None]]] = {}
     for group in groups:
@@ -180,7 +180,7 @@ def success_over(group: Group, first: Group) -> Estimate | None:
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Return the interquartile mean of a group's normalised score minus that of the first group, with an interval.
+    """Return the interquartile mean of a group's score minus that of the first group, with an interval.
 
     The result is None if ``group`` is the first group, if the groups have different classes, or if either group has no
     scores.

@@ -39,7 +39,7 @@ def evaluate(
     The world must be in autoreset mode DISABLED and have at least one environment for each task. Environments that
     share a task share its episodes. If ``episodes_per_task`` or ``seed`` is given, it replaces the value of
     ``protocol``. By default, ``protocol`` has 4 episodes per task and the seed ``EVALUATION_SEED``, like the commands.
-    ``references`` holds each class's reference returns, which define the normalised score and the return of episodes
+    ``references`` holds each class's reference returns, which define the score and the return of episodes
     whose physics broke. By default they are those that the installation stores for the world's classes.
 
     Raises BidexError if the world resets by itself or has too few environments, if a number is out of range, if the

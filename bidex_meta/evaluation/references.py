@@ -1,25 +1,31 @@
-"""Reference returns, which define the normalised score and the return of episodes with broken physics.
+"""Reference returns, which define the score of version 1 and the return of episodes with broken physics.
 
 References were measured with moving hand bases, as in every suite. ``assets/references/`` holds mean returns of random
 actions, zero actions, experts (the best known policies), recorded reference solutions in open-loop replay (called
-``witness``) and scripted policies. The better of random and zero actions scores 0. ``python -m tools.experts`` writes
-the returns of experts. ``bidex-meta baseline`` measures the others.
+``witness``) and scripted policies; entries of version 2 end in ``-v2``. In version 1 the better of random and zero
+actions scores 0. ``python -m tools.experts`` writes the returns of experts. ``bidex-meta baseline`` measures the
+others. In version 2 the reward of a step is in [0, 1], so the score needs no references.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypedDict
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import msgspec
 import numpy as np
 
 from bidex_meta.errors import BidexError
+from bidex_meta.rules import V2, plain_name, versioned_name
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import exists, read_json
 from bidex_meta.utils.validation import Finite, parse
+
+if TYPE_CHECKING:
+    from bidex_meta.tasks.base import TaskClass
 
 Kind = Literal["random", "zero", "expert", "witness", "script"]
 _Row = TypedDict("_Row", {"return": Finite})
@@ -31,25 +37,30 @@ class _File(TypedDict):
 
 @dataclass(frozen=True)
 class Reference:
-    """Mean returns of baseline and expert policies in a class, which define its normalised score."""
+    """Mean returns of baseline and expert policies in a class, and what else defines its score."""
 
-    random: float  # mean return of uniform actions
+    random: float | None  # mean return of uniform actions; None if unknown
     expert: float | None = None  # mean return of the best known policy; None if no policy is above the floor
     zero: float | None = None  # mean return of zero actions; None if unknown
+    episode_steps: int | None = None  # steps of a full episode, if the reward of a step is in [0, 1]
 
     @property
-    def floor(self) -> float:
+    def floor(self) -> float | None:
         """Return the floor: the better return of random actions and zero actions, which gets the score 0."""
-        if self.zero is None:
+        if self.zero is None or self.random is None:
             return self.random
         return max(self.random, self.zero)
 
     def scores(self, returns: np.ndarray) -> np.ndarray | None:
-        """Return the normalised scores of ``returns``: 100 · (R − R_floor) / (R_expert − R_floor) for each return R.
+        """Return the scores of ``returns``, which are sums of the unscaled reward.
 
-        The result is None if the expert's return is unknown or not greater than the floor.
+        In version 2 a score is 100 times the mean reward per step of a full episode. In version 1 it is the normalised
+        return, 100 · (R − R_floor) / (R_expert − R_floor). The result is None in version 1 if a reference is unknown or
+        the expert's return is not greater than the floor.
         """
-        if self.expert is None or self.expert <= self.floor:
+        if self.episode_steps is not None:
+            return 100 * returns / self.episode_steps
+        if self.expert is None or self.floor is None or self.expert <= self.floor:
             return None
         return 100 * (returns - self.floor) / (self.expert - self.floor)
 
@@ -64,7 +75,7 @@ def counted_returns(
     with the return of the worst ``finished`` episode (n,) of this policy and of the policies that are compared with it.
     An episode whose own return is lower keeps its own return.
     """
-    if reference is None:
+    if reference is None or reference.random is None:
         others = finished
     else:
         others = np.array([reference.random])
@@ -119,7 +130,7 @@ def references() -> dict[str, Reference]:
     for name, random in _returns("random").items():
         reference = Reference(random, zero=zero.get(name))
         expert = experts.get(name)
-        if expert is not None and expert > reference.floor:
+        if expert is not None and expert > max(random, reference.zero or random):
             reference = replace(reference, expert=expert)
         known[name] = reference
     return known
@@ -130,28 +141,42 @@ def _returns(kind: Kind) -> dict[str, float]:
 
 
 def references_of(world: object) -> dict[str, Reference]:
-    """Return the reference returns of all classes if they apply to a world, otherwise an empty dict.
+    """Return the references of a world's classes, as ``references_for`` does; empty for other libraries' classes."""
+    return references_for({slot.name.partition("/")[0]: slot.task_class for slot in getattr(world, "slots", ())})
 
-    References do not apply to classes of other libraries, to classes of version 2, or to hands with fixed bases.
+
+def references_for(classes: "Mapping[str, TaskClass]") -> dict[str, Reference]:
+    """Return the references that apply to classes, by the names that ``classes`` gives them.
+
+    Stored returns do not apply to hands with fixed bases, or to tasks and rewards other than those of versions 1 and 2.
     """
-    classes = [slot.task_class for slot in getattr(world, "slots", ())]
-    if classes and all(task.moving_base and task.rules.as_printed for task in classes):
-        return references()
-    return {}
+    known = references()
+    found: dict[str, Reference] = {}
+    for name, task in classes.items():
+        reference = None
+        if task.moving_base and (task.rules == V2 or task.rules.as_printed):
+            reference = known.get(versioned_name(name, task.rules))
+        if task.rules.reward == "v2":
+            reference = replace(reference or Reference(None), episode_steps=task.episode_steps)
+        if reference is not None:
+            found[name] = reference
+    return found
 
 
 def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, ClassSummary]:
     """Compute the normalised scores in an evaluation's results again, from the installed reference returns.
 
-    This makes the scores of different runs comparable. References hold only for moving hand bases. The bases are known
-    to have moved if the run's config says so, or if any class has a score already. Otherwise all results are returned
-    unchanged.
+    This makes the scores of different runs comparable. Scores of version 2 need no references and do not change.
+    References hold only for moving hand bases. The bases are known to have moved if the run's config says so, or if any
+    class has a score already. Otherwise all results are returned unchanged.
     """
+    if config.task is not None and plain_name(config.task) != config.task:
+        return classes
     if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes
     known = references()
     rows = dict(classes)
-    for name in known.keys() & classes.keys():
+    for name in [name for name, row in classes.items() if name in known and row.episode_steps is None]:
         scores = known[name].scores(np.array([classes[name].mean_return]))
         rows[name] = msgspec.structs.replace(classes[name], score=None if scores is None else float(scores[0]))
     return rows

@@ -24,7 +24,7 @@ class ClassResult:
     lengths: np.ndarray  # steps, int64
     tasks: np.ndarray  # index of the played task in the class's pool, int64
     unstable: int  # episodes that ended because the physics broke
-    reference: Reference | None = None  # for the normalised score and broken episodes, if known
+    reference: Reference | None = None  # for the score and broken episodes, if known
     once: float | None = None  # share of episodes solved at any step
     at_end: float | None = None  # share of episodes solved in their last steps (``suite.HELD_STEPS``)
 
@@ -45,7 +45,7 @@ class ClassResult:
 
     @property
     def score(self) -> float | None:
-        """Return the mean normalised score; None if a reference is missing."""
+        """Return the mean score; None if a reference is missing."""
         scores = self.scores
         if scores is None:
             return None
@@ -53,7 +53,7 @@ class ClassResult:
 
     @property
     def scores(self) -> np.ndarray | None:
-        """Return the normalised score of each episode, ``(episodes,)``; None if a reference is missing."""
+        """Return the score of each episode, ``(episodes,)``; None if a reference is missing."""
         if self.reference is None:
             return None
         return self.reference.scores(self.returns)
@@ -87,6 +87,7 @@ class ClassResult:
             success_once=self.once, success_at_end=self.at_end,
             mean_return=self.mean_return, return_interval=estimate(mean, self.drawn(self.returns)).interval,
             length=float(self.lengths.mean()), score=self.score, episodes=self.episodes,
+            episode_steps=None if self.reference is None else self.reference.episode_steps,
             tasks=len(np.unique(self.tasks)), unstable=self.unstable, solved=self.solved,
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Measure reference returns for the normalised score.
+"""Measure reference returns, which also define the score of version 1.
 
 The references are returns of untrained policies, of witnesses (stored action sequences that solve a task) and of
 scripted policies.
@@ -11,6 +11,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.rules import V2, versioned_name
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.files import portable
@@ -34,6 +35,8 @@ def baseline(
 ) -> Evaluation:
     """Measure the returns and success of a simple reference policy on the train tasks of a suite.
 
+    Results of a suite of version 2 are stored under the names of version 2, such as BottleCap-v2.
+
     Args:
         policy: Name of the policy, a key of ``POLICIES``, such as ``random`` or ``script``.
         suite: Name or file of a suite in which the bases of the hands move.
@@ -52,6 +55,12 @@ def baseline(
     worlds = open_worlds(WorldsConfig(suite=suite, seed=seed, threads=threads))
     if not worlds.moving_bases:
         raise BidexError(f'References are for moving bases, but {suite} has fixed ones. Write base = "moving".')
+    rules = next(iter(worlds.task_classes().values())).rules
+    if out is not None and rules != V2 and not rules.as_printed:
+        raise BidexError(
+            f"References are for the rules of version 1 or 2, but {suite} mixes them. Leave --out away, or change the "
+            "suite's file."
+        )
     if policy == "script":
         found = _scripted(worlds, episodes)
     else:
@@ -59,7 +68,8 @@ def baseline(
     if out is not None:
         made = {"policy": POLICIES[policy], "suite": portable(suite), "seed": seed, "versions": collect_versions()}
         rows = found.to_json()["classes"]
-        references.store(out, {name: {key: row[key] for key in _STORED} for name, row in rows.items()}, made)
+        stored = {versioned_name(name, rules): {key: row[key] for key in _STORED} for name, row in rows.items()}
+        references.store(out, stored, made)
     return found
 
 

@@ -143,7 +143,7 @@ def _observations(rows: int, shape: Json) -> torch.Tensor:
 
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:
-    """Return the metadata of the ONNX file, each a text; numbers, lists and dicts are written as JSON."""
+    """Return the metadata of the ONNX file as strings; numbers, lists and dicts are written as JSON."""
     worlds = open_worlds(config.to_json())
     versions = folder.versions()
     facts = {

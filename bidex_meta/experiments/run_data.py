@@ -36,14 +36,14 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     - ``reward_scales``: factor of the reward by slot; ``rules``: the suite's rules; ``hides_goals``
     - ``observation_groups``: name and index ranges of each group
     - ``kind`` (``random``, ``medium``, ...), ``policies``, and ``seed`` of the tasks
-    - ``references``: {class: {random, zero, expert}}, unscaled returns
+    - ``references``: {class: fields of ``evaluation.references.Reference``}, unscaled returns
     - ``versions`` and ``commit``
     - ``gymnasium_id``: id of the same environment in Gymnasium; None for a suite or a class with changed options
     """
     alone = source.class_name
     versions = collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
-    references = {name: known for name, known in source.references().items() if name in names}
+    references = {name: asdict(known) for name, known in source.references().items() if name in names}
     altered = source.object or source.points or source.touch or source.moving_base is not None
     env_id = None
     if alone and not altered and task_id(alone) in gymnasium.registry:
@@ -66,7 +66,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "hides_goals": source.hides_goals,
         "observation_groups": [[g.name, [[p.start, p.stop] for p in g.where]] for g in world.observation_groups],
         "kind": kind, "policies": list(policies), "seed": source.seed,
-        "references": {n: {"random": k.random, "zero": k.zero, "expert": k.expert} for n, k in references.items()},
+        "references": references,
         "versions": versions, "commit": (versions["git"] or {}).get("commit"),
         "gymnasium_id": env_id,
         **more,

@@ -63,7 +63,8 @@ class ClassSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_return: Finite = msgspec.field(name="return")
     return_interval: Interval | None = None
     length: Finite | None = None  # mean length, steps
-    score: Finite | None = None  # mean normalised score; None if a reference is missing
+    score: Finite | None = None  # mean score (``evaluation.references``); None if a reference is missing
+    episode_steps: Few | None = None  # version 2: steps of a full episode; the score is 100 * return / episode_steps
     episodes: Whole | None = None
     tasks: Few | None = None
     unstable: Whole | None = None  # episodes that ended because the physics broke

@@ -34,12 +34,12 @@ class LiftUnderarm(OwnObjectClass):
 
     Observation: Table 18 of the paper's appendix, size (428). Reward: equation 6.
 
-    In version 1 the goal lies 25 to 45 cm above the pot's start in the task, and up to 5 cm to each side along x and y.
-    It has the start's orientation, including yaw. In version 2 the goal is relative to the nominal start instead, and
-    varies more.
+    In version 1 the goal lies 25 to 45 cm above the start that the task gives the pot, and up to 5 cm to each side
+    along x and y. It has the start's orientation, including yaw. In version 2 the goal varies more, and is relative to
+    the class's nominal start instead, because every episode draws another start.
 
-    The pot starts at rest on the table; at the original's height it would start 1.5 cm inside the table. The friction
-    is 3 between pot and table, and 2 between the pot's wall and a hand.
+    The pot starts at rest on the table; at the height in the original Bi-DexHands it would start 1.5 cm inside the
+    table. The friction is 3 between pot and table, and 2 between the pot's wall and a hand.
     """
 
     needs = Capacity(36, 4, 82)

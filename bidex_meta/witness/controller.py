@@ -135,7 +135,7 @@ class HandController:
             yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
-        """Yield the targets of one control step, which move the hands' points towards ``points``.
+        """Yield the targets of one control step that moves a point of each hand towards its goal in ``points``.
 
         The first point is for the right hand, the second for the left hand (world, metres). ``speed`` is the limit in
         m/s.

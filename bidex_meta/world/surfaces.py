@@ -1,4 +1,4 @@
-"""Points with normals on the visible surfaces of a scene, fixed to its bodies: the candidates of a cloud.
+"""Points with normals on the visible surfaces of a scene, fixed to its bodies. Point clouds are drawn from them.
 
 Even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
 Sequences").

@@ -8,7 +8,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
-from bidex_meta.evaluation.references import Reference, references
+from bidex_meta.evaluation.references import Reference, references_for
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.rules import Rules
 from bidex_meta.suite import OTHER_SEED, Suite, load_randomisation
@@ -114,6 +114,10 @@ class Worlds(ABC):
     def task_classes(self) -> "dict[str, TaskClass]":
         """Return the classes of the train split by name; raises BidexError for classes of another library."""
 
+    def all_task_classes(self) -> "dict[str, TaskClass]":
+        """Return the classes of all splits by name; otherwise as ``task_classes``."""
+        return self.task_classes()
+
     @property
     def short_name(self) -> str:
         """Return the name. For a user's own suite file, this is the file's name without folder and suffix."""
@@ -165,18 +169,15 @@ class Worlds(ABC):
         ``physics`` is a digest of the classes' physics (``bidex_meta.engine.models``), or None for classes of another
         library. ``suite_version`` and ``suite_digest`` come from the suite's file; they are None without one.
         """
-        return {"physics": physics_of(self.task_classes()), "suite_version": None, "suite_digest": None}
+        return {"physics": physics_of(self.all_task_classes()), "suite_version": None, "suite_digest": None}
 
     def references(self) -> dict[str, Reference]:
-        """Return the reference returns of classes; the dict is empty if the references do not apply.
+        """Return the references of the classes, by name; classes without any are left out.
 
-        References define the normalised score, and the return that an episode with broken physics gets. They do not
+        References define the score, and the return that an episode with broken physics gets. Stored returns do not
         apply if bases, tasks or reward differ from those with which they were measured.
         """
-        as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
-        if self.moving_bases and as_printed:
-            return references()
-        return {}
+        return references_for(self.all_task_classes())
 
     def protocol(self, split: str, episodes: int | None = None, seed: int = EVALUATION_SEED) -> Protocol:
         """Return the protocol of an evaluation with ``episodes`` (None: ``default_episodes``) per task of a split."""

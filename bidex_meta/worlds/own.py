@@ -9,7 +9,7 @@ from bidex_meta.rules import V1, V2, Rules, plain_name
 from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig, physics_of
+from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig
 
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import PooledWorld, TaskClass
@@ -60,6 +60,10 @@ class OwnSuite(Worlds):
         """See ``Worlds``."""
         return self.benchmark.task_classes()
 
+    def all_task_classes(self) -> "dict[str, TaskClass]":
+        """See ``Worlds``."""
+        return self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
+
     @property
     def rules(self) -> Rules:
         """Return the suite's rules."""
@@ -67,9 +71,7 @@ class OwnSuite(Worlds):
 
     def identity(self) -> Identity:
         """Return the identity of the classes of both splits; see ``Worlds``."""
-        classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
-        physics = physics_of(classes)
-        return {"physics": physics, "suite_version": self.suite.version, "suite_digest": self.suite.digest}
+        return super().identity() | {"suite_version": self.suite.version, "suite_digest": self.suite.digest}
 
 
 class SingleClass(Worlds):

@@ -32,6 +32,7 @@ def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base:
     assert rescored == {"A": today, "B": today, "Lamp": rows["Lamp"]}
     unscored = {"B": rows["B"]}  # nobody could say of what base, but where the run says so itself
     assert references.rescored(unscored, run_config(base=base))["B"].score == (25.0 if base == "moving" else None)
+    assert references.rescored(unscored, run_config(base=base, task="B-v2")) == unscored
 
 
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:
@@ -59,21 +60,22 @@ def test_every_class_has_an_expert_that_solves_it_and_beats_doing_nothing_and_do
     assert all(row["success"] >= 0.5 and "MT" not in row["source"] for row in stored.values())
 
 
-@pytest.mark.parametrize("what", ["random", "zero"])
+@pytest.mark.parametrize(("what", "suite"), [("random", "MT4"), ("zero", "MT4-v2")])
 def test_baseline_measures_every_class_and_stores_what_it_printed(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    what: str, suite: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED", source.seed))
     out = tmp_path / "random.json"
-    arguments = ["baseline", what, "--suite", "MT4", "--episodes", "1", "--out", str(out), "--json"]
+    arguments = ["baseline", what, "--suite", suite, "--episodes", "1", "--out", str(out), "--json"]
     assert main(arguments) == 0
     printed, stored = json.loads(capsys.readouterr().out), json.loads(out.read_text())["classes"]
-    assert printed.keys() == stored.keys()
+    ending = suite.removeprefix("MT4")
+    assert {name + ending for name in printed} == stored.keys()
     for name, row in stored.items():
-        assert row["return"] == printed[name]["return"]
-        assert row["episodes"] == printed[name]["episodes"] > 0
+        assert row["return"] == printed[name.removesuffix(ending)]["return"]
+        assert row["episodes"] == printed[name.removesuffix(ending)]["episodes"] > 0
         assert row["made"]["policy"].startswith({"random": "uniform", "zero": "zero"}[what])
-        assert row["made"]["suite"] == "MT4" and row["made"]["versions"]["packages"]["mujoco"]
+        assert row["made"]["suite"] == suite and row["made"]["versions"]["packages"]["mujoco"]
 
 
 def test_a_baseline_without_out_writes_nothing(
@@ -104,3 +106,13 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     assert open_worlds({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
+
+
+def test_a_suite_that_mixes_rules_makes_no_references(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite = tmp_path / "mine.toml"
+    text = (paths.suites_dir() / "MT1-v2.toml").read_text()
+    suite.write_text(text.replace('variation = "wide"', 'variation = "narrow"'))
+    assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
+    assert "mixes" in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
+    (known,) = open_worlds({"suite": str(suite)}).references().values()
+    assert (known.random, known.episode_steps) == (None, registry.get("CatchUnderarm").episode_steps)

@@ -16,6 +16,7 @@ from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
 from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.tasks import registry
+from tests.fakes import run_config
 from tests.points import Finder, PointWorld, Still, ring
 from tests.tasks.worlds import mixed_world
 from tests.world.play import class_world
@@ -70,6 +71,25 @@ def test_an_agent_that_knows_nothing_scores_nothing(name: str) -> None:
         scores = known.scores(np.array([references.load(kind)[name]["return"]]))
         assert scores is None or scores[0] <= 1.0
     assert known.expert is None or known.scores(np.array([known.expert])) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_the_score_of_version_2_needs_no_expert(name: str) -> None:
+    """References of version 2 are stored, and an untrained policy gets less than the reward of every step."""
+    task = registry.get(f"{name}-v2", moving_base=True)
+    (known,) = references.references_for({name: task}).values()
+    stored = [references.load(kind)[f"{name}-v2"]["return"] for kind in ("random", "zero")]
+    assert [known.random, known.zero] == stored and all(0.0 < value < 0.95 * task.episode_steps for value in stored)
+    assert known.scores(np.array([0.0, task.episode_steps])).tolist() == [0.0, 100.0]
+
+
+def test_scores_of_version_2_are_the_mean_reward_per_step() -> None:
+    world = class_world("Switch-v2", 2, "DISABLED")
+    world.set_tasks({"Switch-v2": world.pools[0][:2]})
+    found = evaluate(ZeroAgent(world.action_space), world, 1)
+    row = found.summary().classes["Switch-v2"]
+    assert row.episode_steps == row.length and row.score == pytest.approx(100 * row.mean_return / row.length)
+    assert references.rescored({"Switch-v2": row}, run_config(base="moving"))["Switch-v2"] == row
 
 
 def test_the_zero_of_the_score_is_the_better_of_random_and_zero_actions() -> None:

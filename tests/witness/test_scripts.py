@@ -129,12 +129,15 @@ def test_each_script_solves_its_class(name: str) -> None:
 
 
 SOLVED = (
-    "BottleCap", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "OpenPenCap", "OpenScissors", "PourWater",
-    "PushBlock", "StackBlock", "SwingCup", "Switch",
+    "BottleCap", "CatchUnderarm", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "HandOver", "OpenPenCap",
+    "OpenScissors", "PourWater", "PushBlock", "StackBlock", "SwingCup", "Switch", "TwoCatchUnderarm",
 )  # fmt: skip
 
 
-STATELESS = ("BottleCap", "GraspAndPlace", "OpenPenCap", "StackBlock", "SwingCup")
+STATELESS = (
+    "BottleCap", "CatchUnderarm", "GraspAndPlace", "HandOver", "OpenPenCap", "StackBlock", "SwingCup", "Switch",
+    "TwoCatchUnderarm",
+)  # fmt: skip
 """Scripts that follow from the present state alone: a student that sees no past can do what they do."""
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bidex_meta import make_task_world
-from bidex_meta.data.checking import verify
+from bidex_meta.data.checking import summary, verify
 from bidex_meta.evaluation.references import references_of
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.state import TaskState
@@ -27,11 +27,15 @@ def test_points_hide_the_object_and_show_the_goal() -> None:
     assert seen[:, block].any() and not cloud[:, block].any()
 
 
-def test_agents_see_the_goal_and_references_are_those_of_version_1() -> None:
+def test_agents_see_the_goal_and_references_are_those_of_the_version() -> None:
     world = suite_world("MT4-v2", 4)
     sizes = [(len(view.columns), len(view.actions)) for view in agent_views(world.observation_groups, 52, "hands")]
     assert sizes == [(450 - 199, 26)] * 2
-    assert not references_of(world) and references_of(suite_world("MT4", 4))
+    found, printed = references_of(world), references_of(suite_world("MT4", 4))
+    assert found.keys() == printed.keys() == set(world.task_names)
+    for name in found:
+        assert (found[name].expert, found[name].episode_steps) == (None, registry.get(f"{name}-v2").episode_steps)
+        assert found[name].random != printed[name].random and printed[name].episode_steps is None
 
 
 @pytest.mark.parametrize("of", [{"suite": "MT1-v2"}, {"task": "CatchUnderarm-v2"}, {"task": "CatchUnderarm"}])
@@ -40,7 +44,10 @@ def test_recorded_rewards_are_computed_again_by_the_right_formula(of: dict[str, 
     dataset, v2 = recorded(tmp_path, **of), "-v2" in str(of)
     found = verify(dataset)
     assert found.count == 0 and list(found.recomputed.values()) == [found.steps], found
-    assert (dataset.metadata["rules"]["reward"] == "v2") == v2 and (dataset.metadata["references"] == {}) == v2
+    assert (dataset.metadata["rules"]["reward"] == "v2") == v2
+    for slot_summary in summary(dataset):
+        score = 100 * slot_summary.returns[2] / registry.get("CatchUnderarm-v2").episode_steps
+        assert not v2 or slot_summary.score == pytest.approx(score)
 
 
 def test_a_world_knows_what_its_observations_hide() -> None:

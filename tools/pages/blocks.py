@@ -102,7 +102,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path]) -> Iterator[str]:
     """Yield the Markdown lines that fill a marked block of a page, and draw the block's pictures."""
     if block.show == "references":
-        yield from tables.references_table()
+        yield from tables.references_table(block.on or "")
         return
     if block.show in _WITHOUT_STUDY:
         yield from _WITHOUT_STUDY[block.show](block.on or "", data)

@@ -155,9 +155,9 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         cells.append(Estimate(best.mean_return, best.return_interval).text(form=".4g"))
         cells.append("–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}")
         cells.append("–" if random is None else f"{random.mean_return:.4g}")
-        wide = str(run.config().suite).endswith("-v2")  # the references are for version 1
+        stored = f"{name}-v2" if str(run.config().suite).endswith("-v2") else name
         for known in references:
-            cells.append(f"{100 * known[name]['success']:.4g} %" if name in known and not wide else "–")
+            cells.append(f"{100 * known[stored]['success']:.4g} %" if stored in known else "–")
         if several:
             content = run.content
             which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
@@ -172,8 +172,13 @@ def _success(row: ClassSummary) -> str:
     return Estimate(row.success, row.success_interval).text(100.0, " %", ".4g")
 
 
-def references_table() -> Iterator[str]:
-    """Yield a table with a row per class: return and success of untrained policies, return and source of the expert."""
+def references_table(version: str) -> Iterator[str]:
+    """Yield a table with a row per class of a version (``v2``, else 1): untrained policies and known solutions.
+
+    Version 1 has returns, success, and the return and source of the expert. Version 2 has scores and success.
+    """
+    if version == "v2":
+        return _references_of_version_2()
     played = [load(kind) for kind in _PLAYED]
     expert = load("expert")
     measures = [f"{who}: {what}" for who, what in product(_PLAYED.values(), ("return", "success"))]
@@ -187,6 +192,23 @@ def references_table() -> Iterator[str]:
         cells += ["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]]
         rows.append(cells)
     return table(["class", *measures, "expert: return", "expert"], rows)
+
+
+def _references_of_version_2() -> Iterator[str]:
+    kinds: tuple[Kind, ...] = ("random", "zero", "script")
+    measures = [f"{_PLAYED[kind]}: {what}" for kind, what in product(kinds, ("score", "success"))]
+    rows = []
+    for name in registry.names():
+        cells = [name]
+        steps = registry.get(f"{name}-v2").episode_steps
+        for kind in kinds:
+            row = load(kind).get(f"{name}-v2")
+            if row is None:
+                cells += ["–", "–"]
+            else:
+                cells += [f"{100 * row['return'] / steps:.3g}", f"{100 * row['success']:.1f} %"]
+        rows.append(cells)
+    return table(["class", *measures], rows)
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -59,7 +59,7 @@ PRESETS: dict[str, BCQConfig] = {
 
 
 class ActionModel(nn.Module):
-    """A conditional variational autoencoder of the data's actions in a state; a code has ``codes`` entries."""
+    """A conditional variational autoencoder of the data's actions in a state; its latent code has ``codes`` entries."""
 
     def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
         super().__init__()

@@ -145,7 +145,7 @@ class ReturnBound(ReturnScale):
         self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """Add one step of all environments, also to the sums from which the largest return is computed.
+        """Add one step of all environments to the reward scale, and to the sums that give the largest return.
 
         The arguments are described in :meth:`ReturnScale.note`.
         """

@@ -8,7 +8,7 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import push_blocks
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
-from bidex_meta.witness.scripts.carrying import carry_egg
+from bidex_meta.witness.scripts.carrying import carry_egg, exchange_eggs
 from bidex_meta.witness.scripts.placing import place_in_bucket
 from bidex_meta.witness.scripts.pots import lift_underarm
 from bidex_meta.witness.scripts.pouring import pour_water
@@ -40,6 +40,7 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "PushBlock": push_blocks,
     "SwingCup": swing_cup,
     "Switch": press_switches,
+    "TwoCatchUnderarm": exchange_eggs,
 }
 """Scripts for version 2, by the class's name; they read what a task hides."""
 

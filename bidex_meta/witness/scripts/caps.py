@@ -23,8 +23,8 @@ _BEFORE = 0.04
 _TOUCHES = 0.014
 _GONE = 0.03
 # Errors of the cap's travel in metres at which the hand lets go, and up to which it does not come back.
-_DONE = 0.0015
-_GOOD = 0.004
+_DONE = 0.0025
+_GOOD = 0.005
 
 
 def pull_cap(hands: HandController) -> Actions:
@@ -61,7 +61,7 @@ def _to_cap(hands: HandController, missing: float) -> Tensor:
     advance = aside + (before - (1.0 - near) * _BEFORE) * ahead
     if near > 0.5:  # a fast finger would knock the bottle out of the hand
         advance *= min(1.0, 0.025 / (float(advance.norm()) + 1e-9))
-    pressed = 0.0012 + 0.6 * max(0.0, before - 0.006)
+    pressed = 0.0015 + max(0.0, before - 0.006)
     drag = max(-0.016, min(0.016, 0.8 * missing)) * axis + pressed * ahead
     touch = near * ramp(before, 0.02, _TOUCHES)
     return touch * drag + (1.0 - touch) * advance

@@ -1,30 +1,49 @@
-"""Scripted policy for an egg whose goal the right hand can reach without a throw to the left hand."""
+"""Scripted policies for eggs that lie on a palm: a tilted hand with bent fingers is a basket that carries the egg.
 
-from bidex_meta.witness.controller import Actions, HandController, point
+A throw that is caught and then brought to the goal is quicker, but a script cannot foresee where an egg flies.
+"""
 
-# Joint angles of the right hand before and after it closes on the egg, rad, and the number of steps while it closes.
-_OPEN = (0.5, 0.5)
-_FIST = (1.3, 1.35)
-_CLOSING = 10
-_THUMB = {"THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
-_SETTLING = 25  # steps in which the hand stays below the egg, before it moves on
-_ASIDE = 0.01  # offset in x of the hand's point from the egg while it closes, metres: eggs escape on the thumb's side
+from torch import Tensor
+
+from bidex_meta.witness.controller import Actions, HandController, Point, point
+from bidex_meta.witness.scripts.between import ramp
+
+_BENT = (0.9, 1.2)  # angles of knuckles and middle joints, rad; a fist would squeeze the egg out on the wrist's side
+_TILT = 0.5  # angle by which the wrist is higher than the fingers, rad: the egg rolls onto the fingers
+# Two hands that exchange their places turn until their forearms point sideways, and pass at a distance.
+_YAW = 1.2
+_ASIDE = 0.15
 
 
 def carry_egg(hands: HandController) -> Actions:
-    """Close the right hand on the egg and carry it to its goal; the left hand moves out of the way."""
-    # A throw that is caught and then brought to the goal is quicker, but a script cannot foresee where an egg flies.
+    """Carry the egg to its goal in the right hand; the left hand moves out of the way."""
+    hands.bend("right", *_BENT)
     hands.bend("left", 0.0, 0.0)
-    for side in ("right", "left"):
-        hands.hold(side)
+    hands.hold("left")
     while hands.steps_left:
-        closed = min(1.0, hands.taken / _CLOSING)
-        knuckles, middles = (first + closed * (last - first) for first, last in zip(_OPEN, _FIST, strict=True))
-        hands.bend("right", knuckles, middles, **{joint: closed * angle for joint, angle in _THUMB.items()})
-        egg = hands.where("object/position")
-        way = hands.frozen("goal")[:3] - egg
-        if hands.taken < _SETTLING:
-            way = 0.0 * way
-            way[0] = egg[0] - hands.at("right")[0] + _ASIDE
+        hands.hold("right", roll=_TILT)
         x, y, z = point(hands.at("left"))
-        yield from hands.lead_each((point(hands.at("right") + way), (x, y - 0.2, z)))
+        yield from hands.lead_each((_carry(hands, "right", "", 0.0), (x, y - 0.2, z)))
+
+
+def exchange_eggs(hands: HandController) -> Actions:
+    """Carry two eggs past each other, each in the hand on which it lies, to the place of the other hand."""
+    hands.bend("right", *_BENT)
+    hands.bend("left", *_BENT)
+    while hands.steps_left:
+        ahead = float((hands.at("right") - hands.at("left"))[1])
+        yaw = -_YAW * ramp(ahead, 0.38, 0.2)
+        aside = _ASIDE * ramp(abs(ahead), 0.3, 0.12)
+        hands.hold("right", roll=_TILT, yaw=yaw)
+        hands.hold("left", roll=-_TILT, yaw=yaw)
+        yield from hands.lead_each((_carry(hands, "right", "1", aside), _carry(hands, "left", "2", -aside)))
+
+
+def _carry(hands: HandController, side: str, number: str, aside: float) -> Point:
+    """Return the target of a hand that carries an egg to its goal, or ``aside`` (m) of it along x, once it is tilted.
+
+    ``number`` is the suffix of the names of the egg and its goal.
+    """
+    way: Tensor = hands.frozen(f"goal{number}")[:3] - hands.where(f"object{number}/position")
+    way[0] += aside
+    return point(hands.at(side) + way * ramp(hands.still_to_turn(side), 0.2, 0.1))

@@ -87,7 +87,7 @@ def close_outward(hands: HandController) -> Actions:
 
         From there the hands are shifted by ``back`` metres, against the direction in which they point.
         """
-        yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
+        yaws = [1.2 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
         for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
             x, y = leaf.place(leaf.along, leaf.over - 0.04, -angle)
@@ -99,8 +99,8 @@ def close_outward(hands: HandController) -> Actions:
 
     for side in SIDES:
         hands.bend(side, 0.0, 0.0)
-    yield from go(start, back=0.2, steps=16, speed=1.0)
-    yield from go(start, steps=22, speed=1.2)
+    yield from go(start, back=0.2, steps=10, speed=1.6)
+    yield from go(start, steps=10, speed=1.6)
     led = start
     lasts = _goals(hands, -0.2, 0.1)  # a finger has this clearance
     while hands.steps_left:

@@ -10,37 +10,31 @@ from bidex_meta.witness.controller import Actions, HandController, Point, point
 from bidex_meta.witness.scripts.between import ramp
 
 _LEVER = 0.035  # distance in metres from a rocker's hinge to its button
+_CLEAR = 0.04  # height of a fingertip that is clear of its button, metres
+_ENOUGH = 0.065  # angle before the requested one at which a finger rises, rad: the finger still presses while it rises
 
 
 def press_switches(hands: HandController) -> Actions:
     """Press each button with a fingertip until its rocker has the requested angle, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
-    buttons = ("switch2", "switch1")  # the buttons of the right and the left hand
     for side in SIDES:
         hands.bend(side, 0.9, 0.5, THJ3=0.5)
         hands.hold(side)
-
-    def over(height: float, steps: int, speed: float) -> Actions:
-        for _ in range(steps):
-            yield from hands.lead_each(
-                (_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
-                speed,
-            )
-
-    yield from over(0.06, 30, 1.2)
-    yield from over(0.04, 5, 0.6)
-    done = [False, False]
     while hands.steps_left:
         points: list[Point] = []
-        for i, (side, name) in enumerate(zip(SIDES, buttons, strict=True)):
-            left = wanted[i] - float(hands.where(f"{name}/angle"))
-            done[i] = done[i] or left < 0.012
-            above = _tip(hands, side, _button(hands, name), 0.06)
-            height = float(hands.at(side)[2])
-            down = min(0.008, max(0.002, 0.8 * _LEVER * left))
-            target = height + 0.01 if done[i] else height - down
-            points.append((above[0], above[1], target))
-        yield from hands.lead_each(points, 0.6)
+        for side, name, angle in zip(SIDES, ("switch2", "switch1"), wanted, strict=True):
+            left = angle - float(hands.where(f"{name}/angle"))
+            above = _tip(hands, side, _button(hands, name), _CLEAR)
+            x, y, height = point(hands.at(side))
+            off = math.hypot(above[0] - x, above[1] - y)
+            if left < _ENOUGH:
+                height = min(height + 0.03, above[2] + 0.1)
+            elif off > 0.02 or height > above[2]:
+                height = above[2]
+            else:
+                height -= min(0.008, max(0.001, 0.8 * _LEVER * (left - 0.03)))
+            points.append((above[0], above[1], height))
+        yield from hands.lead_each(points, 1.2)
 
 
 def _button(hands: HandController, name: str) -> Tensor:
@@ -115,7 +109,7 @@ def open_scissors(hands: HandController) -> Actions:
         right_loop = hands.where(loops["right"])
         left_loop = hands.where(loops["left"])
         out = (right_loop - left_loop) / (right_loop - left_loop).norm()
-        way = max(-0.025, min(0.025, 0.2 * left)) * out
+        way = max(-0.025, min(0.025, 0.5 * left)) * out
         a = hands.at("right") + way
         b = hands.at("left") - way
         heights = [_tip(hands, side, hands.where(loops[side]), 0.022, _HOOKS[side])[2] for side in SIDES]
