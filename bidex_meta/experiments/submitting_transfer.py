@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.agreement import agreements
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.entries import FORMAT, TRANSFER, TRANSFER_STEPS, TransferEntry, evaluation_seed, held_out
 from bidex_meta.evaluation.entry_rows import class_row
@@ -15,16 +14,8 @@ from bidex_meta.evaluation.leaderboard import entry_name, read_entries, read_ent
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.experiments.conditions import conditions
 from bidex_meta.experiments.learners import resolve_device
-from bidex_meta.experiments.submitting import (
-    Check,
-    SubmittedRun,
-    judged,
-    new_path,
-    read_runs,
-    receipt,
-    stated,
-    write_entry,
-)
+from bidex_meta.experiments.submitted_runs import SubmittedRun, read_runs, receipt, stated
+from bidex_meta.experiments.submitting import Check, compared, judged, new_path, write_entry
 from bidex_meta.experiments.transfer_plan import suite_file
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
@@ -32,7 +23,6 @@ from bidex_meta.suite import load_suite
 from bidex_meta.training.launch import say
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.plugins import short_name
-from bidex_meta.utils.validation import parse
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import open_worlds
 
@@ -108,11 +98,7 @@ def check_transfer(path: Path, folder: RunFolder, transfer: Path, device: str) -
             f"{path} is of other runs: expected weights {', '.join(entry.receipt.weights)}, got {', '.join(weights)}."
         )
     content = _played(found, entry.episodes, device) | {"name": entry.name, "tuning": asdict(entry.tuning)}
-    repeated = parse(sealed(content, TransferEntry, str(path)), TransferEntry, str(path))
-    different = [name for name in _FACTS if getattr(repeated, name) != getattr(entry, name)]
-    if repeated.receipt.config != entry.receipt.config:
-        different.append("receipt.config")
-    return Check(agreements(entry.summaries(), repeated.summaries()), different)
+    return compared(path, entry, content, _FACTS)
 
 
 def _read(folder: RunFolder, transfer: Path) -> _Transfer:

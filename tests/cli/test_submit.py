@@ -23,7 +23,7 @@ from bidex_meta.evaluation.leaderboard import (
     sealed,
     success_iqm,
 )
-from bidex_meta.experiments import submitting
+from bidex_meta.experiments import submitted_runs, submitting
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
 from bidex_meta.suite import Suite, load_suite
@@ -492,7 +492,7 @@ def test_a_track_follows_from_the_learner_and_what_it_learned_from(
     if start is not None:
         RunFolder.create(run_config(**start), tmp_path / "start")
         entries = {**entries, "start_from": str(tmp_path / "start")}
-    assert submitting._was_privileged(run_config(suite="ML1", **entries)) is privileged
+    assert submitted_runs._was_privileged(run_config(suite="ML1", **entries)) is privileged
 
 
 def test_runs_that_nobody_else_could_play_are_refused(toy_suite, tmp_path: Path, shown, refused) -> None:
