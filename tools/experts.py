@@ -1,4 +1,4 @@
-"""``python -m tools.experts RUN...``: find the best policy that solves each class; the score of this policy is 100."""
+"""``python -m tools.experts RUN...``: find the best policy that solves each class of version 1; its score is 100."""
 
 from collections.abc import Collection, Sequence
 from itertools import chain

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.rules import V2, plain_name, versioned_name
+from bidex_meta.rules import V2, versioned_name
 from bidex_meta.runs.atomic import Json, write_json
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.folder import AnyConfig
@@ -170,8 +170,6 @@ def rescored(classes: dict[str, ClassSummary], config: AnyConfig) -> dict[str, C
     References hold only for moving hand bases. The bases are known to have moved if the run's config says so, or if any
     class has a score already. Otherwise all results are returned unchanged.
     """
-    if config.task is not None and plain_name(config.task) != config.task:
-        return classes
     if config.base != "moving" and all(row.score is None for row in classes.values()):
         return classes
     known = references()

@@ -141,7 +141,7 @@ def results_by_class(
         for played in (episodes, *compared):
             finished.append(played["return"][(played["slot"] == slot) & ~played["unstable"].astype(bool)])
         broken = own["unstable"].astype(bool)
-        reference = (references or {}).get(name)
+        reference = _reference(references or {}, name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
@@ -149,6 +149,14 @@ def results_by_class(
             at_end=_share(own, "at_end", broken),
         )  # fmt: skip
     return classes
+
+
+def _reference(references: Mapping[str, Reference], name: str) -> Reference | None:
+    """Return the reference of a slot; a slot of one listed task, ``class/task``, has that of its class in version 2."""
+    of_class = references.get(name.partition("/")[0])
+    if name not in references and of_class is not None and of_class.episode_steps is not None:
+        return of_class
+    return references.get(name)
 
 
 def _share(episodes: dict[str, np.ndarray], name: str, broken: np.ndarray) -> float | None:

@@ -61,6 +61,8 @@ def baseline(
             f"References are for the rules of version 1 or 2, but {suite} mixes them. Leave --out away, or change the "
             "suite's file."
         )
+    if out is not None and worlds.suite is not None and any(entry.tasks for entry in worlds.suite.classes):
+        raise BidexError(f"References are for drawn tasks, but {suite} lists tasks. Leave --out away.")
     if policy == "script":
         found = _scripted(worlds, episodes)
     else:
@@ -84,7 +86,7 @@ def _played(policy: str, worlds: Worlds, episodes: int, seed: int) -> Evaluation
         witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
         agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
         names = list(witnesses)
-    found = evaluate(agent, world, episodes, references={})
+    found = evaluate(agent, world, episodes, references=_without_returns(worlds))
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 
@@ -97,6 +99,12 @@ def _scripted(worlds: Worlds, episodes: int) -> Evaluation:
         raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {worlds.name}.")
     world = worlds.world()
     assert isinstance(world, World)
-    found = evaluate(Scripted(world, names=names), world, episodes, references={})
+    found = evaluate(Scripted(world, names=names), world, episodes, references=_without_returns(worlds))
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
+
+
+def _without_returns(worlds: Worlds) -> dict[str, references.Reference]:
+    """Return what defines the scores of version 2; stored returns are left out, since they are measured here."""
+    known = worlds.references().items()
+    return {name: references.Reference(None, episode_steps=each.episode_steps) for name, each in known}

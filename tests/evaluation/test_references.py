@@ -7,6 +7,7 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.references import Reference
+from bidex_meta.experiments import baselines
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.tasks import registry
 from bidex_meta.utils import paths
@@ -32,7 +33,6 @@ def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base:
     assert rescored == {"A": today, "B": today, "Lamp": rows["Lamp"]}
     unscored = {"B": rows["B"]}  # nobody could say of what base, but where the run says so itself
     assert references.rescored(unscored, run_config(base=base))["B"].score == (25.0 if base == "moving" else None)
-    assert references.rescored(unscored, run_config(base=base, task="B-v2")) == unscored
 
 
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:
@@ -106,6 +106,20 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     assert open_worlds({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
+
+
+def test_a_baseline_of_version_2_has_a_score_and_no_stored_returns() -> None:
+    for suite, known in (("MT4-v2", True), ("MT4", False)):
+        for name, found in baselines._without_returns(open_worlds({"suite": suite})).items():
+            steps = registry.get(f"{name}-v2").episode_steps if known else None
+            assert found == Reference(None, episode_steps=steps)
+
+
+def test_a_suite_that_lists_tasks_makes_no_references(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "zero.json")
+    for suite in ("MT1", "MT1-DoorOpenOutward-shared"):
+        assert main(["baseline", "zero", "--suite", suite, "--out", out]) == 2
+        assert "lists tasks" in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
 
 
 def test_a_suite_that_mixes_rules_makes_no_references(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

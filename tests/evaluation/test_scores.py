@@ -92,6 +92,14 @@ def test_scores_of_version_2_are_the_mean_reward_per_step() -> None:
     assert references.rescored({"Switch-v2": row}, run_config(base="moving"))["Switch-v2"] == row
 
 
+def test_a_slot_of_a_listed_task_has_the_score_of_its_class_in_version_2_alone() -> None:
+    episodes = {"slot": np.zeros(2, int), "task": np.arange(2), "return": np.array([3.0, 5.0])}
+    episodes |= {"success": np.ones(2, bool), "length": np.array([8, 8]), "unstable": np.zeros(2, bool)}
+    for reference, score in ((Reference(0.0, episode_steps=8), 50.0), (Reference(0.0, 8.0), None)):
+        assert results_by_class(["A/left"], episodes, {"A": reference})["A/left"].score == score
+        assert results_by_class(["A"], episodes, {"A": reference})["A"].score == 50.0
+
+
 def test_the_zero_of_the_score_is_the_better_of_random_and_zero_actions() -> None:
     assert Reference(1.0, 11.0).scores(np.array([1.0, 6.0])) == pytest.approx([0.0, 50.0])
     assert Reference(1.0, 11.0, 6.0).scores(np.array([1.0, 6.0, 11.0])) == pytest.approx([-100.0, 0.0, 100.0])

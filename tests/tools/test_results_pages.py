@@ -13,7 +13,7 @@ from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill, filled_pages
 from tools.pages.studies import bars_figure, read_studies
-from tools.pages.tables import arms_table, classes_table
+from tools.pages.tables import arms_table, best_table, classes_table
 
 no_weights = test_collect.no_weights
 
@@ -23,6 +23,13 @@ def test_pages_of_the_repository_are_as_its_data_say() -> None:
     pages = filled_pages(ROOT)
     assert sum("<!-- results:" in page.read_text() for page in pages) >= 2
     assert not [str(path) for page in pages for path in fill(page, ROOT / "results" / "data", check=True)]
+
+
+@pytest.mark.parametrize(("study", "replayed", "scripted"), [("mt20-gpu", True, True), ("ladder-rung1", False, True)])
+def test_references_beside_results_are_of_their_version(study: str, replayed: bool, scripted: bool) -> None:
+    head, _, *rows = best_table(read_studies(ROOT / "results" / "data", study))
+    assert ("open-loop replay: success" in head) == replayed and ("scripted policy: success" in head) == scripted
+    assert rows
 
 
 def test_every_policy_of_the_repository_stands_on_the_page_of_pretrained_policies(tmp_path: Path) -> None:

@@ -8,9 +8,11 @@ import numpy as np
 from bidex_meta.evaluation.comparison import Group, scored_classes
 from bidex_meta.evaluation.references import Kind, load
 from bidex_meta.evaluation.statistics import Estimate, iqm_over_seeds
+from bidex_meta.rules import versioned_name
 from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.tasks import registry
+from bidex_meta.worlds import open_worlds
 from tools.pages.studies import Study, classes_of_others, classes_of_random
 
 _FEW = 4
@@ -155,7 +157,8 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         cells.append(Estimate(best.mean_return, best.return_interval).text(form=".4g"))
         cells.append("–" if best.score is None or best.mean_return == experts.get(name) else f"{best.score:.0f}")
         cells.append("–" if random is None else f"{random.mean_return:.4g}")
-        stored = f"{name}-v2" if str(run.config().suite).endswith("-v2") else name
+        rules = open_worlds(run.config().to_json()).rules
+        stored = versioned_name(name, rules) if rules else name
         for known in references:
             cells.append(f"{100 * known[stored]['success']:.4g} %" if stored in known else "–")
         if several:
