@@ -10,9 +10,9 @@ from bidex_meta.witness.scripts.between import ramp
 
 _BENT = (0.9, 1.2)  # angles of knuckles and middle joints, rad; a fist would squeeze the egg out on the wrist's side
 _TILT = 0.5  # angle by which the wrist is higher than the fingers, rad: the egg rolls onto the fingers
-# Two hands that exchange their places turn until their forearms point sideways, and pass at a distance.
+# Hands that exchange their places turn until their forearms point sideways (rad), and pass each other at a distance.
 _YAW = 1.2
-_ASIDE = 0.15
+_ASIDE = 0.15  # distance along x of each egg from the straight way, metres
 
 
 def carry_egg(hands: HandController) -> Actions:
