@@ -130,7 +130,7 @@ def references() -> dict[str, Reference]:
     for name, random in _returns("random").items():
         reference = Reference(random, zero=zero.get(name))
         expert = experts.get(name)
-        if expert is not None and expert > max(random, reference.zero or random):
+        if expert is not None and reference.floor is not None and expert > reference.floor:
             reference = replace(reference, expert=expert)
         known[name] = reference
     return known
@@ -148,13 +148,14 @@ def references_of(world: object) -> dict[str, Reference]:
 def references_for(classes: "Mapping[str, TaskClass]") -> dict[str, Reference]:
     """Return the references that apply to classes, by the names that ``classes`` gives them.
 
-    Stored returns do not apply to hands with fixed bases, or to tasks and rewards other than those of versions 1 and 2.
+    Stored returns do not apply if the bases of any class are fixed, or to rules other than those of versions 1 and 2.
     """
     known = references()
+    moving = all(task.moving_base for task in classes.values())
     found: dict[str, Reference] = {}
     for name, task in classes.items():
         reference = None
-        if task.moving_base and (task.rules == V2 or task.rules.as_printed):
+        if moving and (task.rules == V2 or task.rules.as_printed):
             reference = known.get(versioned_name(name, task.rules))
         if task.rules.reward == "v2":
             reference = replace(reference or Reference(None), episode_steps=task.episode_steps)

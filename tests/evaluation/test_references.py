@@ -104,6 +104,8 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     suite.write_text(text.replace("CatchUnderarm", "HandOver"))
     assert open_worlds({"suite": str(suite)}).references() == {}
     assert open_worlds({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
+    both = {name: registry.get(name, moving) for name, moving in (("HandOver", False), ("CatchUnderarm", True))}
+    assert references.references_for(both) == {}, "rescored takes one score for the proof that all bases moved"
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
 

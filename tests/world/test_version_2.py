@@ -31,7 +31,8 @@ def test_agents_see_the_goal_and_references_are_those_of_the_version() -> None:
     world = suite_world("MT4-v2", 4)
     sizes = [(len(view.columns), len(view.actions)) for view in agent_views(world.observation_groups, 52, "hands")]
     assert sizes == [(450 - 199, 26)] * 2
-    found, printed = references_of(world), references_of(suite_world("MT4", 4))
+    found = references_of(world)
+    printed = references_of(suite_world("MT4", 4))
     assert found.keys() == printed.keys() == set(world.task_names)
     for name in found:
         assert (found[name].expert, found[name].episode_steps) == (None, registry.get(f"{name}-v2").episode_steps)
