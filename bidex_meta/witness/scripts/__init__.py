@@ -11,7 +11,7 @@ from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.carrying import carry_egg, exchange_eggs
 from bidex_meta.witness.scripts.placing import place_in_bucket
 from bidex_meta.witness.scripts.pots import lift_underarm
-from bidex_meta.witness.scripts.pouring import pour_water
+from bidex_meta.witness.scripts.pouring import pour_and_carry, pour_water
 from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
@@ -37,6 +37,7 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "HandOver": carry_egg,
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
+    "PourWater": pour_and_carry,
     "PushBlock": push_blocks,
     "SwingCup": swing_cup,
     "Switch": press_switches,
