@@ -135,8 +135,8 @@ SOLVED = (
 
 
 STATELESS = (
-    "BottleCap", "CatchUnderarm", "GraspAndPlace", "HandOver", "OpenPenCap", "StackBlock", "SwingCup", "Switch",
-    "TwoCatchUnderarm",
+    "BottleCap", "CatchUnderarm", "GraspAndPlace", "HandOver", "OpenPenCap", "PourWater", "StackBlock", "SwingCup",
+    "Switch", "TwoCatchUnderarm",
 )  # fmt: skip
 """Scripts that follow from the present state alone: a student that sees no past can do what they do."""
 
