@@ -25,9 +25,10 @@ class Take:
         aim: Largest horizontal distance between the midpoint of the hands and its target while the hands go down.
         joints: For the right and the left hand, one joint that gives way when the hand presses the object.
         free: Angles of these two joints while the hands touch nothing, rad.
-        firm: Angles of these two joints while the hands hold the object firmly, rad. The hands close until the joints
-            have these angles. The forces on the bases are not used for this, because one newton is only 0.1 to 0.3 % of
-            a base's range, so the hold would be too hard or too loose.
+        firm: Angles of these two joints while the hands hold the object firmly, rad.
+        press: How far the hands close: until the joints have moved by this multiple of the way from ``free`` to
+            ``firm``. The forces on the bases are not used for this, because one newton is only 0.1 to 0.3 % of a base's
+            range, so the hold would be too hard or too loose.
     """
 
     ahead: float
@@ -38,6 +39,7 @@ class Take:
     joints: tuple[str, str]
     free: tuple[float, float]
     firm: tuple[float, float]
+    press: float = 1.0
 
 
 _CLOSING = 0.015  # distance by which the target leads a hand that does not press yet, metres
@@ -120,7 +122,8 @@ class Between:
 
         The hands come closer until they hold the object firmly.
         """
-        return self.half - _CLOSING * (1.0 - min(2.0, self.firm))
+        press = self.take.press
+        return self.half - _CLOSING * (press - min(press + 1.0, self.firm))
 
     def _get(self) -> tuple[float, float, float, float]:
         """Return the next targets, x, y and z of the hands' midpoint and half the hands' distance, to take the object.

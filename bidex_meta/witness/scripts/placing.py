@@ -9,7 +9,7 @@ _WRIST = 0.06
 _YAW = 0.12
 _PRESSED = ("FFJ3", "LFJ3"), (_SPREAD, -_SPREAD), (0.0, 0.0)
 _BUCKET = Take(0.065, 0.013, 0.775, 0.145, 0.02, *_PRESSED)
-_BLOCK = Take(0.075, 0.005, 0.775, 0.115, 0.02, *_PRESSED)
+_BLOCK = Take(0.065, 0.005, 0.775, 0.115, 0.035, *_PRESSED, press=1.3)
 # These are heights in metres: of a bucket on the table, and of the block above it.
 _STANDS = 0.657
 _OVER = 0.765
