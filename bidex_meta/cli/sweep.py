@@ -13,7 +13,8 @@ from bidex_meta.cli.parsing import Switch, parse
 from bidex_meta.cli.tables import NONE, plain_table, print_table
 from bidex_meta.errors import EXIT_FAILED
 from bidex_meta.experiments.sweep_plan import SweepPlan
-from bidex_meta.experiments.sweeping import State, hours_left, states_of, submit_plan, sweep
+from bidex_meta.experiments.sweep_progress import State, hours_left, states_of
+from bidex_meta.experiments.sweeping import submit_plan, sweep
 from bidex_meta.training.launch import say
 from bidex_meta.utils.validation import Few
 

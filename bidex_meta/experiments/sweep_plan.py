@@ -75,7 +75,7 @@ class PlannedRun:
     final: FinalEvaluation = USUAL_EVALUATION
     """The evaluation at the end of the run."""
     config: AnyConfig = field(default=None, compare=False)  # pyright: ignore[reportAssignmentType]
-    """``given``, resolved and checked on this machine by ``bidex_meta.experiments.sweeping.states_of``."""
+    """``given``, resolved and checked on this machine by ``bidex_meta.experiments.sweep_progress.states_of``."""
 
     @property
     def name(self) -> str:

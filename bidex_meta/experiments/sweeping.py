@@ -5,7 +5,6 @@ starts them. Both call a ``Job``, which begins or resumes a run and waits for th
 """
 
 import contextlib
-import math
 import os
 import signal
 import subprocess
@@ -16,47 +15,22 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from statistics import mean
 from types import FrameType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from bidex_meta.errors import BidexError, one_line, shortened
-from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
+from bidex_meta.experiments.sweep_progress import State, beside, last_line, locked, state_of, states_of
 from bidex_meta.runs import RunFolder
-from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.runs.metrics import last_rows
 from bidex_meta.training.launch import BATCH_SIGNALS, say
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.files import JsonObject, absolute, exists, is_file, read_text
+from bidex_meta.utils.files import JsonObject, exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 from bidex_meta.utils.waiting import note
 
 COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # the words of a run are appended
 _STOP = getattr(signal, "SIGUSR2", signal.SIGTERM)
 """Signal that makes a run save and end. A batch system may send it too; a second SIGTERM would kill the run."""
-
-
-class State(NamedTuple):
-    """Progress of one run of a sweep."""
-
-    run: PlannedRun
-    state: Literal["done", "runs", "failed", "left"]
-    step: int
-    """Environment steps that were logged."""
-    goal: int
-    """Environment steps to train for; if time, a return or a score ended the run, the steps that it reached."""
-    seconds: float
-    """Seconds of training so far."""
-    why: str
-    """The last line of the run's log if the run failed when it was last begun or resumed."""
-
-    @property
-    def speed(self) -> float:
-        """Return the measured steps per second; 0 before the first line of metrics."""
-        if self.seconds:
-            return self.step / self.seconds
-        return 0.0
 
 
 @dataclass(frozen=True)
@@ -113,82 +87,6 @@ def _alone_in(plan: SweepPlan) -> contextlib.AbstractContextManager[None]:
     return RunFolder(plan.folder).locked(f"Another sweep works in {plan.folder}. Wait for its end, or stop it.")
 
 
-def states_of(plan: SweepPlan) -> list[State]:
-    """Resolve and check the configs of all runs, and return the runs' progress.
-
-    Raises BidexError for bad values, and if a run's folder has a run with another config.
-    """
-    configs: dict[str, AnyConfig] = {}  # runs that differ only in the seed share a config
-    runs = []
-    for run in plan.runs:
-        kind = str(replace(run.given, seed=0, start_from=None))
-        if kind not in configs:
-            try:
-                configs[kind] = _resolved(run)
-            except BidexError as error:
-                raise BidexError(f"{plan.source}: {run.arm} on {run.subject}: {error}") from None
-        start = None if run.after is None else str(absolute(run.after))
-        runs.append(replace(run, config=replace(configs[kind], seed=run.seed, start_from=start)))
-    return [state_of(run) for run in runs]
-
-
-def _resolved(run: PlannedRun) -> AnyConfig:
-    config = resolve(run.given)
-    check(config)
-    run.final.check(config)
-    return config
-
-
-def state_of(run: PlannedRun) -> State:
-    """Return the progress of a run with resolved config; raise BidexError if its folder has another config."""
-    last: JsonObject = {"step": 0}
-    evaluated = False
-    if exists(run.folder.config_path):
-        # Threads and device are ignored, because the machine may have changed.
-        for name, there, here in run.folder.config().differences(run.config, ignored=("threads", "device")):
-            raise BidexError(
-                f"{run.path} is a run with another config: its {name} is {there}, not {here}. Give the arm another "
-                "name, or move the folder away."
-            )
-        if is_file(run.folder.metrics_path):
-            last = (last_rows(run.folder.metrics_path) or [last])[-1]
-        evaluated = run.folder.evaluated
-    why = _last_line(_beside(run, "failed"))
-    steps = run.config.goal(last)
-    if _locked(run):
-        state = "runs"
-    elif evaluated and (run.folder.evaluation().steps or steps) >= steps:
-        state = "done"
-    elif why:
-        state = "failed"
-    else:
-        state = "left"
-    return State(run, state, last["step"], steps, last.get("Perf/training_time") or 0.0, why)
-
-
-def hours_left(states: Sequence[State]) -> list[float]:
-    """Return the hours that each run still has to train, or NaN if no run has a known speed.
-
-    The assumed speed is the run's own speed if known, otherwise the mean over the runs on its suite, otherwise the mean
-    over all runs.
-    """
-    speeds = [(state.run.subject, state.speed) for state in states if state.speed]
-    hours = []
-    for state in states:
-        minutes = state.run.config.minutes
-        alike = [speed for subject, speed in speeds if subject == state.run.subject] or [speed for _, speed in speeds]
-        if state.state == "done":
-            seconds = 0.0
-        elif minutes is not None:
-            seconds = max(60 * minutes - state.seconds, 0.0)
-        elif alike:
-            seconds = max((state.goal - state.step) / (state.speed or mean(alike)), 0.0)
-        else:
-            seconds = math.nan
-        hours.append(seconds / 3600)
-    return hours
-
-
 class Job:
     """A run as a callable, for a thread or for submitit."""
 
@@ -204,7 +102,7 @@ class Job:
         If the run failed, BidexError is raised with the last line of the run's log.
         """
         run = self.run
-        while _locked(run) and not self.stopped:  # a process of a killed sweep may still train the run
+        while locked(run) and not self.stopped:  # a process of a killed sweep may still train the run
             time.sleep(1.0)
         if state_of(run).state == "done":
             return True
@@ -214,7 +112,7 @@ class Job:
             words = run.resume
         else:
             words = run.begin
-        with _beside(run, "log").open("ab") as log:
+        with beside(run, "log").open("ab") as log:
             one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
             self.process = subprocess.Popen(  # Ctrl-C reaches only the sweep, which then stops its runs
                 [*self.command, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=one_thread,
@@ -225,10 +123,10 @@ class Job:
         code = self.process.wait()
         done = code == 0 and state_of(run).state == "done"
         if not done and not self.stopped and _signal_of(code) is None:
-            why = _last_line(_beside(run, "log")) or f"ended with exit code {code}"
-            _beside(run, "failed").write_text(f"{why}\n", encoding="utf-8")
+            why = last_line(beside(run, "log")) or f"ended with exit code {code}"
+            beside(run, "failed").write_text(f"{why}\n", encoding="utf-8")
             raise BidexError(why)
-        _beside(run, "failed").unlink(missing_ok=True)
+        beside(run, "failed").unlink(missing_ok=True)
         return done
 
     def stop(self) -> None:
@@ -309,7 +207,7 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None]) -> int:
                         failed[run.path] = "has failed"
                         say(f"{run.name} failed: it starts from {run.after.name}, which {failed[run.after]}")
                         continue
-                    say(f"{run.name} {'is waited for: another process trains it' if _locked(run) else 'begins'}")
+                    say(f"{run.name} {'is waited for: another process trains it' if locked(run) else 'begins'}")
                     jobs.append(Job(run, COMMAND))
                     own[pool.submit(jobs[-1])] = jobs[-1]
                 for future in wait(own, return_when=FIRST_COMPLETED).done:
@@ -348,7 +246,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: JsonOb
         executor = submitit.AutoExecutor(folder=folder, cluster=where)
         executor.update_parameters(**{"timeout_min": 24 * 60, "cpus_per_task": 1, **parameters})
         for run in runs:
-            number = _beside(run, "job")  # local jobs need no number, because the lock of the run's folder is enough
+            number = beside(run, "job")  # local jobs need no number, because the lock of the run's folder is enough
             if where == "slurm" and is_file(number):
                 job = submitit.SlurmJob(folder=folder, job_id=read_text(number, "a job's number").strip())
                 if not job.done(force_check=True):
@@ -397,27 +295,3 @@ def _signal_of(code: int) -> int | None:
     if number in (*BATCH_SIGNALS, signal.SIGTERM):
         return number
     return None
-
-
-def _locked(run: PlannedRun) -> bool:
-    """Return whether a process trains in a run's folder."""
-    try:
-        with run.folder.locked():
-            return False
-    except FileNotFoundError:
-        return False
-    except BidexError:
-        return True
-
-
-def _beside(run: PlannedRun, kind: str) -> Path:
-    """Return the path of a file next to a run's folder: ``log`` (output), ``failed`` (last error) or ``job`` (id)."""
-    return run.path.with_name(f"{run.name}.{kind}")
-
-
-def _last_line(path: Path) -> str:
-    if is_file(path):
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    else:
-        lines = []
-    return next((one_line(line) for line in reversed(lines) if line.strip()), "")

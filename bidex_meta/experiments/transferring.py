@@ -18,7 +18,8 @@ from bidex_meta.experiments.conditions import say_differences
 from bidex_meta.experiments.evaluating import USUAL_EVALUATION, FinalEvaluation
 from bidex_meta.experiments.policies import say_other_rules
 from bidex_meta.experiments.run_config import check, resolve
-from bidex_meta.experiments.sweeping import choose_cores, state_of, work
+from bidex_meta.experiments.sweep_progress import state_of
+from bidex_meta.experiments.sweeping import choose_cores, work
 from bidex_meta.experiments.transfer_plan import Arm, Cell, arms_of, cells_of, demonstrations_of, held_out, suite_file
 from bidex_meta.runs import RunFolder, plots
 from bidex_meta.runs.atomic import check_writable, write_json

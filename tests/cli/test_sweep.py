@@ -17,9 +17,10 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.experiments import sweep_progress
 from bidex_meta.experiments import sweeping as queue
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
-from bidex_meta.experiments.sweeping import State, state_of
+from bidex_meta.experiments.sweep_progress import State, state_of
 from bidex_meta.runs import RunFolder
 from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config
@@ -35,7 +36,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(queue, "COMMAND", FAKE)
     # `bidex-meta run` tests configs; this stand-in has only a few entries.
-    monkeypatch.setattr(queue, "_resolved", lambda run: CONFIG)
+    monkeypatch.setattr(sweep_progress, "_resolved", lambda run: CONFIG)
     path = tmp_path / "sweep.toml"
     path.write_text(FILE)
     return path
@@ -73,7 +74,7 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, sho
 def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(file: Path, tmp_path, monkeypatch, shown) -> None:
     file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
     config = replace(CONFIG, stop_at_return=4.0)
-    monkeypatch.setattr(queue, "_resolved", lambda run: config)
+    monkeypatch.setattr(sweep_progress, "_resolved", lambda run: config)
     assert "2 done, 0 runs, 0 failed, 0 left" in shown("sweep", file)
     begun = starts(tmp_path)
     shown("sweep", file)
@@ -217,7 +218,7 @@ def test_how_long_the_rest_takes(file: Path, monkeypatch, shown) -> None:
     left = "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours"
     assert left in shown("sweep", file, "--status"), "1 h of 2, and 2 · 2 h"
     timed = replace(CONFIG, minutes=90.0)
-    monkeypatch.setattr(queue, "_resolved", lambda run: timed)
+    monkeypatch.setattr(sweep_progress, "_resolved", lambda run: timed)
     assert "about 3.50 core-hours" in shown("sweep", file, "--status"), "0.5 h, and 2 · 1.5 h"
 
 

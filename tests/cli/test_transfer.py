@@ -26,7 +26,7 @@ from bidex_meta.evaluation.transfer_measures import at_the_end
 from bidex_meta.experiments import submitting_transfer, transferring
 from bidex_meta.experiments.evaluating import FinalEvaluation
 from bidex_meta.experiments.run_config import resolve
-from bidex_meta.experiments.sweeping import state_of
+from bidex_meta.experiments.sweep_progress import state_of
 from bidex_meta.experiments.transfer_plan import (
     Arm,
     arms_of,
