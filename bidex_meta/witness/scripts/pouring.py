@@ -18,7 +18,13 @@ _POUR = math.radians(50.0)
 _LIP = -0.2 * math.cos(_POUR) - 0.053 * math.sin(_POUR), 0.053 * math.cos(_POUR) - 0.2 * math.sin(_POUR)
 _OVER = 0.098  # height in metres of the lip above the bucket's origin
 _THUMB = {"THJ4": 1.047, "THJ3": 1.222}  # the left thumb lies across the palm, away from the kettle's wall
-_LOOSE, _FIRM = 0.032, -0.003  # distance in metres of the hands from the kettle before they take it, and while they do
+# Distance in metres of the hands from the kettle before they take it, and while they hold it.
+_LOOSE = 0.032
+_FIRM = -0.003
+# By how much the left hand of a grip is farther along x than the right one, metres, and the angle by which the line
+# between the hands is lower at the right one if the kettle is upright, rad.
+_AHEAD = 0.07
+_SLOPE = 0.118
 # Height in metres of a kettle on the table, height at which a kettle pours, and by how much it then rises while the
 # water runs out: a kettle that is higher is empty.
 _STANDS = 0.478
@@ -116,11 +122,11 @@ def _use_kettle(hands: HandController, kettle: Tensor, back: Tensor, tilt: float
     if held > 0.5:
         # The hands follow each other, not the kettle, which may slip between them.
         line = hands.at("right") - hands.at("left")
-        line[0] += 0.07
+        line[0] += _AHEAD
         flat = float(line[:2].norm())
         back = line / flat
         back[2] = 0.0
-        now = math.atan2(float(line[2]), flat) + 0.118
+        now = math.atan2(float(line[2]), flat) + _SLOPE
         step, lead = _next(hands, kettle, back, tilt)
         places = [_tensor(_grip(side, 0.0 * kettle, back, now, loose), kettle) for side in SIDES]
         origin = held * step + 0.5 * sum(hands.at(side) - place for side, place in zip(SIDES, places, strict=True))
@@ -167,9 +173,13 @@ def _grip(side: str, origin: Tensor, back: Tensor, tilt: float, loose: float, as
     ``loose`` is negative. It is shifted by ``aside`` metres along x.
     """
     if side == "right":
-        x, along, up = -0.005, 0.159 + 0.2 * loose, -0.004
+        x = -0.005
+        along = 0.159 + 0.2 * loose
+        up = -0.004
     else:
-        x, along, up = 0.065, -0.153, 0.030 - loose
+        x = 0.065
+        along = -0.153
+        up = 0.030 - loose
     flat = along * math.cos(tilt) - up * math.sin(tilt)
     rise = along * math.sin(tilt) + up * math.cos(tilt)
     return beside(origin + flat * back, x + aside, 0.0, float(origin[2]) + rise)
