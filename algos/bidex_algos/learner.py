@@ -34,6 +34,18 @@ def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
     return dict(zip(tensors, values, strict=True))
 
 
+def decayed(rate: float, done: int, decay_steps: int) -> float:
+    """Return the step size ``rate`` after ``done`` environment steps; it falls linearly to a twentieth.
+
+    It reaches a twentieth after ``decay_steps`` and stays there. If ``decay_steps`` is 0, it is constant.
+    """
+    if decay_steps:
+        share = min(1.0, done / decay_steps)
+    else:
+        share = 0.0
+    return rate * (1.0 - 0.95 * share)
+
+
 # Besides the shapes of the weights, these values determine the function of a network.
 _WORLD = ("observations", "actions", "task_id")
 _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)

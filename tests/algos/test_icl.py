@@ -1,5 +1,6 @@
 """In-context learning: what one episode tells, what the memory is asked, who labels, what is kept."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -90,6 +91,17 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     shown = torch.cat([t.obs[..., :2], data.goals[:, 0].expand(len(filled), -1, -1)], dim=-1)
     long = filled & (torch.arange(8) >= 4)
     assert torch.equal(data.labels[long], world.best(shown[long]))
+
+
+def test_the_step_size_falls_in_a_line_and_stays_at_a_twentieth() -> None:
+    world = PointGoals(8)
+    trial = int(SMALL.episodes_per_trial * world.max_episode_steps.sum())
+    learner = taught(world, replace(SMALL, decay_steps=2 * trial, updates_per_iteration=1))
+    rates = []
+    for _ in range(4):
+        learner.iterate()
+        rates.append(learner.adam.param_groups[0]["lr"] / SMALL.learning_rate)
+    assert rates == pytest.approx([1.0, 0.525, 0.05, 0.05])
 
 
 def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.learner import Learner, as_numbers, decayed
 from bidex_algos.nets.architecture import NetworkConfig, network_bytes
 from bidex_algos.nets.networks import Activation, Autocast, Layers
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
@@ -94,8 +94,9 @@ class DAgger(Learner):
             for _ in range(self.config.rollout_steps):
                 unstable += self._step(share)
         self.lessons.take_moments(self.config.rollout_steps)
-        self.lessons.adam.param_groups[0]["lr"] = self._learning_rate()
-        losses = self.lessons.learn(self.config.updates_per_iteration, self.generator)
+        cfg = self.config
+        self.lessons.adam.param_groups[0]["lr"] = decayed(cfg.learning_rate, self.env_steps, cfg.decay_steps)
+        losses = self.lessons.learn(cfg.updates_per_iteration, self.generator)
         self.env_steps += self.config.rollout_steps * self.world.num_envs * world_size()
         return self.episodes.metrics() | as_numbers({"Train/unstable": all_sum(unstable), **losses}) | self._played()
 
@@ -105,13 +106,6 @@ class DAgger(Learner):
         if steps:
             return max(0.0, 1.0 - self.env_steps / steps)
         return 0.0
-
-    def _learning_rate(self) -> float:
-        if self.config.decay_steps:
-            done = min(1.0, self.env_steps / self.config.decay_steps)
-        else:
-            done = 0.0
-        return self.config.learning_rate * (1.0 - 0.95 * done)
 
     def _begin_all(self, obs: Tensor, share: float) -> None:
         everyone = torch.ones_like(self.teacher_plays)

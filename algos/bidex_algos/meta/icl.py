@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.learner import as_numbers
+from bidex_algos.learner import as_numbers, decayed
 from bidex_algos.meta.config import USUAL_STEPS
 from bidex_algos.meta.memory_agent import MemoryAgent
 from bidex_algos.meta.taught_trials import Steps, TaughtTrials
@@ -58,6 +58,8 @@ class ICLConfig(LearnerConfig):
     goals: Count = 8  # Number of goals, besides the task's own, for which the rewards of a trial are computed.
     trials: Count = 1024  # Trials that each process keeps; the oldest are overwritten first.
     learning_rate: Positive = 1e-3  # Adam's step size.
+    decay_steps: Whole = 0
+    """Environment steps over which the step size falls linearly to a twentieth of learning_rate; 0: it is constant."""
     max_grad_norm: Positive = 1.0  # Gradients are clipped to this norm, separately for actor and model.
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of trials in which the teacher acts falls from 1 to 0."""
@@ -194,7 +196,9 @@ class ICL(TrialLearner):
         self.label_stats.merge(*pool_moments(mean, var, count))
 
     def _learn(self, data: TaughtTrials) -> dict[str, Tensor]:
-        losses = [self._descend(data) for _ in range(self.config.updates_per_iteration)]
+        cfg = self.config
+        self.adam.param_groups[0]["lr"] = decayed(cfg.learning_rate, self.env_steps, cfg.decay_steps)
+        losses = [self._descend(data) for _ in range(cfg.updates_per_iteration)]
         imitation, _, unlike, reward = torch.stack(losses).mean(0)
         names = [f"Loss/imitation/{self.world.task_names[task]}" for task in self.tasks.tolist()]
         found = dict(zip(names, imitation, strict=True))
