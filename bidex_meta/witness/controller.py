@@ -150,6 +150,7 @@ class HandActions:
     def __init__(self, task: TaskClass):
         self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
         self._full_torque = TORQUE_PER_SCALE * task.orientation_scale
+        self._rounds = not task.rules.wide
 
     def __call__(self, leads: Sequence[Lead], sensor: Callable[[str], Tensor]) -> Tensor:
         """Return actions (n, action_size) of n environments; ``sensor`` returns values (n, k), in double precision."""
@@ -162,7 +163,12 @@ class HandActions:
         way *= (speed / (way.norm(dim=-1, keepdim=True) + 1e-9)).clamp_max(1.0)
         fingers = torch.from_numpy(np.stack([lead.fingers for lead in leads]))
         force = (way / self._full_speed).float()
-        return quantised(torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1))
+        actions = torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1)
+        # Witnesses of version 1 store bytes. In version 2 a small force must not become 0: a policy that learns from
+        # the actions would not move the last millimetre.
+        if self._rounds:
+            return quantised(actions)
+        return actions.clamp(-1.0, 1.0)
 
     def _torque(self, held: Tensor, now: Tensor) -> Tensor:
         """Return the actions (n, 2, 3) that turn hands to the orientations ``held``; zeros for a free hand.

@@ -23,7 +23,7 @@ from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.evidence import Belief, BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import Activation, Layers
+from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
@@ -64,6 +64,8 @@ class ICLConfig(LearnerConfig):
     teacher_steps: Whole = 300_000
     """Environment steps over which the share of trials in which the teacher acts falls from 1 to 0."""
     normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
+    autocast: Autocast = "auto"
+    """Use bfloat16 in hidden layers during updates; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
@@ -103,6 +105,7 @@ class ICL(TrialLearner):
     def __init__(self, world: PooledWorld, config: ICLConfig, seed: int, sources: Sources = NO_SOURCES):
         sources.check(self.name, "teachers", needed="teachers")
         super().__init__(world, config, seed)
+        self.low_precision = use_bfloat16(config.autocast, self.device)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
         self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
         assert sources.teachers is not None
@@ -212,8 +215,9 @@ class ICL(TrialLearner):
         """
         trial, row, task = self._drawn(data, self.config.batch_size)
         steps = data.steps(trial, row, torch.rand(len(task), generator=self.generator, device=self.device))
-        unlikely, errors = self._model(steps, task)
-        terms = self._imitation(steps, task), unlikely, self._unlike(steps, task), errors
+        with autocast(self.device, self.low_precision):
+            unlikely, errors = self._model(steps, task)
+            terms = self._imitation(steps, task), unlikely, self._unlike(steps, task), errors
         losses = torch.stack(terms) / world_size()
         actor = self.policy.actor
         weights = list(actor.parameters())

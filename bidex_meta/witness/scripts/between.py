@@ -53,6 +53,18 @@ def ramp(value: float, first: float, last: float) -> float:
     return min(1.0, max(0.0, (value - first) / (last - first)))
 
 
+def blend(share: float, first: tuple[Point, Point], second: tuple[Point, Point]) -> tuple[Point, Point]:
+    """Return target points of both hands: ``first`` for a share of 1, ``second`` for 0, and points between for others.
+
+    A script that jumps from one step to the next teaches badly: near the jump, a network's answer is a mean of both.
+    """
+    right, left = (
+        tuple(share * a + (1.0 - share) * b for a, b in zip(*pair, strict=True))
+        for pair in zip(first, second, strict=True)
+    )
+    return right, left  # type: ignore[return-value]
+
+
 class Between:
     """Both hands and an object that they take, in their present state."""
 

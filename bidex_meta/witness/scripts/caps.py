@@ -147,7 +147,7 @@ def _pull(hands: HandController, missing: float) -> Point:
         return point(hands.at("left") + over + down * (way(0.8, _PEG, 0.1) - over))
     if missing < 0.05 + 0.08 * float(hands.where("cup/angular_velocity")[2]):
         return point(hands.at("left") + way(_TOUCH + 0.4, _PEG, 0.1))
-    return point(hands.at("left") + way(_TOUCH - min(0.3, missing), _PEG))
+    return point(hands.at("left") + way(_TOUCH - min(0.2, 0.05 + 0.3 * missing), _PEG))
 
 
 def _aside(hands: HandController) -> Point:

@@ -1,7 +1,7 @@
 """Scripted policy that puts a block into a bucket; in version 2 the bucket is first carried to its goal."""
 
 from bidex_meta.witness.controller import Actions, HandController
-from bidex_meta.witness.scripts.between import Between, Take
+from bidex_meta.witness.scripts.between import Between, Take, blend, ramp
 
 # The right forefinger and the left little finger spread towards each other and press until they are straight.
 _SPREAD = 0.12
@@ -30,13 +30,14 @@ def place_in_bucket(hands: HandController) -> Actions:
         # The right hand must not descend onto the bucket.
         bucket = Between(hands, "bucket", _BUCKET)
         block = Between(hands, "block", _BLOCK, (max(0.1, gap - 0.12), 1.0))
-        lifted = bucket.held > 0.5 and bucket.thing[2] > _STANDS + 0.012
-        if lifted or bucket.far(goal) > 0.033 - 0.021 * bucket.held:
-            points = bucket.carry(goal, _STANDS + 0.02, _STANDS)
-        elif bucket.off < 0.05 and bucket.over < 0.08:
-            points = bucket.leave()
-        elif block.far(place) > 0.03 - 0.015 * block.held:
-            points = block.carry(place, _OVER, _OVER)
+        # Each step passes into the next one gradually, so that a network can learn them.
+        if bucket.far(goal) > 0.033 - 0.021 * bucket.held:
+            bring = 1.0
         else:
-            points = block.leave()
+            bring = ramp(bucket.thing[2] - _STANDS, 0.006, 0.018) * ramp(bucket.off, 0.07, 0.05)
+        around = ramp(bucket.off, 0.06, 0.04) * ramp(bucket.over, 0.1, 0.06)
+        off_bucket = ramp(block.far(place), 0.02 - 0.01 * block.held, 0.035 - 0.015 * block.held)
+        drop = blend(off_bucket, block.carry(place, _OVER, _OVER), block.leave())
+        put = blend(around, bucket.leave(), drop)
+        points = blend(bring, bucket.carry(goal, _STANDS + 0.02, _STANDS), put)
         yield from hands.lead_each(points)

@@ -119,20 +119,21 @@ def _use_kettle(hands: HandController, kettle: Tensor, back: Tensor, tilt: float
     hands.bend("right", 1.45 * ready, 1.57 * ready)
     hands.bend("left", 0.0, 0.0, **_THUMB)
     held = ready * ramp(float(hands.where("right/FFJ1_position")), 0.85, 0.97)
-    if held > 0.5:
-        # The hands follow each other, not the kettle, which may slip between them.
-        line = hands.at("right") - hands.at("left")
-        line[0] += _AHEAD
-        flat = float(line[:2].norm())
-        back = line / flat
-        back[2] = 0.0
-        now = math.atan2(float(line[2]), flat) + _SLOPE
-        step, lead = _next(hands, kettle, back, tilt)
-        places = [_tensor(_grip(side, 0.0 * kettle, back, now, loose), kettle) for side in SIDES]
-        origin = held * step + 0.5 * sum(hands.at(side) - place for side, place in zip(SIDES, places, strict=True))
-        tilt = now + lead
-    else:
-        origin = kettle
+    # As soon as they hold the kettle, the hands follow each other and not the kettle, which may slip between them.
+    line = hands.at("right") - hands.at("left")
+    line[0] += _AHEAD
+    flat = float(line[:2].norm())
+    line[:2] /= flat + 1e-9
+    now = math.atan2(float(line[2]), flat) + _SLOPE
+    line[2] = 0.0
+    step, lead = _next(hands, kettle, back, tilt)
+    places = [_tensor(_grip(side, 0.0 * kettle, line, now, loose), kettle) for side in SIDES]
+    between = 0.5 * sum(hands.at(side) - place for side, place in zip(SIDES, places, strict=True))
+    follow = ramp(held, 0.3, 0.7)
+    origin = kettle + follow * (between + held * step - kettle)
+    tilt = tilt + follow * (now + lead - tilt)
+    back = back + follow * (line - back)
+    back /= back.norm() + 1e-9
     hands.hold("right", roll=tilt)
     hands.hold("left", roll=_TROUGH + tilt)
     yield from hands.lead_each((_grip(side, origin, back, tilt, loose, aside[side]) for side in SIDES), 1.0)
@@ -145,23 +146,21 @@ def _next(hands: HandController, kettle: Tensor, back: Tensor, tilt: float) -> t
     """
     bucket = hands.where("bucket/position")
     x, y, z = kettle.tolist()
-    if z > _POURS + _EMPTY or y > _INSIDE:
-        way = kettle.new_tensor([float(bucket[0]) - x, _ASIDE - y, 0.0])
-        way *= ramp(tilt, 0.6, 0.3) * min(1.0, 0.045 / (float(way.norm()) + 1e-9))
-        high = _POURS + _EMPTY + 0.026
-        way[2] = max(-0.05, min(0.035, high + (_STANDS - 0.01 - high) * ramp(y, 0.1, 0.17) - z))
-        turn = -tilt
-    else:
-        way = bucket + 0.05 * back - hands.where("kettle/spout_position")
-        way[2] = 0.0
-        far = float(way.norm())
-        up = z - _STANDS
-        way *= ramp(up, 0.03, 0.1) * min(1.0, 0.035 / (far + 1e-9))
-        if tilt > _POUR - 0.12:
-            way[2] = 0.02 * ramp(far, 0.04, 0.02)
-        else:
-            way[2] = max(-0.035, min(0.035, _POURS - z))
-        turn = _POUR * ramp(up, 0.0, 0.9 * (_POURS - _STANDS)) - tilt
+    up = z - _STANDS
+    over = bucket + 0.05 * back - hands.where("kettle/spout_position")
+    over[2] = 0.0
+    far = float(over.norm())
+    over *= ramp(up, 0.03, 0.1) * min(1.0, 0.035 / (far + 1e-9))
+    pours = ramp(tilt, _POUR - 0.16, _POUR - 0.08)
+    over[2] = pours * 0.02 * ramp(far, 0.04, 0.02) + (1.0 - pours) * max(-0.035, min(0.035, _POURS - z))
+    aside = kettle.new_tensor([float(bucket[0]) - x, _ASIDE - y, 0.0])
+    aside *= ramp(tilt, 0.6, 0.3) * min(1.0, 0.045 / (float(aside.norm()) + 1e-9))
+    high = _POURS + _EMPTY + 0.026
+    aside[2] = max(-0.05, min(0.035, high + (_STANDS - 0.01 - high) * ramp(y, 0.1, 0.17) - z))
+    # The empty kettle passes from the first way into the second one gradually.
+    empty = max(ramp(z - _POURS, _EMPTY - 0.005, _EMPTY + 0.005), ramp(y, _INSIDE - 0.02, _INSIDE + 0.02))
+    way = over + empty * (aside - over)
+    turn = (1.0 - empty) * _POUR * ramp(up, 0.0, 0.9 * (_POURS - _STANDS)) - tilt
     return way, max(-0.18, min(0.12, turn))
 
 

@@ -2,7 +2,7 @@
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController
-from bidex_meta.witness.scripts.between import Between, Take, ramp
+from bidex_meta.witness.scripts.between import Between, Take, blend, ramp
 
 # This is the bend of the knuckles in rad. The fingers point down and yield when their backs press a block. A force of
 # 2 N is enough; a larger one would turn the hands, whose torque is low.
@@ -33,12 +33,13 @@ def stack_in_order(hands: HandController) -> Actions:
         below = _between(hands, lower, upper)
         above = _between(hands, upper, lower)
         top = below.thing[2] + _EDGE
-        if below.far(goals[lower]) > 0.022 - 0.014 * below.held:
-            points = below.carry(goals[lower], _LIES, _LIES)
-        elif above.far(hands.where(f"{lower}/position")) > 0.022 or above.thing[2] > top + 0.005:
-            points = above.carry(goals[upper], top + 0.02, top + 0.003)
-        else:
-            points = above.leave()
+        # Each step passes into the next one gradually, so that a network can learn them.
+        off_goal = ramp(below.far(goals[lower]), 0.022 - 0.014 * below.held, 0.032 - 0.018 * below.held)
+        off_block = max(
+            ramp(above.far(hands.where(f"{lower}/position")), 0.018, 0.026), ramp(above.thing[2] - top, 0.003, 0.007)
+        )
+        put = blend(off_block, above.carry(goals[upper], top + 0.02, top + 0.003), above.leave())
+        points = blend(off_goal, below.carry(goals[lower], _LIES, _LIES), put)
         yield from hands.lead_each(points)
 
 

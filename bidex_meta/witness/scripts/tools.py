@@ -11,7 +11,9 @@ from bidex_meta.witness.scripts.between import ramp
 
 _LEVER = 0.035  # distance in metres from a rocker's hinge to its button
 _CLEAR = 0.04  # height of a fingertip that is clear of its button, metres
-_ENOUGH = 0.065  # angle before the requested one at which a finger rises, rad: the finger still presses while it rises
+# Angles before the requested one at which a finger begins to rise, and from which on it rises at full speed, rad. The
+# finger still presses while it rises.
+_ENOUGH = 0.045, 0.02
 
 
 def press_switches(hands: HandController) -> Actions:
@@ -27,12 +29,12 @@ def press_switches(hands: HandController) -> Actions:
             above = _tip(hands, side, _button(hands, name), _CLEAR)
             x, y, height = point(hands.at(side))
             off = math.hypot(above[0] - x, above[1] - y)
-            if left < _ENOUGH:
-                height = min(height + 0.03, above[2] + 0.1)
-            elif off > 0.02 or height > above[2]:
-                height = above[2]
+            if off > 0.02 or height > above[2]:
+                press = above[2] - height
             else:
-                height -= min(0.008, max(0.001, 0.8 * _LEVER * (left - 0.03)))
+                press = -min(0.004, max(0.002, 0.8 * _LEVER * (left - 0.03)))
+            rise = min(0.03, above[2] + 0.1 - height)
+            height += press + ramp(left, *_ENOUGH) * (rise - press)
             points.append((above[0], above[1], height))
         yield from hands.lead_each(points, 1.2)
 
@@ -79,7 +81,7 @@ def _around(hands: HandController, side: str, along: Tensor, way: float, closed:
     off = float((end - at)[:2].norm())
     near = ramp(off, 0.04, 0.015)
     fist = max(ramp(float(hands.where(f"{side}/MFJ2_position")), 1.05, 1.2), near * ramp(over, 0.054, 0.046))
-    hands.bend(side, 0.6 + 0.3 * near + 0.6 * fist, 0.6 + 0.4 * near + 0.57 * fist, THJ3=0.6, THJ4=0.6)
+    hands.bend(side, 0.6 + 0.3 * near + 0.65 * fist, 0.6 + 0.4 * near + 0.65 * fist, THJ3=0.6, THJ4=0.6)
     goal = at + way * along + (1.0 - closed) * (end - at)
     above = float(end[2]) + 0.06 - 0.04 * near
     return float(goal[0]), float(goal[1]), above + closed * (0.65 - above)
