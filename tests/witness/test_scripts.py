@@ -17,6 +17,7 @@ from bidex_meta.witness.controller import GAIN, Actions, HandController, point
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS, Script, script_of
+from bidex_meta.witness.store import LEVELS
 from tests.tasks.worlds import world_of
 
 
@@ -102,6 +103,19 @@ def test_noise_is_added_to_what_a_script_does() -> None:
         actions.append(agent.eval_action(torch.zeros(50, 1)))
     inner = (actions[0].abs() < 0.1) & (actions[1].abs() < 1.0)
     assert float((actions[1] - actions[0])[inner].std()) == pytest.approx(0.3, rel=0.1)
+
+
+def test_only_version_1_rounds_actions_to_bytes() -> None:
+    """A small force must not become 0, or whoever imitates the script does not move the last millimetre."""
+    whole = []
+    for name in ("StackBlock", "StackBlock-v2"):
+        world = make_task_world(name, 8, "cpu", autoreset_mode="DISABLED", threads=1, moving_base=True)
+        world.reset(seed=3)
+        agent = Scripted(world)
+        agent.reset(torch.ones(8, dtype=torch.bool))
+        levels = LEVELS * agent.eval_action(torch.zeros(8, 1))
+        whole.append(bool((levels - levels.round()).abs().max() < 1e-4))
+    assert whole == [True, False]
 
 
 def test_a_hand_turns_about_the_worlds_axes_as_fast_as_it_is_asked() -> None:
