@@ -31,7 +31,7 @@ class BaselineFlags:
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
     """Policy to measure. random: uniform actions; zero: the action 0, which holds joints in the middle of their range
     and bases at rest; witness: the actions that solve task 0 of a class, played in all its tasks; script: a
-    hand-written controller that sees the whole state (eight classes have one, eighteen in version 2)."""
+    hand-written controller that sees the whole state (eight classes have one, nineteen in version 2)."""
     suite: str = "MT20"  # Suite whose train tasks are played.
     episodes: Few = 4  # Episodes of each task.
     seed: Seed = 0  # Seed that draws tasks, start states and actions.

@@ -85,7 +85,7 @@ class RecordConfig:
     script: Switch = False
     """With demonstrations and --starts tasks: use a scripted policy instead of the witness. The script computes actions
     from each start (about a second for 500 steps) and succeeds more often. Eight classes have one, in version 2
-    eighteen."""
+    nineteen."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """With demonstrations and --starts witness: distance by which the objects' start is shifted, metres."""
     num_envs: Environments | None = None  # Environments stepped together; None: one per task, but at least 200.

@@ -143,14 +143,15 @@ def test_each_script_solves_its_class(name: str) -> None:
 
 
 SOLVED = (
-    "BottleCap", "CatchUnderarm", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace", "HandOver", "OpenPenCap",
-    "OpenScissors", "PourWater", "PushBlock", "StackBlock", "SwingCup", "Switch", "TwoCatchUnderarm",
+    "BottleCap", "CatchOver2Underarm", "CatchUnderarm", "DoorCloseInward", "DoorOpenOutward", "GraspAndPlace",
+    "HandOver", "OpenPenCap", "OpenScissors", "PourWater", "PushBlock", "StackBlock", "SwingCup", "Switch",
+    "TwoCatchUnderarm",
 )  # fmt: skip
 
 
 STATELESS = (
-    "BottleCap", "CatchUnderarm", "GraspAndPlace", "HandOver", "OpenPenCap", "PourWater", "StackBlock", "SwingCup",
-    "Switch", "TwoCatchUnderarm",
+    "BottleCap", "CatchOver2Underarm", "CatchUnderarm", "GraspAndPlace", "HandOver", "OpenPenCap", "PourWater",
+    "StackBlock", "SwingCup", "Switch", "TwoCatchUnderarm",
 )  # fmt: skip
 """Scripts that follow from the present state alone: a student that sees no past can do what they do."""
 

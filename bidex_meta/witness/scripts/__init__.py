@@ -14,6 +14,7 @@ from bidex_meta.witness.scripts.pots import lift_underarm
 from bidex_meta.witness.scripts.pouring import pour_and_carry, pour_water
 from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
+from bidex_meta.witness.scripts.throwing import throw_down
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
 from bidex_meta.witness.scripts.turning import turn_cubes
 
@@ -32,6 +33,7 @@ SCRIPTS: dict[str, Script] = {
 """Scripts for both versions of a class, by the class's name."""
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "BottleCap": pull_cap,
+    "CatchOver2Underarm": throw_down,
     "CatchUnderarm": carry_egg,
     "DoorOpenOutward": push,
     "HandOver": carry_egg,

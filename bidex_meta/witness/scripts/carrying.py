@@ -1,6 +1,6 @@
 """Scripted policies for eggs that lie on a palm: a tilted hand with bent fingers is a basket that carries the egg.
 
-A throw that is caught and then brought to the goal is quicker, but a script cannot foresee where an egg flies.
+A throw would be quicker, but a thrown egg is often lost.
 """
 
 from torch import Tensor
