@@ -93,6 +93,20 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     assert torch.equal(data.labels[long], world.best(shown[long]))
 
 
+def test_each_class_is_normalised_by_its_own_observations() -> None:
+    world = PointGoals(8, classes=(PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2)))
+    learner = taught(world)
+    learner.iterate()
+    t, filled = learner.data.trials, learner.data.trials.filled()
+    for task in range(2):
+        mine = t.obs[filled & (world.task_id == task)]
+        seen = learner.policy.seen(mine, torch.full((len(mine),), task))
+        varied = mine.std(0) > 0.01
+        assert torch.allclose(seen.mean(0)[varied], torch.zeros(int(varied.sum())), atol=1e-4)
+        assert torch.allclose(seen.std(0, correction=0)[varied], torch.ones(int(varied.sum())), atol=0.05)
+    assert taught(PointGoals(8)).policy.own is None
+
+
 def test_the_step_size_falls_in_a_line_and_stays_at_a_twentieth() -> None:
     world = PointGoals(8)
     trial = int(SMALL.episodes_per_trial * world.max_episode_steps.sum())

@@ -173,6 +173,8 @@ class ICL(TrialLearner):
         valid = t.valid & filled
         self._take_moments(data)
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
+        if self.policy.own is not None:
+            self.policy.own.update(t.obs[filled], self.world.task_id.expand_as(filled)[filled])
         self.policy.goals.update(data.goals[:, 0])
         losses = self._learn(data) | {"Loss/goal": all_sum(pupil.missed().double()) / world_size()}
         self._count(t)
@@ -249,7 +251,7 @@ class ICL(TrialLearner):
         An actor that always returns the mean label has an error of 1.
         """
         policy = self.policy
-        actions = policy.actor.act(policy.observations(steps.obs), policy.goals(steps.goals[:, 0]), task)
+        actions = policy.actor.act(policy.seen(steps.obs, task), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
         return self._of_class(off.square().mean(1))
 
@@ -263,7 +265,7 @@ class ICL(TrialLearner):
         """
         policy = self.policy
         paid = steps.paid[:, None].float()
-        mean, log_std = policy.actor.pays(policy.observations(steps.obs), policy.goals(steps.goals), task)
+        mean, log_std = policy.actor.pays(policy.seen(steps.obs, task), policy.goals(steps.goals), task)
         off = (mean - policy.earned(steps.rewards)).square()
         unlikely = (0.5 * off * torch.exp(-2.0 * log_std) + log_std) * log_std.detach().exp()
         return self._of_class((unlikely * paid).mean(1)), self._of_class((off * paid).mean(1))

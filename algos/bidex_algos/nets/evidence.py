@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Towers
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Headed, head_of, linear
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.normalise import ObservationNormaliser, TaskNormaliser
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_meta.utils import maths
 
@@ -149,8 +149,8 @@ class ModelBelief:
 
     def _likelihood(self, obs: Tensor, reward: Tensor) -> Tensor:
         policy = self._policy
-        seen = policy.observations(obs)
-        mean, log_std = policy.actor.pays(seen, policy.goals(self.candidates), policy.actor.class_of(seen))
+        task = policy.class_of(obs)
+        mean, log_std = policy.actor.pays(policy.seen(obs, task), policy.goals(self.candidates), task)
         off = (policy.earned(reward)[:, None] - mean) / log_std.exp()
         return self._trust * (-0.5 * (_TAIL + 1.0) * torch.log1p(off.square() / _TAIL) - log_std)
 
@@ -182,8 +182,22 @@ class BeliefPolicy(RecurrentPolicy):
         """
         super().__init__(inputs, actions, candidates if belief is None else len(belief.candidates), *rest)
         self.goals = ObservationNormaliser(goals)
+        self.own: TaskNormaliser | None = None
+        """Statistics of each class's observations, for the reward model and the actor; None if there is one class."""
+        if self.observations.enabled and self.actor.classes > 1:
+            self.own = TaskNormaliser(inputs, self.actor.classes)
         self.try_steps = try_steps
         self.belief: Belief = belief or ModelBelief(self, trust)
+
+    def seen(self, obs: Tensor, task: Tensor) -> Tensor:
+        """Normalise raw observations (B, d) of the classes ``task`` (B,) for the reward model and the actor."""
+        if self.own is None:
+            return self.observations(obs)
+        return self.own(obs, task)
+
+    def class_of(self, obs: Tensor) -> Tensor:
+        """Predict the class (B,) of raw observations (B, d)."""
+        return self.actor.class_of(self.observations(obs))
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
         """Draw the candidate on which each of ``rows`` environments acts when it explores.
@@ -210,5 +224,5 @@ class BeliefPolicy(RecurrentPolicy):
         if drawn is not None:
             place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
             goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
-        seen = self.observations(obs)
-        return self.actor.act(seen, self.goals(goal), self.actor.class_of(seen)), state
+        task = self.class_of(obs)
+        return self.actor.act(self.seen(obs, task), self.goals(goal), task), state

@@ -133,31 +133,33 @@ def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) ->
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Normalises each observation by the statistics of its own task, which the observation's group ``task_id`` shows.
+    """Normalises each observation by the statistics of its own task.
 
-    ``tasks`` is the number of tasks.
+    Columns that vary little within a task, but much between tasks, would otherwise be compressed. ``tasks`` is the
+    number of tasks. If a method gets no ``task``, int64 (...), the observation's group ``task_id`` shows the task.
     """
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)
         self.tasks = tasks
-        self.one_hot = inputs.columns("task_id")
+        self.one_hot = inputs.columns(*[group.name for group in inputs.groups if group.name == "task_id"])
         self.stats = RunningStats((tasks, self.measured.size))
         self.shift = torch.zeros(tasks, inputs.width)
         self.scale = torch.ones(tasks, inputs.width)
 
-    def forward(self, obs: Tensor) -> Tensor:
+    def forward(self, obs: Tensor, task: Tensor | None = None) -> Tensor:
         """Normalise raw observations (..., d), each by the statistics of its task; the result is float32."""
-        task = self.one_hot(obs).argmax(-1)
+        if task is None:
+            task = self.one_hot(obs).argmax(-1)
         return ((obs - self.shift[task]) * self.scale[task]).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
-    def update(self, obs: Tensor) -> None:
+    def update(self, obs: Tensor, task: Tensor | None = None) -> None:
         """Add raw observations (..., columns) of all processes to the statistics of their tasks."""
         if self.settled or self.measured.size == 0:
             return
         flat = obs.reshape(-1, obs.shape[-1])
-        task = self.one_hot(flat).argmax(-1)
+        task = self.one_hot(flat).argmax(-1) if task is None else task.flatten()
         var, mean = torch.zeros(2, self.tasks, self.measured.size, device=obs.device).unbind()
         for seen in task.unique():
             var[seen], mean[seen] = torch.var_mean(self.measured(flat[task == seen]), dim=0, correction=0)
