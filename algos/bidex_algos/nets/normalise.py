@@ -159,9 +159,12 @@ class TaskNormaliser(ObservationNormaliser):
         if self.settled or self.measured.size == 0:
             return
         flat = obs.reshape(-1, obs.shape[-1])
-        task = self.one_hot(flat).argmax(-1) if task is None else task.flatten()
+        if task is None:
+            of_row = self.one_hot(flat).argmax(-1)
+        else:
+            of_row = task.flatten()
         var, mean = torch.zeros(2, self.tasks, self.measured.size, device=obs.device).unbind()
-        for seen in task.unique():
-            var[seen], mean[seen] = torch.var_mean(self.measured(flat[task == seen]), dim=0, correction=0)
-        count = torch.bincount(task, minlength=self.tasks).double()[:, None]
+        for seen in of_row.unique():
+            var[seen], mean[seen] = torch.var_mean(self.measured(flat[of_row == seen]), dim=0, correction=0)
+        count = torch.bincount(of_row, minlength=self.tasks).double()[:, None]
         self.merge(mean, var, count.expand_as(mean).contiguous())

@@ -58,11 +58,12 @@ def blend(share: float, first: tuple[Point, Point], second: tuple[Point, Point])
 
     A script that jumps from one step to the next teaches badly: near the jump, a network's answer is a mean of both.
     """
-    right, left = (
-        tuple(share * a + (1.0 - share) * b for a, b in zip(*pair, strict=True))
-        for pair in zip(first, second, strict=True)
-    )
-    return right, left  # type: ignore[return-value]
+
+    def between(a: Point, b: Point) -> Point:
+        x, y, z = (share * p + (1.0 - share) * q for p, q in zip(a, b, strict=True))
+        return x, y, z
+
+    return between(first[0], second[0]), between(first[1], second[1])
 
 
 class Between:
