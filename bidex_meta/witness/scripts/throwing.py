@@ -9,21 +9,21 @@ from bidex_meta.witness.scripts.between import ramp
 
 # The right hand waits with its wrist bent back and leaning back (wrist and roll, rad) until the falling egg is below a
 # height, metres. Then it swings ahead until the egg is faster than a speed along -y, m/s, or has left the fingers.
-_BACK = (-0.7, -0.3)
-_AHEAD = (0.49, 0.9)
-_LOW = 0.999
-_FAST = 1.269
+_BACK = -0.7, -0.268
+_AHEAD = 0.49, 0.794
+_LOW = 0.997
+_FAST = 1.359
 _LEFT = -0.03, 0.9  # y and height in metres below which the egg has left the right fingers
-_STAYS: Point = (0.003, 0.04, 0.87)  # place of the right hand's point, metres
+_STAYS: Point = (0.009, 0.036, 0.865)  # place of the right hand's point, metres
 # Angles in rad of the left hand's knuckles, middle joints and wrist, while it waits for the egg and while it holds it.
-_OPEN = (0.679, 1.16, -0.7)
-_CLOSED = (1.0, 1.474, -0.4)
+_OPEN = 0.6, 1.041, -0.7
+_CLOSED = 1.089, 1.232, -0.4
 _HOME = (0.0, -0.8, 0.5)  # start of the left hand's mount, metres
-_REACH = 0.093  # distance in metres of the mount from its start; at 0.1 m the episode fails
+_REACH = 0.096  # distance in metres of the mount from its start; at 0.1 m the episode fails
 _REST = -0.026, 0.05  # where an egg lies in the fingers, relative to the hand's point: along y, and up, metres
-_ASIDE = 0.008  # by how much farther along x than the hand's point the egg should arrive, metres
-_NEAR = 0.06  # height in metres above the fingers below which the egg is caught
-_STEP = 0.011  # distance by which the target leads a hand that carries the egg, metres: a fast hand loses it
+_ASIDE = 0.015  # by how much farther along x than the hand's point the egg should arrive, metres
+_NEAR = 0.07  # height in metres above the fingers below which the egg is caught
+_STEP = 0.014  # distance by which the target leads a hand that carries the egg, metres: a fast hand loses it
 _GRAVITY = 9.81
 
 
