@@ -97,7 +97,8 @@ def test_each_class_is_normalised_by_its_own_observations() -> None:
     world = PointGoals(8, classes=(PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2)))
     learner = taught(world)
     learner.iterate()
-    t, filled = learner.data.trials, learner.data.trials.filled()
+    t = learner.data.trials
+    filled = t.filled()
     for task in range(2):
         mine = t.obs[filled & (world.task_id == task)]
         seen = learner.policy.seen(mine, torch.full((len(mine),), task))

@@ -106,7 +106,7 @@ def test_noise_is_added_to_what_a_script_does() -> None:
 
 
 def test_only_version_1_rounds_actions_to_bytes() -> None:
-    """A small force must not become 0, or whoever imitates the script does not move the last millimetre."""
+    """Check that small forces stay: a policy that imitates rounded actions stops just before the goal."""
     whole = []
     for name in ("StackBlock", "StackBlock-v2"):
         world = make_task_world(name, 8, "cpu", autoreset_mode="DISABLED", threads=1, moving_base=True)
