@@ -15,7 +15,7 @@ FILM = ["--tiled", "--steps", "160", "--every", "8", "--width", "160"]
 
 @dataclass(frozen=True)
 class DemoFlags:
-    """Show the policy that comes with bidex-meta in the twenty classes of MT20.
+    """Show the policy that comes with bidex-meta in the twenty classes of MT20-v2.
 
     Example: bidex-meta demo --out demo.webp
 
@@ -35,4 +35,4 @@ def main(arguments: Sequence[str]) -> None:
         return
     out = flags.out or Path("bidex-meta-demo.webp")
     tell(f"Drawing the film {out}, which takes about two minutes without a GPU.")
-    render.main([str(paths.assets_dir() / "policies" / "MT20"), *FILM, "--out", str(out.absolute())])
+    render.main([str(paths.shipped_policy()), *FILM, "--out", str(out.absolute())])

@@ -12,7 +12,7 @@ from bidex_meta.experiments.exporting import ROWS, TOLERANCE, export
 class ExportFlags:
     """Write a run's policy as ONNX: raw observations (N, d) in, mean actions (N, a) in [-1, 1] out, float32.
 
-    Example: bidex-meta export assets/policies/MT20 --out mt20.onnx
+    Example: bidex-meta export assets/policies/MT20-v2 --out mt20.onnx
 
     The file contains the running statistics of observations. Policies that have a memory or adapt are refused. The file
     computes in float32; for a policy that computes in bfloat16 on this machine, the command prints the largest

@@ -22,8 +22,8 @@ class PlayFlags(LookFlags):
 
     Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
 
-    Without arguments, bidex-meta play shows the policy that comes with bidex-meta, one episode of each class of MT20.
-    bidex-meta play --task SwingCup --policy random needs no run either.
+    Without arguments, bidex-meta play shows the policy that comes with bidex-meta, one episode of each class of
+    MT20-v2. bidex-meta play --task SwingCup --policy random needs no run either.
     """
 
     speed: Positive = 1.0  # Playback speed relative to real time; 0.5 is slow motion.
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(PlayFlags, arguments, "play")
     tour = not (flags.run or flags.task or flags.suite) and flags.policy == PlayFlags.policy
     if tour:
-        flags = replace(flags, run=paths.assets_dir() / "policies" / "MT20")
+        flags = replace(flags, run=paths.shipped_policy())
     from bidex_meta.cli.looking import acting, looked_at
     from bidex_meta.viewer.playback import Stage, play
 

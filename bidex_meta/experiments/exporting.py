@@ -84,14 +84,14 @@ def exported(policy: Any, shape: Json, metadata: dict[str, str]) -> tuple[bytes,
     network: Any = policy
     if not isinstance(policy, torch.nn.Module):
         raise BidexError(f"Expected a policy that is a torch.nn.Module, got {type(policy).__name__}.")
-    obs = _observations(ROWS, shape)
+    obs = _observations(ROWS, shape, network)
     as_played = network.eval_action(obs).numpy()
     low_precision = getattr(network, "low_precision", False)
     network.low_precision = False
     # mkldnn would choose a matrix product by the batch size, which the export leaves open.
     with warnings.catch_warnings(action="ignore"), torch.backends.mkldnn.flags(enabled=False):
         try:
-            content = _onnx(network, _observations(2, shape), metadata)
+            content = _onnx(network, _observations(2, shape, network), metadata)
         except Exception as error:  # the exporter raises many kinds of errors
             raise BidexError(
                 f"torch cannot export this policy: {type(error).__name__}, {one_line(error)[:200]}. Its networks may "
@@ -134,12 +134,23 @@ def _onnx(policy: Any, obs: torch.Tensor, metadata: dict[str, str]) -> bytes:
     return program.model_proto.SerializeToString()
 
 
-def _observations(rows: int, shape: Json) -> torch.Tensor:
-    """Draw random raw observations (rows, d), float32, with a task's one-hot if the policy reads one."""
+def _observations(rows: int, shape: Json, policy: Any) -> torch.Tensor:
+    """Draw random raw observations (rows, d), float32, with a task's one-hot if the policy reads one.
+
+    If the policy normalises observations, they have the mean and the variance that it knows. Others would be so far
+    from those of training that rounding alone moves the actions.
+    """
     obs = torch.randn(rows, shape["observations"], generator=torch.Generator().manual_seed(0))
+    task = torch.arange(rows)
     for start, stop in shape.get("groups", {}).get("task_id", []):
-        obs[:, start:stop] = torch.eye(stop - start)[torch.arange(rows) % (stop - start)]
-    return obs
+        obs[:, start:stop] = torch.eye(stop - start)[task % (stop - start)]
+    normaliser = getattr(policy, "observations", None)
+    if normaliser is None:
+        return obs
+    shift, scale = normaliser.shift, normaliser.scale  # (d,), or (tasks, d) for statistics of each task
+    if shift.ndim == 2:
+        shift, scale = (rows_of[task % len(rows_of)] for rows_of in (shift, scale))
+    return shift + obs / scale
 
 
 def _metadata(folder: RunFolder, config: RunConfig, steps: int, shape: Json) -> dict[str, str]:

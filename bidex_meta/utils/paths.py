@@ -17,6 +17,11 @@ def assets_dir() -> Path:
     return _room("assets")
 
 
+def shipped_policy() -> Path:
+    """Return the folder of the run whose policy comes with bidex-meta: DAgger on MT20-v2."""
+    return assets_dir() / "policies" / "MT20-v2"
+
+
 def _room(name: str) -> Path:
     packed = _PACKAGE / name
     beside = _PACKAGE.parent / name

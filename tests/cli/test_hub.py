@@ -15,7 +15,7 @@ from bidex_meta.runs import RunFolder
 from tests.pages import ROOT
 
 HAND_OVER = ROOT / "results" / "teachers" / "HandOver"
-MT20 = ROOT / "assets" / "policies" / "MT20"
+MT20 = ROOT / "results" / "MT20-dagger-seed0"
 
 
 def test_a_policy_goes_through_a_folder_and_plays(shown, refused, tmp_path: Path) -> None:

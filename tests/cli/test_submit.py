@@ -81,7 +81,7 @@ def test_shipped_entries_fit(path: Path) -> None:
 
 def test_digests_of_shipped_policies_are_those_of_the_runs() -> None:
     """Both policies are stored in half precision, the runs had single precision."""
-    for run in ("assets/policies/MT20", "results/MT20-mtppo-seed0"):
+    for run in ("results/MT20-dagger-seed0", "results/MT20-mtppo-seed0"):
         loaded = RunFolder.open(ROOT / run).checkpoints.load()
         assert loaded is not None
         digest = weights_digest(loaded[0]["learner"]["policy"])

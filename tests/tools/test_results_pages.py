@@ -41,9 +41,9 @@ def test_every_policy_of_the_repository_stands_on_the_page_of_pretrained_policie
     rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|") and "bidex-meta" in line]
     commands = [row[-1].strip("`") for row in rows]
     assert sorted(commands) == sorted(
-        f"bidex-meta play {folder.relative_to(ROOT)}".replace(" assets/policies/MT20", "") for folder in folders
+        f"bidex-meta play {folder.relative_to(ROOT)}".replace(" assets/policies/MT20-v2", "") for folder in folders
     )
-    stored = json.loads((ROOT / "assets" / "policies" / "MT20" / "evaluation.json").read_text())
+    stored = json.loads((ROOT / "assets" / "policies" / "MT20-v2" / "evaluation.json").read_text())
     assert percent(rows[0][4]) == pytest.approx(
         stored["other_tasks"]["policy"]["aggregate"]["success"]["mean"], abs=6e-4
     )

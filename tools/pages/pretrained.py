@@ -10,7 +10,7 @@ from tools.pages.tables import table
 
 _FOLDERS = {"policies": ("assets/policies/*", "results/*"), "teachers": ("results/teachers/*",)}
 """Patterns of run folders in the repository, by the value of a block's option ``on``."""
-_ALONE = "assets/policies/MT20"
+_ALONE = "assets/policies/MT20-v2"
 """The policy that ``bidex-meta play`` shows if no run is named; the package contains it."""
 
 
