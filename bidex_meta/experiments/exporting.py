@@ -145,9 +145,10 @@ def _observations(rows: int, shape: Json, policy: Any) -> torch.Tensor:
     for start, stop in shape.get("groups", {}).get("task_id", []):
         obs[:, start:stop] = torch.eye(stop - start)[task % (stop - start)]
     normaliser = getattr(policy, "observations", None)
-    if normaliser is None:
+    # Both are (d,), or (tasks, d) if each task has its own statistics.
+    shift, scale = getattr(normaliser, "shift", None), getattr(normaliser, "scale", None)
+    if shift is None or scale is None:
         return obs
-    shift, scale = normaliser.shift, normaliser.scale  # (d,), or (tasks, d) for statistics of each task
     if shift.ndim == 2:
         shift, scale = (rows_of[task % len(rows_of)] for rows_of in (shift, scale))
     return shift + obs / scale

@@ -118,6 +118,20 @@ def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
             say(f"Note: {folder.path} learned {learned.name} by other rules than those of {worlds.name}: {apart}.")
 
 
+def say_other_classes(folder: RunFolder, worlds: Worlds) -> None:
+    """Log one line if a run has learned as many classes as ``worlds`` has, but other classes or in another order.
+
+    Such a policy fits, although the weights and statistics that each class has for itself are those of another class.
+    Nothing is logged if the run's suite cannot be opened.
+    """
+    with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
+        learned = slots_of(open_worlds(folder.config().to_json()))
+        wanted = slots_of(worlds)
+        if learned != wanted and len(learned) == len(wanted) > 1:
+            names = " ".join(learned)
+            say(f"Note: {folder.path} learned other classes: {names}. What it has per class goes to yours by order.")
+
+
 def slots_of(worlds: Worlds) -> list[str]:
     """Return the class name of each slot in the train split of ``worlds``.
 

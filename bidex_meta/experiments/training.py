@@ -18,7 +18,7 @@ from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.experiments.learners import LearnerKind, learner_kind
-from bidex_meta.experiments.policies import checkpoint, fitting, say_other_rules
+from bidex_meta.experiments.policies import checkpoint, fitting, say_other_classes, say_other_rules
 from bidex_meta.experiments.run_config import check, check_resumed, preset_reason, resolve
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import Json
@@ -244,6 +244,7 @@ def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: V
             learner.start_from(state["learner"]["policy"])
         say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
         say_other_rules(start, worlds)
+        say_other_classes(start, worlds)
     return learner
 
 

@@ -105,6 +105,13 @@ def test_each_class_is_normalised_by_its_own_observations() -> None:
         varied = mine.std(0) > 0.01
         assert torch.allclose(seen.mean(0)[varied], torch.zeros(int(varied.sum())), atol=1e-4)
         assert torch.allclose(seen.std(0, correction=0)[varied], torch.ones(int(varied.sum())), atol=0.05)
+    other = taught(PointGoals(8, classes=(PointClass("Short", steps=2, count=3), PointClass("Long", steps=9, count=2))))
+    other.start_from(learner.policy_state_dict())
+    other.iterate()
+    kept, own = learner.policy.own, other.policy.own
+    assert kept is not None and own is not None
+    varied = kept.scale < 100.0
+    assert torch.equal(own.scale[varied], kept.scale[varied])
     assert taught(PointGoals(8)).policy.own is None
 
 
@@ -177,7 +184,7 @@ def test_a_loaded_policy_acts_on_the_belief_that_is_passed() -> None:
     assert isinstance(policy, BeliefPolicy) and policy.fresh_memory(3).state.shape == (3, 1)
     obs = torch.randn(3, policy.inputs.width - policy.num_actions - 3)
     seen = policy.observations(obs)
-    wanted = policy.actor.act(seen, torch.tensor([[0.3, -0.4]]).expand(3, -1), policy.actor.class_of(seen))
+    wanted = policy.actor.act(seen, torch.tensor([[0.3, -0.4]]).expand(3, -1), policy.class_of(obs))
     assert torch.allclose(policy.step(obs, policy.fresh_memory(3))[0], wanted)
     own = ICL.load_policy(learner.policy_state_dict()).policy
     assert all(torch.equal(a, b) for a, b in zip(own.parameters(), policy.parameters(), strict=True))

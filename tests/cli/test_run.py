@@ -355,6 +355,10 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
     note = f"Note: {first} learned MT4 by other rules than those of MT4-v2: reward paper, not v2, variation narrow, "
     note += "not wide, success once, not at-end, starts plain, not jittered."
     assert capsys.readouterr().err.count(note) == 1
+    mt4 = (ROOT / "suites" / "MT4.toml").read_text()
+    (tmp_path / "other.toml").write_text(mt4.replace('"HandOver"', '"SwingCup"').replace("MT4", "other"))
+    assert run(*flags[:-2], tmp_path / "swapped", "--no-evaluate", "--suite", tmp_path / "other.toml") == 0
+    assert "learned other classes: CatchUnderarm HandOver CatchAbreast Two" in capsys.readouterr().err
     layers = [final(path)[0]["learner"]["policy"]["weights"]["actor.mean.body.0.weight"] for path in (first, second)]
     assert 0 < (layers[0] - layers[1]).abs().max() < 0.02  # one update away; fresh weights of seed 1 differ by 1
     assert main(["run", "--resume", str(second), "--steps", "48", "--no-evaluate"]) == 0

@@ -6,12 +6,11 @@ from pathlib import Path
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.evaluations import Estimate, PolicyEvaluation, Summary
 from bidex_meta.runs.folder import RunFolder
+from bidex_meta.utils.paths import shipped_policy
 from tools.pages.tables import table
 
 _FOLDERS = {"policies": ("assets/policies/*", "results/*"), "teachers": ("results/teachers/*",)}
 """Patterns of run folders in the repository, by the value of a block's option ``on``."""
-_ALONE = "assets/policies/MT20-v2"
-"""The policy that ``bidex-meta play`` shows if no run is named; the package contains it."""
 
 
 def pretrained_table(on: str, data: Path) -> Iterator[str]:
@@ -41,7 +40,7 @@ def _row(folder: Path, name: str) -> list[str]:
         unseen = "not stored"
     else:
         unseen = _success(evaluation.other_tasks.policy)
-    if name == _ALONE:
+    if folder.resolve() == shipped_policy().resolve():
         command = "bidex-meta play"
     else:
         command = f"bidex-meta play {name}"

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 
 from bidex_meta.errors import BidexError
@@ -13,7 +14,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of
-from bidex_meta.witness.store import Witness, load_witness, save_witness
+from bidex_meta.witness.store import Witness, load_witness, quantised, save_witness
 from tools.witness_search.planner import Planner, PlannerConfig
 from tools.witness_search.steady import steadied
 from tools.witness_search.whole import searched
@@ -118,7 +119,8 @@ class Script(Search):
         simulator = Simulator(self.task, 16, self.threads)
         play = script_of(simulator.task)
         simulator.load(simulator.starts(15, seed=7))
-        actions = np.stack([action.numpy() for action, _ in simulator.led(play)])
+        # A script of version 2 does not round its actions, but the file of a witness does.
+        actions = quantised(torch.stack([action for action, _ in simulator.led(play)])).numpy()
         self.keep(actions, {"script": play.__name__, "rival": None})
 
 

@@ -145,6 +145,12 @@ class ICL(TrialLearner):
         policy.load_state_dict(agent.policy.state_dict())
         return MemoryAgent(policy)
 
+    def start_from(self, policy: State) -> None:
+        """Start as in the base class; also keep the statistics of each class fixed."""
+        super().start_from(policy)
+        if self.policy.own is not None:
+            self.policy.own.keep()
+
     def _begin_lessons(self, teachers: Teachers) -> None:
         self.teachers = teachers
         cfg = self.config

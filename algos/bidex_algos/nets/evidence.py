@@ -63,8 +63,8 @@ class BeliefNet(nn.Module):
         self.candidates: Tensor
         self.register_buffer("candidates", spread(candidates, goals))
 
-    def class_of(self, seen: Tensor) -> Tensor:
-        """Predict the class (B,) of normalised observations (B, d)."""
+    def class_of_normalised(self, seen: Tensor) -> Tensor:
+        """Predict the class (B,) of observations (B, d) that are normalised by the statistics of all classes."""
         if self.classes == 1:
             return torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
         return self.which(seen).argmax(-1)
@@ -72,8 +72,8 @@ class BeliefNet(nn.Module):
     def pays(self, seen: Tensor, goals: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
         """Predict mean and log standard deviation (B, g) of the rewards for goals (B, g, n) or (g, n).
 
-        ``seen`` are observations (B, d), ``task`` are their classes (B,). Observations, goals and rewards are
-        normalised.
+        ``seen`` are observations (B, d), ``task`` are their classes (B,). Observations, by statistics of their class,
+        goals and rewards are normalised.
         """
         if self.classes == 1:
             wanted = self.goal(goals)
@@ -85,7 +85,10 @@ class BeliefNet(nn.Module):
         return mean, log_std.clamp(-6.0, 2.0)
 
     def act(self, seen: Tensor, goal: Tensor, task: Tensor) -> Tensor:
-        """Return mean actions (B, actions) for normalised observations (B, d), goals (B, n) and classes (B,)."""
+        """Return mean actions (B, actions) for observations (B, d), goals (B, n) and classes (B,).
+
+        Observations, by statistics of their class, and goals are normalised.
+        """
         given = torch.cat([seen, goal], dim=1)
         if self.classes == 1:
             return self.head(given)
@@ -197,7 +200,7 @@ class BeliefPolicy(RecurrentPolicy):
 
     def class_of(self, obs: Tensor) -> Tensor:
         """Predict the class (B,) of raw observations (B, d)."""
-        return self.actor.class_of(self.observations(obs))
+        return self.actor.class_of_normalised(self.observations(obs))
 
     def drawn(self, last: Tensor | None, rows: int, generator: torch.Generator) -> Tensor:
         """Draw the candidate on which each of ``rows`` environments acts when it explores.

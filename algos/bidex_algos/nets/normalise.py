@@ -136,7 +136,8 @@ class TaskNormaliser(ObservationNormaliser):
     """Normalises each observation by the statistics of its own task.
 
     Columns that vary little within a task, but much between tasks, would otherwise be compressed. ``tasks`` is the
-    number of tasks. If a method gets no ``task``, int64 (...), the observation's group ``task_id`` shows the task.
+    number of tasks. If a method gets no ``task``, int64 (...), the observation must have the group ``task_id``,
+    which shows the task.
     """
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):

@@ -30,7 +30,7 @@ SCRIPTS: dict[str, Script] = {
     "ReOrientation": turn_cubes,
     "StackBlock": stack_in_order,
 }
-"""Scripts for both versions of a class, by the class's name."""
+"""Scripts for version 1, by the class's name; version 2 shares those that WIDE_SCRIPTS does not replace."""
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "BottleCap": pull_cap,
     "CatchOver2Underarm": throw_down,

@@ -6,8 +6,10 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import Actions, HandController, point
 from bidex_meta.witness.scripts.between import ramp
 
+BUCKET_STANDS = 0.457
+"""Height in metres of the origin of a bucket on the table."""
+
 # These values are in metres.
-_STANDS = 0.457  # height of a bucket on the table
 _AHEAD = 0.03  # offset of the hands' points from the bucket along x
 _UP = 0.03  # height of the hands' points above a standing bucket's origin; below, the left thumb would touch the table
 _OVER = 0.18  # how much higher the hands pass over the bucket
@@ -37,7 +39,7 @@ def carry_bucket(hands: HandController) -> Actions:
     rest = hands.frozen("goal")[:3] - bucket
     far = float(rest[:2].norm())
     rest *= held * min(1.0, 0.04 / (far + 1e-9))
-    rest[2] = _STANDS + _UP - bucket[2] + held * _LIFT * ramp(far, 0.01, 0.02)
+    rest[2] = BUCKET_STANDS + _UP - bucket[2] + held * _LIFT * ramp(far, 0.01, 0.02)
     points = [point(bucket + rest + _next(way, sign, half)) for way, sign in zip(ways, _SIGNS, strict=True)]
     yield from hands.lead_each(points, 1.0)
 

@@ -30,7 +30,7 @@ def place_in_bucket(hands: HandController) -> Actions:
         # The right hand must not descend onto the bucket.
         bucket = Between(hands, "bucket", _BUCKET)
         block = Between(hands, "block", _BLOCK, (max(0.1, gap - 0.12), 1.0))
-        # Each step passes into the next one gradually, so that a network can learn them.
+        # Most steps pass into the next one gradually, so that a network can learn them.
         if bucket.far(goal) > 0.033 - 0.021 * bucket.held:
             bring = 1.0
         else:

@@ -8,7 +8,7 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.utils.maths import constant, rotate
 from bidex_meta.witness.controller import Actions, HandController, Point, beside
 from bidex_meta.witness.scripts.between import ramp
-from bidex_meta.witness.scripts.buckets import carry_bucket
+from bidex_meta.witness.scripts.buckets import BUCKET_STANDS, carry_bucket
 
 # The first value is the rotation that lays the left fingers on the underside of the kettle's trough, the second the
 # kettle's tilt in rad when it pours.
@@ -28,7 +28,7 @@ _SLOPE = 0.118
 # Height in metres of a kettle on the table, height at which a kettle pours, and by how much it then rises while the
 # water runs out: a kettle that is higher is empty.
 _STANDS = 0.478
-_POURS = 0.457 + _OVER - _LIP[1]
+_POURS = BUCKET_STANDS + _OVER - _LIP[1]
 _EMPTY = 0.039
 _ASIDE = 0.2  # where the empty kettle is put down, y in metres
 _INSIDE = 0.08  # a kettle with a larger y is on the way there
@@ -42,15 +42,15 @@ def pour_water(hands: HandController) -> Actions:
     back = hands.where("kettle/handle_position") - kettle  # from spout to handle
     back = back / back.norm()
 
-    def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = _FIRM, steps: int = 1) -> Actions:
+    def grip(origin: Tensor, tilt: float = 0.0, shift: float = 0.0, loose: float = _FIRM, steps: int = 1) -> Actions:
         hands.hold("right", roll=tilt)
         hands.hold("left", roll=_TROUGH + tilt)
-        right, left = (_grip(side, origin, back, tilt, loose, aside) for side in SIDES)
+        right, left = (_grip(side, origin, back, tilt, loose, shift) for side in SIDES)
         yield from hands.lead(right, left, steps, speed=1.0)
 
     hands.bend("right", 0.0, 0.0)
     hands.bend("left", 0.0, 0.0, **_THUMB)
-    yield from grip(kettle, aside=0.15, loose=0.025, steps=26)
+    yield from grip(kettle, shift=0.15, loose=0.025, steps=26)
     yield from grip(kettle, loose=0.025, steps=17)
     hands.bend("right", 1.2, 1.5)
     yield from grip(kettle, steps=17)
@@ -100,7 +100,7 @@ def _use_kettle(hands: HandController, kettle: Tensor, back: Tensor, tilt: float
     ``back`` (3,) is the horizontal direction from spout to handle, ``tilt`` the kettle's tilt towards the spout, rad.
     ``off`` are the ways (3,) from the places at which the hands hold the kettle to the hands' points, metres.
     """
-    aside = {}
+    shift = {}
     ready = 1.0
     for side in SIDES:
         x, y, z = off[side].tolist()
@@ -111,7 +111,7 @@ def _use_kettle(hands: HandController, kettle: Tensor, back: Tensor, tilt: float
             z += 0.026  # the left hand comes from below, and then rises to the trough
             far = math.hypot(y, max(0.0, z - 0.035) + min(0.0, z + 0.01))
         inside = max(ramp(math.hypot(y, z), 0.012, 0.007), ramp(x, 0.06, 0.03) * ramp(far, 0.05, 0.035))
-        aside[side] = 0.15 * (1.0 - inside)
+        shift[side] = 0.15 * (1.0 - inside)
         ready *= ramp(abs(x), 0.024, 0.012) * ramp(far, 0.035, 0.02)
     slip = max(float(off[side].norm()) for side in SIDES)
     ready = max(ready, ramp(float(hands.where("right/FFJ2_position")), 0.45, 0.6) * ramp(slip, 0.07, 0.05))
@@ -136,7 +136,7 @@ def _use_kettle(hands: HandController, kettle: Tensor, back: Tensor, tilt: float
     back /= back.norm() + 1e-9
     hands.hold("right", roll=tilt)
     hands.hold("left", roll=_TROUGH + tilt)
-    yield from hands.lead_each((_grip(side, origin, back, tilt, loose, aside[side]) for side in SIDES), 1.0)
+    yield from hands.lead_each((_grip(side, origin, back, tilt, loose, shift[side]) for side in SIDES), 1.0)
 
 
 def _next(hands: HandController, kettle: Tensor, back: Tensor, tilt: float) -> tuple[Tensor, float]:
@@ -164,12 +164,12 @@ def _next(hands: HandController, kettle: Tensor, back: Tensor, tilt: float) -> t
     return way, max(-0.18, min(0.12, turn))
 
 
-def _grip(side: str, origin: Tensor, back: Tensor, tilt: float, loose: float, aside: float = 0.0) -> Point:
+def _grip(side: str, origin: Tensor, back: Tensor, tilt: float, loose: float, shift: float = 0.0) -> Point:
     """Return the place at which a hand holds a kettle, world, metres.
 
     ``origin`` (3,) is the kettle's origin, ``back`` (3,) the horizontal direction from spout to handle, and ``tilt``
     its tilt towards the spout, rad. The hand keeps a distance of ``loose`` metres from the kettle, or presses it if
-    ``loose`` is negative. It is shifted by ``aside`` metres along x.
+    ``loose`` is negative. It is shifted by ``shift`` metres along x.
     """
     if side == "right":
         x = -0.005
@@ -181,7 +181,7 @@ def _grip(side: str, origin: Tensor, back: Tensor, tilt: float, loose: float, as
         up = 0.030 - loose
     flat = along * math.cos(tilt) - up * math.sin(tilt)
     rise = along * math.sin(tilt) + up * math.cos(tilt)
-    return beside(origin + flat * back, x + aside, 0.0, float(origin[2]) + rise)
+    return beside(origin + flat * back, x + shift, 0.0, float(origin[2]) + rise)
 
 
 def _tensor(place: Point, like: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ _BACK = -0.7, -0.268
 _AHEAD = 0.49, 0.794
 _LOW = 0.997
 _FAST = 1.359
-_LEFT = -0.03, 0.9  # y and height in metres below which the egg has left the right fingers
+_GONE = -0.03, 0.9  # y and height in metres below which the egg has left the right fingers
 _STAYS: Point = (0.009, 0.036, 0.865)  # place of the right hand's point, metres
 # Angles in rad of the left hand's knuckles, middle joints and wrist, while it waits for the egg and while it holds it.
 _OPEN = 0.6, 1.041, -0.7
@@ -53,7 +53,7 @@ def _swing(hands: HandController, egg: Tensor, speed: Tensor) -> None:
     """Bend the right wrist and turn the right hand: back while the egg falls, then ahead to strike it."""
     if egg[2] > _LOW:
         wrist, roll = _BACK
-    elif egg[1] > _LEFT[0] and egg[2] > _LEFT[1] and -speed[1] < _FAST:
+    elif egg[1] > _GONE[0] and egg[2] > _GONE[1] and -speed[1] < _FAST:
         wrist, roll = _AHEAD
     else:
         wrist = _AHEAD[0]
