@@ -146,7 +146,8 @@ def _observations(rows: int, shape: Json, policy: Any) -> torch.Tensor:
         obs[:, start:stop] = torch.eye(stop - start)[task % (stop - start)]
     normaliser = getattr(policy, "observations", None)
     # Both are (d,), or (tasks, d) if each task has its own statistics.
-    shift, scale = getattr(normaliser, "shift", None), getattr(normaliser, "scale", None)
+    shift = getattr(normaliser, "shift", None)
+    scale = getattr(normaliser, "scale", None)
     if shift is None or scale is None:
         return obs
     if shift.ndim == 2:

@@ -178,7 +178,7 @@ def test_demo_plays_where_there_is_a_screen(monkeypatch):
     monkeypatch.setattr("bidex_meta.cli.render.main", played.append)
     assert main(["demo"]) == main(["demo", "--out", "x.webp"]) == 0
     live, film = played
-    assert live == [] and film[0].endswith("MT20") and film[-1].endswith("/x.webp")
+    assert live == [] and film[0].endswith("MT20-v2") and film[-1].endswith("/x.webp")
 
 
 def test_what_cannot_be_played_is_one_line(monkeypatch, capsys):
