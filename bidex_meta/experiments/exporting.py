@@ -151,7 +151,9 @@ def _observations(rows: int, shape: Json, policy: Any) -> torch.Tensor:
     if shift is None or scale is None:
         return obs
     if shift.ndim == 2:
-        shift, scale = (rows_of[task % len(rows_of)] for rows_of in (shift, scale))
+        row_of = task % len(shift)
+        shift = shift[row_of]
+        scale = scale[row_of]
     return shift + obs / scale
 
 

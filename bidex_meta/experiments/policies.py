@@ -119,9 +119,9 @@ def say_other_rules(folder: RunFolder, worlds: Worlds) -> None:
 
 
 def say_other_classes(folder: RunFolder, worlds: Worlds) -> None:
-    """Log one line if a run has learned as many classes as ``worlds`` has, but other classes or in another order.
+    """Log one line if the classes of a run and of ``worlds`` are equal in number, but not the same in the same order.
 
-    Such a policy fits, although the weights and statistics that each class has for itself are those of another class.
+    The policy fits such worlds, but its weights and statistics of single classes belong to other classes.
     Nothing is logged if the run's suite cannot be opened.
     """
     with contextlib.suppress(BidexError):  # the suite's file of the run may be missing
@@ -129,7 +129,7 @@ def say_other_classes(folder: RunFolder, worlds: Worlds) -> None:
         wanted = slots_of(worlds)
         if learned != wanted and len(learned) == len(wanted) > 1:
             names = " ".join(learned)
-            say(f"Note: {folder.path} learned other classes: {names}. What it has per class goes to yours by order.")
+            say(f"Note: {folder.path} learned other classes: {names}. Weights of single classes go to yours in order.")
 
 
 def slots_of(worlds: Worlds) -> list[str]:
