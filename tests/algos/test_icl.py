@@ -115,6 +115,22 @@ def test_each_class_is_normalised_by_its_own_observations() -> None:
     assert taught(PointGoals(8)).policy.own is None
 
 
+def test_only_the_entries_that_a_class_hides_count_as_missed_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(Knowing.hidden_columns, "Short", [0])
+    world = PointGoals(8, classes=(PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, count=2)))
+    learner = taught(world)
+
+    def believed(state: Tensor) -> Tensor:
+        goal = world.goal.float().clone()
+        goal[world.task_id == 0, 1] = 0.9  # an entry that no task of Short hides
+        goal[world.task_id == 1, 1] += 0.3
+        return goal
+
+    monkeypatch.setattr(learner.policy.belief, "believed", believed)
+    # Four environments hide one number, the other four hide two. Four of these twelve numbers are off by 0.3.
+    assert learner.iterate()["Loss/goal"] == pytest.approx(0.3**2 * 4 / 12, rel=1e-5)
+
+
 def test_the_step_size_falls_in_a_line_and_stays_at_a_twentieth() -> None:
     world = PointGoals(8)
     trial = int(SMALL.episodes_per_trial * world.max_episode_steps.sum())

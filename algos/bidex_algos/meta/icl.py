@@ -344,17 +344,23 @@ class _Pupil:
         random in all goals.
         """
         goals = self._data.goals
-        world = self._learner.world
         goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
-        used = torch.arange(goals.shape[2], device=goals.device) < self._learner.hidden_sizes[world.task_id][:, None]
-        goals[:, 0] = torch.where(used, privileged.hidden_values(), goals[:, 0])
+        goals[:, 0] = torch.where(self._used(), privileged.hidden_values(), goals[:, 0])
+
+    def _used(self) -> Tensor:
+        """Return which entries of a goal the class of each environment uses, bool (N, n)."""
+        sizes = self._learner.hidden_sizes[self._learner.world.task_id]
+        return torch.arange(self._data.goals.shape[2], device=sizes.device) < sizes[:, None]
 
     def missed(self) -> Tensor:
         """Return the mean squared difference between the goals that the policy believes and the true goals, a scalar.
 
-        The entries of a goal lie in [-1, 1]. Without any knowledge of the task the difference is 1/3.
+        Only entries that a class uses count. They lie in [-1, 1]. Without any knowledge of the task the difference is
+        1/3. It is 0 if no class hides a goal.
         """
-        return (self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]).square().mean()
+        used = self._used()
+        off = self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]
+        return off.square().masked_fill(~used, 0.0).sum() / used.sum().clamp_min(1)
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
         """Store the rewards of the step, and the rewards that it would have earned under the other drawn goals."""
