@@ -1,11 +1,13 @@
-"""Suites of a single class, such as ``MT1-Switch-v2``, which shows its goals, and ``ML1-Switch-v2``, which hides them.
+"""Suites without a file, such as ``MT1-Switch-v2``, which shows its goals, and ``ML1-Switch-v2``, which hides them.
 
-``bidex_meta.suite`` makes these suites from the files of ``MT1-v2`` and ``ML1-v2``. The door classes and Switch have
-goals of two angles. These classes also have suites with fewer different goals:
+``bidex_meta.suite`` makes these suites from the files of other suites. The door classes and Switch have goals of two
+angles. These classes also have suites with fewer different goals:
 
 - ``choice2``, such as ``ML1-Switch-choice2``: two tasks. Both angles are small, or both are large.
 - ``choice4``: four tasks. Each angle is small or large, independently of the other.
 - ``shared``: both angles have the same value, anywhere in the class's range.
+
+``ML2-Doors-shared`` and ``MT2-Doors-shared`` have two door classes with a shared angle.
 
 A choice suite has the same tasks in both splits. ``MT1-Switch-choice2`` shows the goal that ``ML1-Switch-choice2``
 hides: the success of a policy that is trained on the former shows what adaptation can reach in the latter.
@@ -42,7 +44,9 @@ CHOICES = {
 ANY_CLASS = "CLASS"
 """Placeholder for the name of a class, in messages."""
 _VARIANTS = ("choice2", "choice4", "shared")
-_NAME = re.compile(rf"(MT1|ML1)-([^-]+)-(v2|{'|'.join(_VARIANTS)})")
+GROUPS = {"Doors": ("DoorOpenOutward", "DoorCloseInward")}
+"""Groups of classes that have suites of their own, such as ``ML2-Doors-shared``; each class has a shared angle."""
+_NAME = re.compile(rf"(MT|ML)(1)-([^-]+)-(v2|{'|'.join(_VARIANTS)})|(MT|ML)(2)-({'|'.join(GROUPS)})-(shared)")
 _Task = tuple[str, Literal["train", "test", "both"], dict[str, float]]
 _SHARED_TASKS = 50
 """Number of tasks in each split of a shared suite. The test tasks lie midway between the train tasks."""
@@ -77,49 +81,57 @@ RUNGS = (
     Rung("one of two or four goals", "15 minutes on one core"),
     Rung("one number", "45 minutes on one core"),
     Rung("two numbers", "2 hours on one core"),
-    Rung("two numbers, several classes", "2 hours on one core"),
+    Rung("one or two numbers, several classes", "2 hours on one core"),
     Rung("three numbers and more", "10 minutes of a GPU"),
     Rung("all that version 2 hides", "hours of a GPU"),
 )
 
 
-class OfOneClass(NamedTuple):
-    """The parsed name of a suite with a single class."""
+class Parts(NamedTuple):
+    """The parsed name of a suite without a file."""
 
     template: str
     """Name of the suite that this suite is made from."""
-    class_name: str
+    subject: str
+    """Name of the class or of the group of classes."""
     variant: str
     """Kind of goals: ``v2`` (as in the template), ``choice2``, ``choice4`` or ``shared``."""
 
     @property
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the suite's classes."""
+        return GROUPS.get(self.subject, (self.subject,))
+
+    @property
     def shows_goals(self) -> bool:
         """Return whether observations show the goal; such a suite only has a train split."""
-        return self.template.startswith("MT1")
+        return self.template.startswith("MT")
 
     @property
     def description(self) -> str:
         """Return the suite's description."""
         sight = "visible" if self.shows_goals else "hidden"
+        if self.subject in GROUPS:
+            return f"{' and '.join(self.classes)} with one {sight} angle that both leaves share"
         if self.variant.startswith("choice"):
             number = self.variant.removeprefix("choice")
-            return f"{self.class_name} with one of {number} {sight} goals; placements differ between episodes"
+            return f"{self.subject} with one of {number} {sight} goals; placements differ between episodes"
         if self.variant == "shared":
-            return f"{self.class_name} with one {sight} angle that both parts share"
+            return f"{self.subject} with one {sight} angle that both parts share"
         if self.shows_goals:
-            return f"{self.class_name} with fifty goals, visible"
-        return f"{self.class_name} with hidden goals: train on fifty, adapt to fifty others"
+            return f"{self.subject} with fifty goals, visible"
+        return f"{self.subject} with hidden goals: train on fifty, adapt to fifty others"
 
-    def tasks(self) -> list[_Task]:
-        """Return the tasks that the suite lists; an empty list if its tasks are drawn.
+    def tasks(self, class_name: str) -> list[_Task]:
+        """Return the tasks that the suite lists for one of its classes; an empty list if its tasks are drawn.
 
         Each task is a tuple of its name, its split, and the values of the goal's components, rad, by name.
         """
         if self.variant == "v2":
             return []
-        choice = CHOICES[self.class_name]
+        choice = CHOICES[class_name]
         if self.variant == "shared":
-            return self._shared_tasks()
+            return self._shared_tasks(choice)
         values = {"small": choice.small, "large": choice.large}
         tasks = []
         for of_first, of_second in product(values, values):
@@ -128,14 +140,13 @@ class OfOneClass(NamedTuple):
                 tasks.append((f"{of_first}-{of_second}", "both", fixed))
         return tasks
 
-    def _shared_tasks(self) -> list[_Task]:
-        """Return the tasks of a suite in which both angles of the goal are equal.
+    def _shared_tasks(self, choice: Choice) -> list[_Task]:
+        """Return the tasks of a class in which both angles of the goal are equal.
 
         The tasks of a split are evenly spaced over the class's range of angles. Test tasks lie midway between train
         tasks. The order is not that of the angles, because evaluations may play only the first tasks. A suite that
         shows its goals has only train tasks.
         """
-        choice = CHOICES[self.class_name]
         splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
         for place in range(_SHARED_TASKS):
@@ -161,14 +172,14 @@ def rung_of(name: str, classes: Iterable[str]) -> int | None:
     if parts.variant.startswith("choice"):
         return 0
     if parts.variant == "shared":
-        return 1
+        return 3 if parts.subject in GROUPS else 1
     numbers = max(HIDDEN_NUMBERS[each] for each in classes)
     return {1: 1, 2: 2}.get(numbers, 4)
 
 
 def names_of(classes: Iterable[str]) -> list[str]:
-    """Return the names of all single-class suites of the given classes."""
-    names = []
+    """Return the names of all suites without a file: those of each of the given classes, and those of groups."""
+    names = [f"{kind}{len(group)}-{subject}-shared" for subject, group in GROUPS.items() for kind in ("MT", "ML")]
     for name in classes:
         for kind in ("MT1", "ML1"):
             names.append(f"{kind}-{name}-v2")
@@ -177,10 +188,11 @@ def names_of(classes: Iterable[str]) -> list[str]:
     return names
 
 
-def parts_of(name: str) -> OfOneClass | None:
-    """Return the parts of the name of a single-class suite; None for any other name."""
+def parts_of(name: str) -> Parts | None:
+    """Return the parts of the name of a suite without a file; None for any other name."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None
-    kind, class_name, variant = match.groups()
-    return OfOneClass(f"{kind}-v2", class_name, variant)
+    kind, count, subject, variant = (part for part in match.groups() if part is not None)
+    template = "1-v2" if count == "1" else "5-v2"
+    return Parts(f"{kind}{template}", subject, variant)

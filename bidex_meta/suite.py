@@ -221,7 +221,7 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
 
 
 def suite_names() -> list[str]:
-    """Return the names of all shipped suites: first those with a file, sorted, then the suites of a single class."""
+    """Return the names of all shipped suites: first those with a file, sorted, then the others."""
     classes = [entry.name for entry in _shipped("MT20-v2").classes]
     return [*file_names(), *ladder.names_of(classes)]
 
@@ -255,7 +255,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
     parts = ladder.parts_of(name)
     if parts is None:
         return _shipped(name)
-    return _of_one_class(name, parts)
+    return _from_template(name, parts)
 
 
 def known_suite(name: str, more: Iterable[str] = (), kind: str = "suite") -> str:
@@ -279,12 +279,15 @@ def _shipped(name: str) -> Suite:
     return _parse(suites_dir() / f"{name}.toml")
 
 
-def _of_one_class(name: str, parts: ladder.OfOneClass) -> Suite:
+def _from_template(name: str, parts: ladder.Parts) -> Suite:
     template = _shipped(parts.template)
-    tasks = tuple(ListedTask(*task) for task in parts.tasks())
-    entry = replace(template.classes[0], name=parts.class_name, class_name=parts.class_name, tasks=tasks)
-    suite = replace(template, name=name, description=parts.description, classes=(entry,))
-    if tasks:
+    splits = ("train",) if parts.shows_goals else SPLITS
+    classes = []
+    for of in parts.classes:
+        tasks = tuple(ListedTask(*task) for task in parts.tasks(of))
+        classes.append(replace(template.classes[0], name=of, class_name=of, splits=splits, tasks=tasks))
+    suite = replace(template, name=name, description=parts.description, classes=tuple(classes))
+    if classes[0].tasks:
         return replace(suite, tasks_per_class=None)
     return suite
 

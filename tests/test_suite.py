@@ -104,6 +104,7 @@ def test_rungs_count_what_the_classes_hide() -> None:
         assert HIDDEN_NUMBERS[name] == hidden, name
     rungs = {name: rung_of(name, [entry.name for entry in load_suite(name).classes]) for name in suite_names()}
     of = {"ML1-Switch-choice2": 0, "ML1-SwingCup-v2": 1, "ML1-Switch-shared": 1, "ML1-Switch-v2": 2, "ML5-v2": 3}
+    of |= {"ML2-Doors-shared": 3, "MT2-Doors-shared": None}
     of |= {"ML1-PushBlock-v2": 4, "ML20-v2": 5, "MT1-Switch-choice2": None, "ML1": None}
     assert of.items() <= rungs.items()
 
@@ -114,7 +115,8 @@ def test_names_and_paths(tmp_path: Path) -> None:
     with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
         load_suite(tmp_path / "absent.toml")
     choices = "ML1-CLASS-choice2, ML1-CLASS-choice4, ML1-CLASS-shared, ML1-CLASS-v2"
-    known = f"ML1, {choices}, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, ML5-v2, MT1, MT1-CLASS-choice2"
+    meta = f"ML1, {choices}, ML1-objects, ML1-v2, ML1-wide, ML2-Doors-shared, ML20, ML20-v2, ML4, ML4-v2, ML5-v2"
+    known = f"{meta}, MT1, MT1-CLASS-choice2"
     with pytest.raises(BidexError, match=rf"Did you mean 'MT4'\? Known: {known}"):
         load_suite("MT44")
     with pytest.raises(BidexError, match=r"Did you mean 'ML1-Switch-choice\d'\?"):
