@@ -179,7 +179,9 @@ def rung_of(name: str, classes: Iterable[str]) -> int | None:
 
 def names_of(classes: Iterable[str]) -> list[str]:
     """Return the names of all suites without a file: those of each of the given classes, and those of groups."""
-    names = [f"{kind}{len(group)}-{subject}-shared" for subject, group in GROUPS.items() for kind in ("MT", "ML")]
+    names = []
+    for subject, group in GROUPS.items():
+        names += [f"MT{len(group)}-{subject}-shared", f"ML{len(group)}-{subject}-shared"]
     for name in classes:
         for kind in ("MT1", "ML1"):
             names.append(f"{kind}-{name}-v2")
