@@ -1,6 +1,6 @@
 """Teachers of ``bidex-meta run`` (--teacher): the teacher of each class, and the teachers' policies."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds, open_worlds
+from bidex_meta.worlds.own import OwnSuite
 
 SCRIPTS = "scripts"
 
@@ -84,8 +85,8 @@ def _scripted(source: Worlds) -> set[str]:
 def _known_to(name: str, source: Worlds) -> set[str]:
     """Return the names of the classes in ``source`` that the policy of a run can teach.
 
-    The run must have learned the class, with the same observations and actions. ``name`` is the run's folder. Raises
-    BidexError if there is no such class, or if the run's policy adapts to tasks.
+    The run must have learned the class with its goal shown, with the same observations and actions. ``name`` is the
+    run's folder. Raises BidexError if there is no such class, or if the run's policy adapts to tasks.
     """
     config = RunFolder.open(Path(name)).config()
     if Capability.ADAPTS in learner_kind(config.algo).make.capabilities:
@@ -93,20 +94,33 @@ def _known_to(name: str, source: Worlds) -> set[str]:
     other = open_worlds(config.to_json())
     own = source.task_classes()
     theirs = other.task_classes()
-    if other.class_name is None:
-        same = slots_of(source) == slots_of(other) and not (source.hides_goals or other.hides_goals)
-        agree = same and all(_alike(own[task], theirs[task]) for task in own)
-        known = set(own) if agree else set[str]()
+    if other.class_name is None and (other.hides_goals or not (_same_form(source, other) or _is_by_class(other))):
+        known = set[str]()
     else:
-        (taught,) = theirs.values()
-        known = {task for task, here in own.items() if _alike(here, taught)}
-    if not known or source.points != other.points or (source.points and other.class_name is not None):
+        known = set(_same_classes(own, theirs))
+    if not known or source.points != other.points or (source.points and not _same_form(source, other)):
         raise BidexError(
-            f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected "
-            "a run on the same suite (one that shows goals), or on one of its classes with the same rules, bases, "
-            "objects and touch."
+            f"--teacher {name} has learned {other.name}, of which {source.name} has no class in the same form. "
+            "Expected a run on a suite that shows goals, or on a single class, with the same rules, bases, objects and "
+            "touch."
         )
     return known
+
+
+def _same_form(source: Worlds, other: Worlds) -> bool:
+    """Return whether two suites that show goals have the same observations."""
+    return other.class_name is None and not source.hides_goals and slots_of(source) == slots_of(other)
+
+
+def _is_by_class(other: Worlds) -> bool:
+    """Return whether ``other`` is a suite of ours whose task id tells classes apart, not tasks of one class."""
+    slots = slots_of(other)
+    return isinstance(other, OwnSuite) and len(set(slots)) == len(slots)
+
+
+def _same_classes(own: Mapping[str, object], theirs: Mapping[str, object]) -> dict[str, str]:
+    """Return, for each class of one suite that another has too, its name in that other suite."""
+    return {task: name for task, here in own.items() for name, there in theirs.items() if _alike(here, there)}
 
 
 def _alike(one: object, other: object) -> bool:
@@ -128,12 +142,17 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
             policy, _ = load_policy(RunFolder.open(Path(name)), device)
-            single = open_worlds(RunFolder.open(Path(name)).config().to_json()).class_name is not None
-            if single:
+            other = open_worlds(RunFolder.open(Path(name)).config().to_json())
+            width = int(world.single_observation_space.shape[0])
+            more = None
+            if other.class_name is not None:
                 width = classes[learn[0]].observation_size
-            else:
-                width = int(world.single_observation_space.shape[0])
-            tutors.append(Tutor(policy, rows, width))
+            elif isinstance(other, OwnSuite) and not _same_form(source, other):
+                width = min(width - world.num_id_columns, other.benchmark.padded_size)
+                their = _same_classes(classes, other.task_classes())
+                names = [their[slots[i]] for i in world.task_id[rows].tolist()]
+                more = _appended(other, names, width).to(world.device)
+            tutors.append(Tutor(policy, rows, width, more))
     if untaught := [task for task in classes if task not in assigned]:
         rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
@@ -146,6 +165,20 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
     mask = torch.zeros(world.num_envs, dtype=torch.bool)
     mask[_rows(world, slots, scripted)] = True
     return Teachers(world, tutors, Scripted(inner, names=names), mask, privileged)
+
+
+def _appended(other: OwnSuite, names: Sequence[str], width: int) -> Tensor:
+    """Return the entries (k, m) that a policy of ``other`` reads after the first ``width`` entries of an observation.
+
+    These are padding, and the task id if the suite shows it. ``names`` are the classes of the k environments, by their
+    names in ``other``.
+    """
+    padding = torch.zeros(len(names), other.benchmark.padded_size - width)
+    if other.suite.observation != "one-hot":
+        return padding
+    slots = slots_of(other)
+    numbers = torch.tensor([slots.index(name) for name in names])
+    return torch.cat([padding, torch.eye(len(slots))[numbers]], dim=1)
 
 
 def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:

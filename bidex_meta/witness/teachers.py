@@ -18,13 +18,22 @@ from bidex_meta.world.contract import PrivilegedWorld, VectorWorld
 class Tutor:
     """A policy that teaches in some environments of a world.
 
-    ``rows`` (k,), int64, are these environments. The policy reads the first ``width`` entries of an observation. A
-    policy of one class does not read the padding and the task id, which are the last entries of a suite's observation.
+    ``rows`` (k,), int64, are these environments. The policy reads the first ``width`` entries of an observation and
+    then ``more`` (k, m), such as the padding and the task id of the suite that it was trained on. A policy of one class
+    reads neither.
     """
 
     policy: Agent
     rows: Tensor
     width: int
+    more: Tensor | None = None
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Return the policy's actions (k, a) for the observations (N, d) of all environments."""
+        seen = obs[self.rows, : self.width]
+        if self.more is not None:
+            seen = torch.cat([seen, self.more], dim=1)
+        return self.policy.eval_action(seen)
 
 
 class Teachers:
@@ -74,7 +83,7 @@ class Teachers:
         if self.privileged is not None and self._tutors:
             obs = self.privileged.with_goals(obs)
         for tutor in self._tutors:
-            actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
+            actions = tutor.eval_action(obs)
             labels[tutor.rows, : actions.shape[1]] = actions
         return labels
 

@@ -3,9 +3,14 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from bidex_meta.cli import main
+from bidex_meta.config import RunConfig
+from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder, read_metrics
+from bidex_meta.utils.paths import shipped_policy
+from bidex_meta.worlds import open_worlds
 from tests.cli.conftest import Command
 
 SMALL = "--algo dagger --num-envs 4 --threads 1 --device cpu --logger none --no-evaluate --learner.hidden 32 "
@@ -74,6 +79,22 @@ def test_a_memory_learns_from_scripts_and_a_run_what_a_suite_hides(
     assert f"Teacher {student}: Switch." in capsys.readouterr().err
     (row,) = read_metrics(path / "metrics.jsonl")
     assert row["Loss/goal"] > 0.0 and {"Loss/imitation/Switch", "Loss/imitation/PushBlock"} < set(row)
+
+
+@pytest.mark.parametrize(("suite", "task"), [("ML2-Doors-shared", None), (None, "DoorCloseInward-v2")])
+def test_a_policy_of_a_suite_teaches_any_of_its_classes(suite: str | None, task: str | None) -> None:
+    given = (str(shipped_policy()),)
+    config = RunConfig(suite=suite, task=task, algo="icl", teacher=given, device="cpu", threads=1)
+    worlds = open_worlds(config.to_json())
+    world = worlds.world("train", 8)
+    teachers = teachers_of(config, worlds, world)
+    assert bool(teachers.known.all())
+    obs, _ = world.reset(seed=0)
+    teachers.reset(torch.ones(8, dtype=torch.bool))
+    info = {}
+    for _ in range(int(world.max_episode_steps.max())):
+        obs, _, _, _, info = world.step(teachers.eval_action(obs))
+    assert info["running"]["success"].float().mean() > 0.7  # with another padding or task id there is no success
 
 
 def test_ppo_starts_from_a_student_has_its_teachers_and_is_resumed(student: Path, tmp_path: Path) -> None:
