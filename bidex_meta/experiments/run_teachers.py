@@ -120,7 +120,12 @@ def _is_by_class(other: Worlds) -> bool:
 
 def _same_classes(own: Mapping[str, object], theirs: Mapping[str, object]) -> dict[str, str]:
     """Return, for each class of one suite that another has too, its name in that other suite."""
-    return {task: name for task, here in own.items() for name, there in theirs.items() if _alike(here, there)}
+    found = {}
+    for task, here in own.items():
+        same = [name for name, there in theirs.items() if _alike(here, there)]
+        if same:
+            found[task] = same[0]
+    return found
 
 
 def _alike(one: object, other: object) -> bool:
