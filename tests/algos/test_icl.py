@@ -131,6 +131,17 @@ def test_only_the_entries_that_a_class_hides_count_as_missed_goals(monkeypatch: 
     assert learner.iterate()["Loss/goal"] == pytest.approx(0.3**2 * 4 / 12, rel=1e-5)
 
 
+def test_the_policy_acts_on_the_true_goal_in_a_share_of_the_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = PointGoals(400, classes=(PointClass(steps=3, count=400),))
+    learner = taught(world, replace(SMALL, goal_shown_share=0.4, teacher_steps=0, still_share=1.0))
+    monkeypatch.setattr(learner.policy.actor, "act", lambda seen, goal, task: goal)
+    learner.iterate()
+    trials = learner.data.trials
+    told = (trials.actions == learner.data.goals[:, 0])[trials.filled().all(1)].all(-1)
+    assert torch.equal(told.any(0), told.all(0))  # in all episodes of a trial, or in none
+    assert float(told.float().mean()) == pytest.approx(0.4, abs=0.08)
+
+
 def test_the_step_size_falls_in_a_line_and_stays_at_a_twentieth() -> None:
     world = PointGoals(8)
     trial = int(SMALL.episodes_per_trial * world.max_episode_steps.sum())
@@ -211,7 +222,9 @@ def test_each_class_has_networks_of_its_own_and_is_told_by_what_is_seen(monkeypa
     seen, goals, task = torch.randn(4, 3), torch.randn(4, 5, 2), torch.tensor([2, 0, 2, 1])
     for row, of in enumerate(task.tolist()):
         weight, bias = net.goal.weight[8 * of : 8 * (of + 1)], net.goal.bias[8 * of : 8 * (of + 1)]
-        both = torch.nn.functional.elu(net.encoder(seen[row : row + 1]) + goals[row] @ weight.T + bias)
+        given = torch.cat([seen[row], torch.eye(3)[of]])[None]
+        encoded = net.encoder(given)[:, 8 * of : 8 * (of + 1)]
+        both = torch.nn.functional.elu(encoded + goals[row] @ weight.T + bias)
         assert torch.allclose(net.pays(seen, goals, task)[0][row], net.paid(both)[:, 0], atol=1e-6)
     actions = net.act(seen, goals[:, 0], task)
     actions[task == 2].sum().backward()

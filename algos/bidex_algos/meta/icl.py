@@ -50,6 +50,7 @@ class ICLConfig(LearnerConfig):
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
     still_share: Fraction = 0.3  # Share of the episodes in which the policy does not explore, as in an evaluation.
+    goal_shown_share: Fraction = 0.0  # Share of the trials in which the policy acts on the task's goal, not its belief.
     try_steps: Count = 50  # Mean number of steps for which an exploring policy acts on the same goal.
     reward_unit: Positive = 0.3
     """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
@@ -313,7 +314,8 @@ class _Pupil:
     """Chooses the actions in a trial: teachers act in some environments, and the policy acts in the others.
 
     All steps are labelled by the teachers. In a fraction ``still_share`` of the episodes the policy does not explore,
-    as in an evaluation.
+    as in an evaluation. In a fraction ``goal_shown_share`` of the trials the policy acts on the true goal: in long
+    tasks, a policy that acts on its belief rarely visits the states that follow from the right actions.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
@@ -322,6 +324,9 @@ class _Pupil:
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
         self._tried: Tensor | None = None
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
+        self._told = torch.zeros_like(data.taught)
+        if learner.config.goal_shown_share:
+            self._told = self._draw(torch.rand) < learner.config.goal_shown_share
 
     def begin(self, shown: Tensor) -> None:
         """Begin an episode: choose at random in which environments the policy explores, and reset the teachers.
@@ -329,7 +334,7 @@ class _Pupil:
         In the first episode of a trial, also draw the goals whose rewards are computed in hindsight.
         """
         learner = self._learner
-        self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
+        self._exploring = (self._draw(torch.rand, 1) >= learner.config.still_share) & ~self._told[:, None]
         learner.teachers.reset(torch.ones_like(shown))
         if self._tried is None and learner.teachers.privileged is not None:
             self._draw_goals(learner.teachers.privileged)
@@ -380,6 +385,7 @@ class _Pupil:
         data.labels[slot, self._rows] = labels
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
         tried = self._tried.masked_fill(~self._exploring, -1.0)
-        mean, self._state = learner.policy.step(obs, memory, tried)
+        told = data.goals[:, 0].masked_fill(~self._told[:, None], torch.nan)
+        mean, self._state = learner.policy.step(obs, memory, tried, told)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._exploring
         return torch.where(data.taught[:, None], labels, action), self._state

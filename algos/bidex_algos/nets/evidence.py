@@ -38,7 +38,8 @@ class BeliefNet(nn.Module):
 
     ``hidden`` are the layers with which the reward model encodes the observation; ``head`` are the actor's layers. The
     observation does not show the class, so a third network predicts it if ``classes`` is above 1. In the reward model
-    each class has its own weights for the goal. In the actor each class has its own layers after the first.
+    each class has its own layers for the observation and its own weights for the goal. In the actor each class has its
+    own layers after the first.
     """
 
     def __init__(
@@ -48,7 +49,11 @@ class BeliefNet(nn.Module):
         super().__init__()
         width = hidden[-1]
         self.classes = classes
-        self.encoder = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
+        own = seen.extended("task_id", classes)
+        if classes == 1:
+            self.encoder: Headed = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
+        else:
+            self.encoder = Towers(own, hidden[:-1], classes * width, 1.0, generator, activation, modules=1, shared=0)
         # One layer holds all classes; the columns of each class have unit norm.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)
         self.activation = ACTIVATIONS[activation]()
@@ -80,7 +85,7 @@ class BeliefNet(nn.Module):
         else:
             weight, bias = (x.unflatten(0, (self.classes, -1))[task] for x in (self.goal.weight, self.goal.bias))
             wanted = goals @ weight.mT + bias[:, None]
-        both = self.activation(self.encoder(seen)[:, None] + wanted)
+        both = self.activation(self._of_class(self.encoder, seen, task)[:, None] + wanted)
         mean, log_std = self.paid(both).unbind(-1)
         return mean, log_std.clamp(-6.0, 2.0)
 
@@ -89,14 +94,17 @@ class BeliefNet(nn.Module):
 
         Observations, by statistics of their class, and goals are normalised.
         """
-        given = torch.cat([seen, goal], dim=1)
+        return self._of_class(self.head, torch.cat([seen, goal], dim=1), task)
+
+    def _of_class(self, net: Headed, inputs: Tensor, task: Tensor) -> Tensor:
+        """Return the outputs of a network for inputs (B, d) of the classes ``task`` (B,)."""
         if self.classes == 1:
-            return self.head(given)
-        one_hot = nn.functional.one_hot(task, self.classes).to(given.dtype)
-        given = torch.cat([given, one_hot], dim=1)
-        if maths.may_look(given.device):
-            return self.head.of_head(given, task, self.classes)
-        return head_of(one_hot, self.head(given), self.classes)
+            return net(inputs)
+        one_hot = nn.functional.one_hot(task, self.classes).to(inputs.dtype)
+        inputs = torch.cat([inputs, one_hot], dim=1)
+        if maths.may_look(inputs.device):
+            return net.of_head(inputs, task, self.classes)
+        return head_of(one_hot, net(inputs), self.classes)
 
 
 class Belief(Protocol):
@@ -215,11 +223,14 @@ class BeliefPolicy(RecurrentPolicy):
         return torch.where(again < 1.0 / self.try_steps, new, last)
 
     @torch.no_grad()
-    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(
+        self, obs: Tensor, memory: Memory, drawn: Tensor | None = None, told: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return mean actions (N, a) and the memory's next state (N, candidates) for raw observations (N, d).
 
         ``drawn`` (N, 1) is the result of :meth:`drawn`; the policy does not explore in environments with a negative
-        entry. With None the policy explores in no environment.
+        entry. With None the policy explores in no environment. In environments whose goal is ``told`` (N, n), not NaN,
+        the policy acts on this goal instead of its belief.
         """
         known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
@@ -227,5 +238,7 @@ class BeliefPolicy(RecurrentPolicy):
         if drawn is not None:
             place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
             goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
+        if told is not None:
+            goal = torch.where(told.isnan(), goal, told)
         task = self.class_of(obs)
         return self.actor.act(self.seen(obs, task), self.goals(goal), task), state

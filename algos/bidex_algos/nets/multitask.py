@@ -262,7 +262,7 @@ class Towers(Headed):
         self.common = nn.ModuleList(linear(*pair, gain, generator) for pair in widths[:shared])
         own = [StackedLinear(self.one_hot.size, *pair, gain, generator) for pair in widths[shared:]]
         self.own: Sequence[StackedLinear] = nn.ModuleList(own)  # type: ignore[assignment]
-        self.head = linear(hidden[-1], outputs, output_gain, generator)
+        self.head = linear([self.encoder.size, *hidden][-1], outputs, output_gain, generator)
 
     def features(self, x: Tensor) -> Tensor:
         """Return the input (batch, width) of the output layer for network inputs (batch, inputs)."""
