@@ -131,23 +131,6 @@ def test_only_the_entries_that_a_class_hides_count_as_missed_goals(monkeypatch: 
     assert learner.iterate()["Loss/goal"] == pytest.approx(0.3**2 * 4 / 12, rel=1e-5)
 
 
-def test_in_coached_trials_teacher_and_policy_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = PointGoals(300, classes=(PointClass(steps=60, count=300),))
-    learner = taught(world, replace(SMALL, coached_share=0.4, teacher_steps=0, still_share=1.0, init_std=1e-9))
-    monkeypatch.setattr(learner.policy.actor, "act", lambda seen, goal, task: goal - 7.0)
-    learner.iterate()
-    trials = learner.data.trials
-    played = trials.filled().all(1)
-    on_goal = (trials.actions == learner.data.goals[:, 0] - 7.0)[played].all(-1)
-    by_teacher = (trials.actions == learner.data.labels)[played].all(-1)
-    coached = (on_goal | by_teacher).any(0)
-    assert float(coached.float().mean()) == pytest.approx(0.4, abs=0.1)
-    assert bool((on_goal | by_teacher)[:, coached].all())
-    assert float(by_teacher[:, coached].float().mean()) == pytest.approx(0.5, abs=0.25)
-    turns = (by_teacher[1:] != by_teacher[:-1])[:, coached].float().mean()
-    assert float(turns) == pytest.approx(0.5 / 25, abs=0.01)
-
-
 def test_the_step_size_falls_in_a_line_and_stays_at_a_twentieth() -> None:
     world = PointGoals(8)
     trial = int(SMALL.episodes_per_trial * world.max_episode_steps.sum())

@@ -35,7 +35,6 @@ from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
 # Added to the labels' standard deviations, by which errors of actions are divided. It is 1.5 % of an action's range.
 _FLOOR = 0.03
-_TURN = 25  # mean number of steps for which teacher or policy acts in a coached trial
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,6 @@ class ICLConfig(LearnerConfig):
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
     still_share: Fraction = 0.3  # Share of the episodes in which the policy does not explore, as in an evaluation.
-    coached_share: Fraction = 0.0
-    """Share of the trials in which the policy acts on the task's goal, not its belief, and its teacher takes turns."""
     try_steps: Count = 50  # Mean number of steps for which an exploring policy acts on the same goal.
     reward_unit: Positive = 0.3
     """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
@@ -316,8 +313,7 @@ class _Pupil:
     """Chooses the actions in a trial: teachers act in some environments, and the policy acts in the others.
 
     All steps are labelled by the teachers. In a fraction ``still_share`` of the episodes the policy does not explore,
-    as in an evaluation. A fraction ``coached_share`` of the trials is coached: the policy acts on the true goal, and
-    the teacher takes over for half of the time. In long tasks, a policy on its own rarely visits the later states.
+    as in an evaluation.
     """
 
     def __init__(self, learner: ICL, data: TaughtTrials):
@@ -326,10 +322,6 @@ class _Pupil:
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
         self._tried: Tensor | None = None
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
-        self._coached = torch.zeros_like(data.taught)
-        if learner.config.coached_share:
-            self._coached = (self._draw(torch.rand) < learner.config.coached_share) & learner.teachers.known
-        self._teacher_acts = data.taught.clone()
 
     def begin(self, shown: Tensor) -> None:
         """Begin an episode: choose at random in which environments the policy explores, and reset the teachers.
@@ -337,7 +329,7 @@ class _Pupil:
         In the first episode of a trial, also draw the goals whose rewards are computed in hindsight.
         """
         learner = self._learner
-        self._exploring = (self._draw(torch.rand, 1) >= learner.config.still_share) & ~self._coached[:, None]
+        self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
         learner.teachers.reset(torch.ones_like(shown))
         if self._tried is None and learner.teachers.privileged is not None:
             self._draw_goals(learner.teachers.privileged)
@@ -388,16 +380,6 @@ class _Pupil:
         data.labels[slot, self._rows] = labels
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
         tried = self._tried.masked_fill(~self._exploring, -1.0)
-        told = data.goals[:, 0].masked_fill(~self._coached[:, None], torch.nan)
-        mean, self._state = learner.policy.step(obs, memory, tried, told)
+        mean, self._state = learner.policy.step(obs, memory, tried)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._exploring
-        self._take_turns()
-        return torch.where(self._teacher_acts[:, None], labels, action), self._state
-
-    def _take_turns(self) -> None:
-        """Choose anew, every ``_TURN`` steps on average, whether the teacher acts in each coached trial."""
-        if not self._learner.config.coached_share:
-            return
-        again, first = self._draw(torch.rand, 2).unbind(1)
-        turning = self._coached & ~self._data.taught & (again < 1.0 / _TURN)
-        self._teacher_acts = torch.where(turning, first < 0.5, self._teacher_acts)
+        return torch.where(data.taught[:, None], labels, action), self._state

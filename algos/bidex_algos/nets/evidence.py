@@ -49,10 +49,10 @@ class BeliefNet(nn.Module):
         super().__init__()
         width = hidden[-1]
         self.classes = classes
-        own = seen.extended("task_id", classes)
         if classes == 1:
             self.encoder: Headed = MLP(seen, hidden[:-1], width, 1.0, generator, activation)
         else:
+            own = seen.extended("task_id", classes)
             self.encoder = Towers(own, hidden[:-1], classes * width, 1.0, generator, activation, modules=1, shared=0)
         # One layer holds all classes; the columns of each class have unit norm.
         self.goal = linear(goals, classes * width, math.sqrt(classes), generator)
@@ -223,14 +223,11 @@ class BeliefPolicy(RecurrentPolicy):
         return torch.where(again < 1.0 / self.try_steps, new, last)
 
     @torch.no_grad()
-    def step(
-        self, obs: Tensor, memory: Memory, drawn: Tensor | None = None, told: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, obs: Tensor, memory: Memory, drawn: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return mean actions (N, a) and the memory's next state (N, candidates) for raw observations (N, d).
 
         ``drawn`` (N, 1) is the result of :meth:`drawn`; the policy does not explore in environments with a negative
-        entry. With None the policy explores in no environment. In environments whose goal is ``told`` (N, n), not NaN,
-        the policy acts on this goal instead of its belief.
+        entry. With None the policy explores in no environment.
         """
         known = memory.known & ~memory.done  # the state after the last step of an episode was not seen
         state = memory.state + self.belief.evidence(obs, memory.reward, known)
@@ -238,7 +235,5 @@ class BeliefPolicy(RecurrentPolicy):
         if drawn is not None:
             place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
             goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
-        if told is not None:
-            goal = torch.where(told.isnan(), goal, told)
         task = self.class_of(obs)
         return self.actor.act(self.seen(obs, task), self.goals(goal), task), state
