@@ -120,7 +120,7 @@ class Parts(NamedTuple):
             return f"{self.subject} with one {sight} angle that both parts share"
         if self.shows_goals:
             return f"{self.subject} with fifty goals, visible"
-        return f"{self.subject} with hidden goals: train on fifty, adapt to fifty others"
+        return f"{self.subject} with hidden goals; fifty train tasks and fifty other test tasks"
 
     def tasks(self, class_name: str) -> list[_Task]:
         """Return the tasks that the suite lists for one of its classes; an empty list if its tasks are drawn.

@@ -146,8 +146,9 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         say(f"Teacher {name}: {', '.join(learn) or 'no class is left for it'}.")
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
-            policy, _ = load_policy(RunFolder.open(Path(name)), device)
-            other = open_worlds(RunFolder.open(Path(name)).config().to_json())
+            folder = RunFolder.open(Path(name))
+            policy, _ = load_policy(folder, device)
+            other = open_worlds(folder.config().to_json())
             width = int(world.single_observation_space.shape[0])
             more = None
             if other.class_name is not None:
