@@ -250,6 +250,10 @@ class PrivilegedWorld(Protocol):
         """
         ...
 
-    def with_goals(self, obs: Tensor, /) -> Tensor:
-        """Return a copy of the present observations (N, d) in which the hidden goals are visible."""
+    def with_goals(self, obs: Tensor, goals: Tensor | None = None, /) -> Tensor:
+        """Return a copy of the present observations (N, d) in which the hidden goals are visible.
+
+        With ``goals`` (..., N, hidden_size), the observations (..., N, d) show the goals of tasks with these hidden
+        values instead. Raises BidexError for another shape.
+        """
         ...

@@ -250,13 +250,13 @@ class Part:
             for name, block in blocks.items():
                 values[where, self._observer.layout.range(name)] = block.float()
 
-    def goals(self, task_index: Tensor, width: int) -> Tensor:
+    def goals(self, states: list[tuple[Member, slice, TaskState]], width: int) -> Tensor:
         """Return observations (num, width) with the goals, as if nothing were hidden; all other entries are zero.
 
-        ``task_index``: task of each of the part's environments, (num,).
+        ``states`` are those of all engine rows, with the goals to show.
         """
         values = torch.zeros(self._engine.num, width, device=self._engine.device)
-        self._show_goals(values, list(self.states(task_index)))
+        self._show_goals(values, states)
         self._observer.choose_signs(values)
         return values.clamp_(-CLIP, CLIP)
 

@@ -496,9 +496,9 @@ class World(BatchedWorld):
         """See ``PrivilegedWorld``."""
         return self._hidden_parts.rewards(self, goals)
 
-    def with_goals(self, obs: Tensor) -> Tensor:
+    def with_goals(self, obs: Tensor, goals: Tensor | None = None) -> Tensor:
         """See ``PrivilegedWorld``."""
-        return self._hidden_parts.with_goals(self, obs)
+        return self._hidden_parts.with_goals(self, obs, goals)
 
     @cached_property
     def _hidden_parts(self) -> HiddenParts:

@@ -72,7 +72,11 @@ def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
     one = World(classes, WorldConfig(4, observation="masked", autoreset_mode="DISABLED", threads=1))
     action = torch.rand(4, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
     one.reset(seed=0)
-    mirrored, own = -one.hidden_values(), one.step(action)[1]
+    mirrored = -one.hidden_values()
+    masked, own, *_ = one.step(action)
+    shown = one.with_goals(masked, torch.stack([one.hidden_values(), mirrored]))
+    torch.testing.assert_close(shown[0], one.with_goals(masked), rtol=0, atol=1e-6)
+    assert not torch.allclose(shown[0], shown[1], atol=1e-3)
     again, earned = one.rewards_if(torch.stack([one.hidden_values(), mirrored]))
     torch.testing.assert_close(again, own, rtol=0, atol=1e-5)
     assert torch.equal(one.rewards_if(mirrored), earned)
@@ -83,7 +87,9 @@ def test_rewards_for_other_goals_are_those_of_a_world_that_has_them() -> None:
         pools[each.name][:, columns] = np.add(space.low, space.high)[columns] - each.tasks[:, columns]
     one.set_tasks(pools)
     one.reset(seed=0)
-    torch.testing.assert_close(one.step(action)[1], earned, rtol=0, atol=1e-5)
+    masked, paid, *_ = one.step(action)
+    torch.testing.assert_close(paid, earned, rtol=0, atol=1e-5)
+    torch.testing.assert_close(one.with_goals(masked), shown[1], rtol=0, atol=1e-5)
     assert not torch.allclose(earned, own)
 
 
