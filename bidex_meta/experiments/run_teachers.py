@@ -11,7 +11,7 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_data
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.experiments.policies import load_policy, slots_of
+from bidex_meta.experiments.policies import checkpoint, policy_of, slots_of
 from bidex_meta.runs import RunFolder
 from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability
@@ -147,7 +147,9 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
             folder = RunFolder.open(Path(name))
-            policy, _ = load_policy(folder, device)
+            state, _ = checkpoint(folder)
+            policy = policy_of(folder, state, device)
+            origin = {"algo": folder.config().algo, "policy": state["learner"]["policy"]}
             other = open_worlds(folder.config().to_json())
             width = int(world.single_observation_space.shape[0])
             more = None
@@ -158,7 +160,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
                 their = _same_classes(classes, other.task_classes())
                 names = [their[slots[i]] for i in world.task_id[rows].tolist()]
                 more = _appended(other, names, width).to(world.device)
-            tutors.append(Tutor(policy, rows, width, more))
+            tutors.append(Tutor(policy, rows, width, more, origin))
     if untaught := [task for task in classes if task not in assigned]:
         rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")

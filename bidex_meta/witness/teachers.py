@@ -3,8 +3,9 @@
 These actions are labels for imitation; another policy may act in the world.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,13 +21,15 @@ class Tutor:
 
     ``rows`` (k,), int64, are these environments. The policy reads the first ``width`` entries of an observation and
     then ``more`` (k, m), such as the padding and the task id of the suite that it was trained on. A policy of one class
-    reads neither.
+    reads neither. ``source`` has the name of the learner that made the policy (``algo``) and the state from which this
+    learner loads it again (``policy``). It is None for a policy that was not loaded from a run.
     """
 
     policy: Agent
     rows: Tensor
     width: int
     more: Tensor | None = None
+    source: Mapping[str, Any] | None = None
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return the policy's actions (k, a) for the observations (N, d) of all environments."""
@@ -54,7 +57,7 @@ class Teachers:
         privileged: PrivilegedWorld | None = None,
     ) -> None:
         self.privileged = privileged
-        self._tutors = tutors
+        self.tutors = tutors
         self._scripted = scripted
         self._shape = world.action_space.shape
         self.known = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
@@ -80,9 +83,9 @@ class Teachers:
             labels = obs.new_zeros(self._shape)
         else:
             labels = self._scripted.eval_action(obs)
-        if self.privileged is not None and self._tutors:
+        if self.privileged is not None and self.tutors:
             obs = self.privileged.with_goals(obs)
-        for tutor in self._tutors:
+        for tutor in self.tutors:
             actions = tutor.eval_action(obs)
             labels[tutor.rows, : actions.shape[1]] = actions
         return labels
@@ -91,5 +94,5 @@ class Teachers:
         """Tell the teachers that an episode begins in the environments that ``env_mask`` selects, bool (N,)."""
         if self._scripted is not None:
             self._scripted.reset(env_mask)
-        for tutor in self._tutors:
+        for tutor in self.tutors:
             tutor.policy.reset(env_mask[tutor.rows])

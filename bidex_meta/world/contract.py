@@ -250,6 +250,11 @@ class PrivilegedWorld(Protocol):
         """
         ...
 
+    @property
+    def goal_entries(self) -> Tensor:
+        """Indices of the entries of an observation that would show the goal, int64 (e,); empty if nothing is hidden."""
+        ...
+
     def with_goals(self, obs: Tensor, goals: Tensor | None = None, /) -> Tensor:
         """Return a copy of the present observations (N, d) in which the hidden goals are visible.
 

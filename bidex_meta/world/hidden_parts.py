@@ -32,7 +32,8 @@ class HiddenParts:
             self.columns[slot.name] = columns
             self._ranges[slot.name] = 0.5 * (high + low), 0.5 * (high - low)
             goal_indices.update(slot.task_class.layout.goal_indices())
-        self._goal_entries = torch.tensor(sorted(goal_indices), dtype=torch.int64, device=device)
+        self.entries = torch.tensor(sorted(goal_indices), dtype=torch.int64, device=device)
+        """Entries of an observation that would show the goal."""
         self.size = max(map(len, self.columns.values()))
         """Maximum number of values that the tasks of a class hide."""
 
@@ -56,7 +57,7 @@ class HiddenParts:
         for part, own in zip(world.parts, states, strict=True):
             values[part.group.env_ids] = part.goals(own, world.observation_size)
         # The parts are added, because an entry of the goal in one class may belong to an object in another class.
-        return obs.index_add(1, self._goal_entries, values[:, self._goal_entries])
+        return obs.index_add(1, self.entries, values[:, self.entries])
 
     def _states(self, world: PartedWorld, part: Part, given: Tensor) -> Iterator[tuple[Member, TaskState]]:
         """Yield the present state of each member of a part, as if its tasks had other hidden values (g, N, n).

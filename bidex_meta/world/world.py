@@ -496,6 +496,13 @@ class World(BatchedWorld):
         """See ``PrivilegedWorld``."""
         return self._hidden_parts.rewards(self, goals)
 
+    @property
+    def goal_entries(self) -> Tensor:
+        """See ``PrivilegedWorld``."""
+        if self.hides_goals:
+            return self._hidden_parts.entries
+        return torch.zeros(0, dtype=torch.int64, device=self.device)
+
     def with_goals(self, obs: Tensor, goals: Tensor | None = None) -> Tensor:
         """See ``PrivilegedWorld``."""
         return self._hidden_parts.with_goals(self, obs, goals)

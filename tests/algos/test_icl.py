@@ -87,8 +87,8 @@ def test_classes_without_a_teacher_are_played_and_not_learned() -> None:
     data = learner.data
     assert data is not None
     t, filled = data.trials, data.trials.filled()
-    assert torch.equal(data.goals[:, 0], world.goal.float()) and data.taught.tolist() == [False] * 4 + [True] * 4
-    shown = torch.cat([t.obs[..., :2], data.goals[:, 0].expand(len(filled), -1, -1)], dim=-1)
+    assert torch.equal(data.goals[0, :, 0], world.goal.float()) and data.taught.tolist() == [False] * 4 + [True] * 4
+    shown = torch.cat([t.obs[..., :2], data.goals[:, :, 0]], dim=-1)
     long = filled & (torch.arange(8) >= 4)
     assert torch.equal(data.labels[long], world.best(shown[long]))
 
@@ -152,7 +152,7 @@ def test_the_newest_trials_are_kept_as_the_memory_saw_them() -> None:
         trials.lengths = torch.tensor([4, 6])
         data.labels.fill_(10.0 * number)
         data.rewards[:] = torch.tensor([number, -number])
-        data.goals[:, 1] = 1.0
+        data.goals[:, :, 1] = 1.0
         data.keep()
     trial, row = torch.tensor([0, 1]), torch.tensor([1, 0])  # places of the third trial and of the second
     shown = data.steps(trial, row, torch.tensor([0.99, 0.0]))

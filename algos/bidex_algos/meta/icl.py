@@ -10,6 +10,7 @@ belief (posterior sampling).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -21,12 +22,15 @@ from bidex_algos.meta.taught_trials import Steps, TaughtTrials
 from bidex_algos.meta.trial_learner import TrialLearner
 from bidex_algos.meta.trials import Trials
 from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.borrowed import BorrowedPolicy
 from bidex_algos.nets.evidence import Belief, BeliefNet, BeliefPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory
 from bidex_algos.nets.shape import Shape
+from bidex_meta.errors import BidexError
+from bidex_meta.experiments.learners import learner_class
 from bidex_meta.training.distributed import all_sum, pool_moments, sum_gradients, world_size
 from bidex_meta.training.learner import NO_SOURCES, Capability, LearnerConfig, Parts, Sources, State
 from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths
@@ -46,6 +50,9 @@ class ICLConfig(LearnerConfig):
     candidates: Count = 512  # Number of candidate goals; the belief gives each candidate a probability.
     trust: Fraction = 0.05  # Factor of each log-likelihood, small because the errors of successive steps correlate.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
+    actor: Literal["own", "teacher"] = "own"
+    """Who acts: a network that imitates the teachers' actions, or the teacher's policy, to which a network shows the
+    goal by predicting the entries of the observation that the suite hides. This needs a single run as --teacher."""
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.
@@ -55,7 +62,7 @@ class ICLConfig(LearnerConfig):
     """The policy reads a reward as asinh(reward / reward_unit), normalised by running statistics."""
     updates_per_iteration: Count = 50  # Updates after each trial.
     batch_size: Count = 1024  # Steps per update, split evenly over the classes with a teacher.
-    goals: Count = 8  # Number of goals, besides the task's own, for which the rewards of a trial are computed.
+    goals: Count = 8  # Number of goals, drawn in each step, for which rewards are computed besides the task's own.
     trials: Count = 1024  # Trials that each process keeps; the oldest are overwritten first.
     learning_rate: Positive = 1e-3  # Adam's step size.
     decay_steps: Whole = 0
@@ -107,7 +114,8 @@ class ICL(TrialLearner):
         super().__init__(world, config, seed)
         self.low_precision = use_bfloat16(config.autocast, self.device)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.learning_rate, fused=True)
-        self.label_stats = RunningStats((world.num_tasks, self.shape.actions)).to(self.device)
+        labels = self.shape.goal_entries if config.actor == "teacher" else self.shape.actions
+        self.label_stats = RunningStats((world.num_tasks, labels)).to(self.device)
         assert sources.teachers is not None
         self._begin_lessons(sources.teachers)
 
@@ -119,16 +127,21 @@ class ICL(TrialLearner):
         seen = cls._inputs(config, shape)
         goals = max(1, shape.hidden)
 
+        outputs = shape.goal_entries if config.actor == "teacher" else shape.actions
+
         def actor(inputs: Inputs) -> BeliefNet:
             return BeliefNet(
-                seen, config.hidden, config.candidates, config.head, goals, shape.actions, init, config.activation,
+                seen, config.hidden, config.candidates, config.head, goals, outputs, init, config.activation,
                 shape.classes
             )  # fmt: skip
 
-        return BeliefPolicy(
+        policy = BeliefPolicy(
             seen, shape.actions, config.candidates, goals, config.try_steps, config.trust, config.init_std,
             config.reward_unit, config.normalise_observations, actor, belief=belief
-        ).to(device)  # fmt: skip
+        )  # fmt: skip
+        if config.actor == "teacher":
+            policy.borrowed = BorrowedPolicy(shape.classes, shape.goal_entries)
+        return policy.to(device)
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu", belief: Belief | None = None) -> MemoryAgent:
@@ -137,13 +150,24 @@ class ICL(TrialLearner):
         With ``belief``, the agent's actor acts on this belief instead of the learned belief.
         """
         agent = super().load_policy(state, device)
-        if belief is None:
-            return agent
-        config = ICLConfig(**state["config"])
-        init = torch.Generator().manual_seed(0)
-        policy = cls._make_policy(config, Shape.load(state["shape"]), init, torch.device(device), belief)
-        policy.load_state_dict(agent.policy.state_dict())
-        return MemoryAgent(policy)
+        policy = agent.policy
+        if belief is not None:
+            config = ICLConfig(**state["config"])
+            init = torch.Generator().manual_seed(0)
+            policy = cls._make_policy(config, Shape.load(state["shape"]), init, torch.device(device), belief)
+            policy.load_state_dict(agent.policy.state_dict())
+            agent = MemoryAgent(policy)
+        if isinstance(policy, BeliefPolicy) and policy.borrowed is not None:
+            lent = state["borrowed"]
+            policy.borrowed.lend(learner_class(lent["algo"]).load_policy(lent["policy"], device), lent)
+        return agent
+
+    def policy_state_dict(self) -> State:
+        """Return the base class's state and, if a teacher acts, the state of the teacher's policy."""
+        state = super().policy_state_dict()
+        if self.policy.borrowed is not None:
+            state["borrowed"] = self.policy.borrowed.state
+        return state
 
     def start_from(self, policy: State) -> None:
         """Start as in the base class; also keep the statistics of each class fixed."""
@@ -164,9 +188,31 @@ class ICL(TrialLearner):
         self.hidden_sizes = torch.tensor(sizes, device=self.device)
         """Number of hidden values of each class (num_tasks,)."""
         trials = Trials(cfg.episodes_per_trial, self.limits, self.shape.observations, self.shape.actions, chunk=None)
-        self.data = TaughtTrials(
-            trials, max(1, cfg.trials // self.world.num_envs), 1 + cfg.goals, max(1, self.shape.hidden)
-        )
+        kept = max(1, cfg.trials // self.world.num_envs)
+        labels = self.label_stats.mean.shape[1]
+        self.data = TaughtTrials(trials, kept, 1 + cfg.goals, max(1, self.shape.hidden), labels)
+        if self.policy.borrowed is not None:
+            self._borrow(self.policy.borrowed)
+
+    def _borrow(self, borrowed: BorrowedPolicy) -> None:
+        """Let the teacher act; raise BidexError if the teachers are not one run that teaches every class."""
+        teachers = self.teachers
+        tutors = teachers.tutors
+        source = tutors[0].source if len(tutors) == 1 else None
+        privileged = teachers.privileged
+        if source is None or privileged is None or teachers.follow or len(self.tasks) < self.world.num_tasks:
+            raise BidexError(
+                f"icl: actor teacher needs a suite that hides goals and one run that teaches all its "
+                f"{self.world.num_tasks} classes; got {len(tutors)} run(s){' and scripts' * teachers.follow}, which "
+                f"teach {len(self.tasks)}. Name one run as --teacher, or leave actor out."
+            )
+        [tutor] = tutors
+        taught = self.world.task_id[tutor.rows].tolist()
+        more = torch.zeros(self.world.num_tasks, 0)
+        if tutor.more is not None:
+            more = torch.stack([tutor.more[taught.index(task)] for task in range(self.world.num_tasks)])
+        entries = privileged.goal_entries
+        borrowed.lend(tutor.policy, {**source, "width": tutor.width, "entries": entries.cpu(), "more": more.cpu()})
 
     def _iterate(self) -> dict[str, float]:
         data = self.data
@@ -181,7 +227,9 @@ class ICL(TrialLearner):
         self.policy.update_statistics(t.obs[filled], t.rewards[valid])
         if self.policy.own is not None:
             self.policy.own.update(t.obs[filled], self.world.task_id.expand_as(filled)[filled])
-        self.policy.goals.update(data.goals[:, 0])
+        self.policy.goals.update(pupil.goal)
+        if self.policy.borrowed is not None:
+            self.policy.borrowed.measure(self.label_stats.mean, self.label_stats.std(0.0))
         losses = self._learn(data) | {"Loss/goal": all_sum(pupil.missed().double()) / world_size()}
         self._count(t)
         tensors = {"Train/unstable": all_sum((filled & ~valid).sum()), "Policy/teacher_share": share, **losses}
@@ -252,11 +300,17 @@ class ICL(TrialLearner):
         return trial.flatten(), rows.flatten(), self.tasks.repeat_interleave(shape[1])
 
     def _imitation(self, steps: Steps, task: Tensor) -> Tensor:
-        """Return the squared error of actions for each class (K,), relative to the variance of the class's labels.
+        """Return the squared error of the actor for each class (K,), relative to the variance of the class's labels.
 
-        An actor that always returns the mean label has an error of 1.
+        An actor that always returns the mean label has an error of 1. Labels are the teachers' actions for the task's
+        own goal or, if the teacher's policy acts, the hidden entries for the first of the other goals.
         """
         policy = self.policy
+        if policy.borrowed is not None:
+            found = policy.actor.act(policy.seen(steps.obs, task), policy.goals(steps.goals[:, 1]), task)
+            wanted, varies = policy.borrowed.normalised(steps.labels, task)
+            squared = (found - wanted).square().masked_fill(~varies, 0.0)
+            return self._of_class(squared.sum(1) / varies.sum(1).clamp_min(1))
         actions = policy.actor.act(policy.seen(steps.obs, task), policy.goals(steps.goals[:, 0]), task)
         off = (actions - steps.labels) / self.label_stats.std(_FLOOR).float()[task]
         return self._of_class(off.square().mean(1))
@@ -321,12 +375,15 @@ class _Pupil:
         self._data = data
         self._rows = torch.arange(learner.world.num_envs, device=learner.device)
         self._tried: Tensor | None = None
+        self.goal = data.goals[0, :, 0]
+        """The task's own goal in each environment (N, k)."""
+        self._teaching = learner.teachers_share() > 0.0
         data.taught[:] = (self._draw(torch.rand) < learner.teachers_share()) & learner.teachers.known
 
     def begin(self, shown: Tensor) -> None:
         """Begin an episode: choose at random in which environments the policy explores, and reset the teachers.
 
-        In the first episode of a trial, also draw the goals whose rewards are computed in hindsight.
+        In the first episode of a trial, also draw the goals for which rewards are computed in hindsight.
         """
         learner = self._learner
         self._exploring = self._draw(torch.rand, 1) >= learner.config.still_share
@@ -338,19 +395,22 @@ class _Pupil:
         return draw(len(self._rows), *columns, generator=self._learner.generator, device=self._learner.device)
 
     def _draw_goals(self, privileged: PrivilegedWorld) -> None:
-        """Store each environment's own goal, and draw other goals, whose rewards are computed in hindsight.
+        """Store each environment's own goal, and draw other goals for each state of the trial.
 
         The other goals come from the same range. A goal has k entries in [-1, 1]. Entries that a class does not use are
-        random in all goals.
+        random in all goals. New goals in each state show the networks far more goals than the trials have.
         """
+        learner = self._learner
         goals = self._data.goals
-        goals[:] = 2.0 * self._draw(torch.rand, *goals.shape[1:]) - 1.0
-        goals[:, 0] = torch.where(self._used(), privileged.hidden_values(), goals[:, 0])
+        torch.rand(goals.shape, generator=learner.generator, out=goals)
+        goals.mul_(2.0).sub_(1.0)
+        self.goal = torch.where(self._used(), privileged.hidden_values(), goals[0, :, 0])
+        goals[:, :, 0] = self.goal
 
     def _used(self) -> Tensor:
         """Return which entries of a goal the class of each environment uses, bool (N, n)."""
         sizes = self._learner.hidden_sizes[self._learner.world.task_id]
-        return torch.arange(self._data.goals.shape[2], device=sizes.device) < sizes[:, None]
+        return torch.arange(self._data.goals.shape[3], device=sizes.device) < sizes[:, None]
 
     def missed(self) -> Tensor:
         """Return the mean squared difference between the goals that the policy believes and the true goals, a scalar.
@@ -359,7 +419,7 @@ class _Pupil:
         1/3. It is 0 if no class hides a goal.
         """
         used = self._used()
-        off = self._learner.policy.belief.believed(self._state) - self._data.goals[:, 0]
+        off = self._learner.policy.belief.believed(self._state) - self.goal
         return off.square().masked_fill(~used, 0.0).sum() / used.sum().clamp_min(1)
 
     def earned(self, reward: Tensor, valid: Tensor, slot: Tensor) -> None:
@@ -369,17 +429,28 @@ class _Pupil:
         data.rewards[slot, self._rows] = reward[:, None]
         if privileged is None:
             return
-        others = privileged.rewards_if(data.goals[:, 1:].transpose(0, 1))
+        next_slot = (slot + 1).clamp_max(len(data.goals) - 1)  # the state after a trial's last step is not recorded
+        others = privileged.rewards_if(data.goals[next_slot, self._rows, 1:].transpose(0, 1))
         data.rewards[slot, self._rows, 1:] = others.masked_fill(~valid, 0.0).T
 
     def act(self, obs: Tensor, memory: Memory, slot: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions (from the teachers or the policy) and the memory's state; store the teachers' labels."""
         learner = self._learner
         data = self._data
-        labels = learner.teachers.eval_action(obs)
-        data.labels[slot, self._rows] = labels
+        borrowed = learner.policy.borrowed
+        privileged = learner.teachers.privileged
+        labels = None
+        if self._teaching or borrowed is None:
+            labels = learner.teachers.eval_action(obs)
+        if borrowed is None:
+            data.labels[slot, self._rows] = labels
+        elif privileged is not None:
+            shown = privileged.with_goals(obs, data.goals[slot, self._rows, 1]) - obs
+            data.labels[slot, self._rows] = shown[:, privileged.goal_entries]
         self._tried = learner.policy.drawn(self._tried, len(obs), learner.generator)
         tried = self._tried.masked_fill(~self._exploring, -1.0)
         mean, self._state = learner.policy.step(obs, memory, tried)
         action = mean + learner.policy.log_std.exp() * self._draw(torch.randn, mean.shape[1]) * self._exploring
+        if labels is None:
+            return action, self._state
         return torch.where(data.taught[:, None], labels, action), self._state

@@ -20,7 +20,7 @@ class Steps(NamedTuple):
     obs: Tensor
     """Raw observations (B, d)."""
     labels: Tensor
-    """The teachers' actions in these states (B, a)."""
+    """What the actor learns to output in these states (B, a), such as the teachers' actions."""
     goals: Tensor
     """Goals (B, g, k); the first of the g goals is the hidden values of the step's own task."""
     rewards: Tensor
@@ -33,18 +33,22 @@ class TaughtTrials:
     """The last ``kept`` trials of N environments.
 
     Four tensors are filled while ``trials`` is played, and :meth:`keep` then stores them: ``labels`` (S, N, a),
-    ``goals`` (N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,), which marks trials in which teachers act. The first
-    of g goals is the task's own. The rewards that the other goals would have given are computed in hindsight.
+    ``goals`` (S, N, g, k), ``rewards`` (S, N, g) and ``taught`` (N,), which marks trials in which teachers act. A label
+    has ``labels`` entries; the default is those of an action. The first of g goals is the task's own. The rewards that
+    the other goals would have given are computed in hindsight. The goals of a slot belong to the state in this slot,
+    and the rewards of a slot are those of the step that leaves this state, under the goals of the next slot.
     """
 
-    def __init__(self, trials: Trials, kept: int, goals: int, size: int):
+    def __init__(self, trials: Trials, kept: int, goals: int, size: int, labels: int | None = None):
         self.trials = trials
         self.kept = kept
         self.added = 0
         slots, rows, actions = trials.actions.shape
+        labels = labels or actions
         device = trials.obs.device
-        self.labels = torch.zeros(slots, rows, actions, device=device)
-        self.goals, self.rewards = (torch.zeros(*n, device=device) for n in ((rows, goals, size), (slots, rows, goals)))
+        self.labels = torch.zeros(slots, rows, labels, device=device)
+        self.goals = torch.zeros(slots, rows, goals, size, device=device)
+        self.rewards = torch.zeros(slots, rows, goals, device=device)
         self.taught = torch.zeros(rows, dtype=torch.bool, device=device)
 
         def empty(*shape: int, dtype: torch.dtype = torch.float16) -> Tensor:
@@ -52,9 +56,9 @@ class TaughtTrials:
             return torch.empty(kept, slots, rows, *shape, dtype=dtype, device=device)
 
         self._ring = {
-            "obs": empty(trials.obs.shape[2]), "labels": empty(actions), "rewards": empty(goals, dtype=torch.float32),
+            "obs": empty(trials.obs.shape[2]), "labels": empty(labels), "rewards": empty(goals, dtype=torch.float32),
             "paid": empty(dtype=torch.bool),
-            "goals": torch.empty(kept, rows, goals, size, device=device),
+            "goals": empty(goals, size),
             "taught": torch.empty(kept, rows, dtype=torch.bool, device=device),
             "lengths": torch.empty(kept, rows, dtype=torch.int64, device=device),
         }  # fmt: skip
@@ -83,8 +87,9 @@ class TaughtTrials:
         """
         slot = (share * self._ring["lengths"][trial, row]).long()
         ring = self._ring
-        obs, labels, rewards, paid = (ring[name][trial, slot, row] for name in ("obs", "labels", "rewards", "paid"))
-        return Steps(obs.float(), labels.float(), ring["goals"][trial, row], rewards, paid)
+        names = ("obs", "labels", "goals", "rewards", "paid")
+        obs, labels, goals, rewards, paid = (ring[name][trial, slot, row] for name in names)
+        return Steps(obs.float(), labels.float(), goals.float(), rewards, paid)
 
     def state_dict(self) -> State:
         """Return a copy of the stored data."""

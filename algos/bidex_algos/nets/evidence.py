@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.nets.borrowed import BorrowedPolicy
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Towers
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Headed, head_of, linear
@@ -197,6 +198,8 @@ class BeliefPolicy(RecurrentPolicy):
         """Statistics of each class's observations, for the reward model and the actor; None if there is one class."""
         if self.observations.enabled and self.actor.classes > 1:
             self.own = TaskNormaliser(inputs, self.actor.classes)
+        self.borrowed: BorrowedPolicy | None = None
+        """Acts instead of the actor, which then predicts entries of the observation that show a goal."""
         self.try_steps = try_steps
         self.belief: Belief = belief or ModelBelief(self, trust)
 
@@ -236,4 +239,7 @@ class BeliefPolicy(RecurrentPolicy):
             place = (state.softmax(-1).cumsum(-1) < drawn).sum(-1).clamp_max(self.memory - 1)
             goal = torch.where(drawn < 0.0, goal, self.belief.candidates[place])
         task = self.class_of(obs)
-        return self.actor.act(self.seen(obs, task), self.goals(goal), task), state
+        found = self.actor.act(self.seen(obs, task), self.goals(goal), task)
+        if self.borrowed is not None:
+            return self.borrowed.eval_action(obs, found, task), state
+        return found, state

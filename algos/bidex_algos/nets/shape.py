@@ -19,6 +19,8 @@ class Shape:
     """Number of hidden values per task, which the world does not show: the goal in a meta suite."""
     classes: int = 1
     """Number of classes that the observation does not tell apart; 1 if the observation has the task's one-hot."""
+    goal_entries: int = 0
+    """Number of entries of the observation that would show the goal if the world did not hide it."""
 
     @classmethod
     def of(cls, world: VectorWorld) -> "Shape":
@@ -31,7 +33,8 @@ class Shape:
             classes = 1
         else:
             classes = world.num_tasks
-        return cls(int(observations.shape[0]), int(actions.shape[0]), groups, hidden, classes)
+        entries = len(getattr(world, "goal_entries", ()))
+        return cls(int(observations.shape[0]), int(actions.shape[0]), groups, hidden, classes, entries)
 
     @property
     def num_id_columns(self) -> int:
@@ -52,15 +55,20 @@ class Shape:
             classes = {"classes": self.classes}
         else:
             classes = {}
+        if self.goal_entries:
+            entries = {"goal_entries": self.goal_entries}
+        else:
+            entries = {}
         groups = {group.name: [[where.start, where.stop] for where in group.where] for group in self.groups}
-        return self.sizes() | hidden | classes | {"groups": groups}
+        return self.sizes() | hidden | classes | entries | {"groups": groups}
 
     @classmethod
     def load(cls, state: State) -> "Shape":
         """Return the shape that :meth:`state_dict` saved as ``state``."""
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
         named = tuple(ObservationGroup(*group) for group in groups)
-        return cls(state["observations"], state["actions"], named, state.get("hidden", 0), state.get("classes", 1))
+        more = state.get("hidden", 0), state.get("classes", 1), state.get("goal_entries", 0)
+        return cls(state["observations"], state["actions"], named, *more)
 
 
 _OF_SEVERAL = ("task_embedding", "normalise_per_task")
