@@ -41,6 +41,7 @@ class PointGoals(FakePools):
     speed = 0.2
     kept = ("position",)
     hidden_size = 2
+    goal_entries = torch.tensor([2, 3])
 
     def __init__(
         self, rows: int = 40, goal_visible: bool = False, classes: Sequence[PointClass] = (PointClass(),),

@@ -1,12 +1,14 @@
 """In-context learning: what one episode tells, what the memory is asked, who labels, what is kept."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from bidex_algos.meta import icl
 from bidex_algos.meta.icl import ICL, ICLConfig
 from bidex_algos.meta.taught_trials import TaughtTrials
 from bidex_algos.meta.trials import Trials
@@ -36,8 +38,10 @@ class Knowing:
     def hidden_values(self) -> Tensor:
         return self.world.goal.float()
 
-    def with_goals(self, obs: Tensor) -> Tensor:
-        return obs.index_add(1, torch.tensor([2, 3]), self.hidden_values())
+    goal_entries = PointGoals.goal_entries
+
+    def with_goals(self, obs: Tensor, goals: Tensor | None = None) -> Tensor:
+        return obs.index_add(1, self.goal_entries, self.hidden_values() if goals is None else goals)
 
     def rewards_if(self, goals: Tensor) -> Tensor:
         return -(self.world.position - goals).norm(dim=-1)
@@ -52,7 +56,8 @@ class Knowing:
 def taught(world: PointGoals, config: ICLConfig = SMALL, rows: Tensor | None = None) -> ICL:
     knowing: Any = Knowing(world)
     rows = torch.arange(world.num_envs) if rows is None else rows
-    return ICL(world, config, 0, Sources(teachers=Teachers(world, [Tutor(knowing, rows, 4)], privileged=knowing)))
+    tutor = Tutor(knowing, rows, 4, source={"algo": "knowing", "policy": {}})
+    return ICL(world, config, 0, Sources(teachers=Teachers(world, [tutor], privileged=knowing)))
 
 
 def evaluated(agent: Any, world: PointGoals) -> float:
@@ -74,6 +79,53 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal() -> No
     assert before == pytest.approx(-10.0, abs=1.0)
     shot(agent, test)
     assert (evaluated(agent, test) - before) / (best - before) > 0.55
+
+
+@pytest.fixture
+def loads_knowing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The learner's name "knowing" stands for policies of ``Knowing``."""
+    kind = SimpleNamespace(load_policy=lambda state, device: Knowing(PointGoals(2)))
+    monkeypatch.setattr(icl, "learner_class", {"knowing": kind}.__getitem__)
+
+
+def test_a_teacher_acts_on_predicted_entries(loads_knowing: None) -> None:
+    learner = taught(PointGoals(160, classes=TEN), replace(SMALL, actor="teacher"))
+    for _ in range(25):
+        metrics = learner.iterate()
+    assert metrics["Loss/imitation"] < 0.05
+    # A teacher that read the goal of the trial, not the drawn one, would give the same label in all states of it.
+    data = learner.data
+    filled = data.trials.filled()
+    assert torch.equal(data.labels[filled], data.goals[filled][:, 1])
+    assert data.labels[:, 0][filled[:, 0]].std(0).min() > 0.4
+
+    test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
+    test.set_tasks({"PointGoals": circle(16, first=0.2)})
+    agent = ICL.load_policy(learner.policy_state_dict())
+    best, before = played(shown.best, shown), evaluated(agent, test)
+    shot(agent, test)
+    assert (evaluated(agent, test) - before) / (best - before) > 0.55
+
+
+def test_what_a_teacher_reads_beside_the_entries_belongs_to_the_class(loads_knowing: None) -> None:
+    classes = (PointClass("Short", steps=3, count=4), PointClass("Long", steps=3, count=4))
+    world = PointGoals(8, classes=classes)
+    knowing: Any = Knowing(world)
+    read = []
+    knowing.eval_action = lambda obs: read.append(obs) or world.best(obs[:, :4])
+    more = torch.tensor([[1.0, 0.0]] * 4 + [[0.0, 1.0]] * 4)
+    tutor = Tutor(knowing, torch.arange(8), 4, more, {"algo": "knowing", "policy": {}})
+    teachers = Teachers(world, [tutor], privileged=knowing)
+    learner = ICL(world, replace(SMALL, actor="teacher", teacher_steps=0), 0, Sources(teachers=teachers))
+    learner.iterate()
+    obs = world.reset()[0]
+    learner.policy.step(obs, learner.policy.fresh_memory(8))
+    told = learner.policy.class_of(obs)
+    assert torch.equal(read[-1][:, 4:], torch.eye(2)[told]) and torch.equal(read[-1][:, :2], obs[:, :2])
+    with pytest.raises(BidexError, match="one run that teaches all its 2 classes; got 2 run"):
+        ICL(world, learner.config, 0, Sources(teachers=Teachers(world, [tutor, tutor], privileged=knowing)))
+    with pytest.raises(BidexError, match=r"one run .* teach 1\. Name one run"):
+        taught(world, learner.config, rows=torch.arange(4))
 
 
 def test_classes_without_a_teacher_are_played_and_not_learned() -> None:

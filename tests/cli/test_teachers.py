@@ -1,12 +1,14 @@
 """``--teacher``: short runs on real physics with scripts and with a run's policy, and what is refused."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from bidex_meta.cli import main
 from bidex_meta.config import RunConfig
+from bidex_meta.experiments.policies import load_policy
 from bidex_meta.experiments.run_teachers import teachers_of
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.utils.paths import shipped_policy
@@ -95,6 +97,29 @@ def test_a_policy_of_a_suite_teaches_any_of_its_classes(suite: str | None, task:
     for _ in range(int(world.max_episode_steps.max())):
         obs, _, _, _, info = world.step(teachers.eval_action(obs))
     assert info["running"]["success"].float().mean() > 0.7  # with another padding or task id there is no success
+
+
+def test_a_shipped_policy_acts_in_a_suite_that_hides_goals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = str(shipped_policy())
+    words = ["run", "--suite", "ML1-Switch-v2", *SMALL.replace("dagger", "icl").split()[:-6], "--steps", "9"]
+    words += ["--learner.hidden", "8", "--learner.head", "8", "--learner.candidates", "8", "--learner.actor", "teacher"]
+    words += [
+        "--learner.max-adapt-steps",
+        "5",
+        "--learner.updates-per-iteration",
+        "2",
+        "--run-dir",
+        str(tmp_path / "r"),
+    ]
+    assert main([*words, "--teacher", shipped]) == 0
+    agent: Any = load_policy(tmp_path / "r")[0]
+    borrowed = agent.policy.borrowed
+    entries = len(borrowed.state["entries"])
+    task = torch.zeros(2, dtype=torch.int64)
+    acted = borrowed.eval_action(torch.zeros(2, 600), torch.zeros(2, entries), task)
+    assert acted.shape == (2, 52) and acted.abs().max() > 0.01
+    assert main([*words[:-1], str(tmp_path / "s"), "--teacher", "scripts"]) == 1
+    assert "got 0 run(s) and scripts, which teach 1. Name one run as --teacher" in capsys.readouterr().err
 
 
 def test_ppo_starts_from_a_student_has_its_teachers_and_is_resumed(student: Path, tmp_path: Path) -> None:
