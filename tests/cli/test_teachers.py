@@ -118,7 +118,7 @@ def test_a_shipped_policy_acts_in_a_suite_that_hides_goals(tmp_path: Path, capsy
     task = torch.zeros(2, dtype=torch.int64)
     acted = borrowed.eval_action(torch.zeros(2, 600), torch.zeros(2, entries), task)
     assert acted.shape == (2, 52) and acted.abs().max() > 0.01
-    assert main([*words[:-1], str(tmp_path / "s"), "--teacher", "scripts"]) == 1
+    assert main([*words[:-1], str(tmp_path / "s"), "--teacher", "scripts"]) == 2
     assert "got 0 run(s) and scripts, which teach 1. Name one run as --teacher" in capsys.readouterr().err
 
 
