@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
+from bidex_meta.errors import BidexError
 from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, PolicyEvaluation, SplitSummary, Summary
+from tools.pages.gained import adaptation_table
 from tools.pages.ladder import BLIND, SHOWN, ladder_figure, ladder_table, suites_table
 
 SUITE = "ML1-Door-choice4"
@@ -92,6 +94,24 @@ def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None
     assert row == [SUITE, "left_angle", "25.0 %", "26.4 % (25 %)", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
     runs[0].path = tmp_path / "elsewhere" / "data" / "ladder.json"
     assert cells(list(suites_table(study))[2])[:5] == [SUITE, "", "", "", ""]
+
+
+def test_classes_have_success_by_shot_above_what_is_possible_without_the_goal(tmp_path: Path) -> None:
+    study: Any = SimpleNamespace(name="s", split=None, runs=[run("RL2", 0, 0.1, 0.5), run("RL2", 1, 0.2, 0.7)])
+    for each in study.runs:
+        each.path = tmp_path / "data" / "s.json"
+    folder = tmp_path / "validity"
+    with pytest.raises(BidexError, match="bidex-meta validity"):
+        list(adaptation_table(study))
+    folder.mkdir()
+    (folder / f"{SUITE}.json").write_text(json.dumps({"classes": {"Door": {"blind": 0.25}}}))
+    head, _, row, mean = adaptation_table(study)
+    assert cells(head) == ["class", "blind at best", "before", "after 1", "above blind"]
+    assert cells(row) == ["Door", "25.0 %", "15 % (10 to 20)", "60 % (50 to 70)", "+35"]
+    assert cells(mean)[1:] == cells(row)[1:]
+    study.split = "others"
+    with pytest.raises(BidexError, match="no meta-test of others"):
+        list(adaptation_table(study))
 
 
 @pytest.mark.parametrize(

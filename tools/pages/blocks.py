@@ -20,7 +20,7 @@ from PIL import Image
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import plots
 from tools.pages import tables
-from tools.pages.gained import gains_table
+from tools.pages.gained import adaptation_table, gains_table
 from tools.pages.gpu import gpu_table
 from tools.pages.ladder import ladder_figure, ladder_table, suites_table
 from tools.pages.leaderboard import leaderboard_table
@@ -34,6 +34,7 @@ _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end
 _TABLES = {
     "table": tables.arms_table,
     "classes": tables.classes_table,
+    "adaptation": adaptation_table,
     "gains": gains_table,
     "ladder": ladder_table,
     "ladder-suites": suites_table,

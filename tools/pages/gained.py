@@ -1,15 +1,18 @@
-"""Meta-tests: each run's gain compared with a control without meta-training."""
+"""Meta-tests by class: success after each shot, and each run's gain compared with a control without meta-training."""
 
 from collections.abc import Iterator
 from itertools import chain
 from math import hypot
+
+import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Estimate
 from bidex_meta.runs.evaluations import MetaTestEvaluation, SplitSummary
 from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study
-from tools.pages.tables import table
+from tools.pages.tables import mean_and_range, table
+from tools.pages.validity import read_validity
 
 CONTROL = "control"
 """Name of the arm with which the other arms are compared. Its runs adapt the same initial policy without
@@ -49,6 +52,37 @@ def gains_table(study: Study) -> Iterator[str]:
                 _both(part, name, "success", 100.0, " %"), _both(part, name, "mean_return"), _bold(gain), over,
             ])  # fmt: skip
     return table(_HEAD, rows)
+
+
+def adaptation_table(study: Study) -> Iterator[str]:
+    """Yield a table of success after 0, 1, ... shots, with a row for each class and one for the mean.
+
+    A cell shows the mean over the study's runs, which are seeds of one arm, and the lowest and highest value of a run.
+    "Above blind" is the success after the last shot, minus what is possible without knowing the goal according to
+    ``validity/SUITE.json``. The split is the study's split, by default ``test``. Raises BidexError if a run has no
+    meta-test of the split.
+    """
+    split = study.split or "test"
+    parts = []
+    for run in study.runs:
+        if split not in _splits(run):
+            raise BidexError(f"Study {study.name}: {run.path} has no meta-test of {split} tasks. Leave it out.")
+        parts.append(_splits(run)[split].by_shot)
+    suite = str(study.runs[0].content["suite"]["name"])
+    possible = read_validity(study.runs[0].path.parent.parent, suite)
+    names = list(parts[0][0].classes)
+    blind = {name: 100.0 * possible[name]["blind"] for name in names}
+    blind["mean"] = float(np.mean([*blind.values()]))
+    success = {
+        name: 100.0 * np.array([[shot.classes[name].success for shot in shots] for shots in parts]) for name in names
+    }
+    success["mean"] = np.mean([*success.values()], axis=0)
+    rows = []
+    for name, found in success.items():
+        shares = [mean_and_range(each, ".3g", " %") for each in found.T]
+        rows.append([name, f"{blind[name]:.1f} %", *shares, f"{found[:, -1].mean() - blind[name]:+.0f}"])
+    shots = ["before", *(f"after {number + 1}" for number in range(len(parts[0]) - 1))]
+    return table(("class", "blind at best", *shots, "above blind"), rows)
 
 
 def _splits(run: StoredRun) -> dict[str, SplitSummary]:

@@ -20,10 +20,7 @@ _SHARES = {
 
 def validity_table(suite: str, data: Path) -> list[str]:
     """Return a suite's table from ``validity/SUITE.json`` next to the folder of data; the last row is the mean."""
-    file = data.parent / "validity" / f"{suite}.json"
-    if not file.is_file():
-        raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
-    classes = json.loads(file.read_text())["classes"]
+    classes = read_validity(data.parent, suite)
     lines = [f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |"]
     lines.append("|---|---|" + "---|" * (len(_SHARES) + 2))
     for name, row in classes.items():
@@ -38,6 +35,15 @@ def validity_table(suite: str, data: Path) -> list[str]:
     means = (_mean([row.get(key) for row in classes.values()]) for key in _SHARES)
     ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
     return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
+
+
+def read_validity(results: Path, suite: str) -> Json:
+    """Return what ``bidex-meta validity`` stored of a suite in the folder ``results``, by class; raise BidexError."""
+    file = results / "validity" / f"{suite}.json"
+    if not file.is_file():
+        raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
+    classes: Json = json.loads(file.read_text())["classes"]
+    return classes
 
 
 def share_cell(row: Json, figure: str) -> str:
