@@ -39,6 +39,7 @@ from bidex_meta.world.contract import PooledWorld, PrivilegedWorld
 
 # Added to the labels' standard deviations, by which errors of actions are divided. It is 1.5 % of an action's range.
 _FLOOR = 0.03
+_USUAL_HIDDEN = 6  # entries of a goal, for an estimate of the memory; no class hides more
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class ICLConfig(LearnerConfig):
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         steps = self.episodes_per_trial * min(self.max_adapt_steps or USUAL_STEPS, USUAL_STEPS)
+        width += _USUAL_HIDDEN * (1 + self.goals)
         kept = (4 * num_envs + 2 * max(self.trials, num_envs)) * width * steps
         return kept + network_bytes(self.head, width, 1)
 
