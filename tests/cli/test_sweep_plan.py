@@ -135,7 +135,8 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
 
 def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, shown) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "results").symlink_to(ROOT / "results")  # teachers
+    for teachers in ("results", "assets"):
+        (tmp_path / teachers).symlink_to(ROOT / teachers)
     # Data sets must be recorded before the sweep; its file lists them.
     monkeypatch.setattr("bidex_meta.experiments.run_data.open_datasets", lambda names: [])
     monkeypatch.setattr("bidex_meta.experiments.run_data.check_offline", lambda *_: None)
