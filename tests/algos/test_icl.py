@@ -99,10 +99,12 @@ def test_a_teacher_acts_on_predicted_entries(loads_knowing: None) -> None:
     assert torch.equal(data.labels[filled], data.goals[filled][:, 1])
     assert data.labels[:, 0][filled[:, 0]].std(0).min() > 0.4
 
-    test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
+    test = PointGoals(80, classes=TEN)
+    shown = PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = ICL.load_policy(learner.policy_state_dict())
-    best, before = played(shown.best, shown), evaluated(agent, test)
+    best = played(shown.best, shown)
+    before = evaluated(agent, test)
     shot(agent, test)
     assert (evaluated(agent, test) - before) / (best - before) > 0.55
 
@@ -120,8 +122,8 @@ def test_what_a_teacher_reads_beside_the_entries_belongs_to_the_class(loads_know
     learner.iterate()
     obs = world.reset()[0]
     learner.policy.step(obs, learner.policy.fresh_memory(8))
-    told = learner.policy.class_of(obs)
-    assert torch.equal(read[-1][:, 4:], torch.eye(2)[told]) and torch.equal(read[-1][:, :2], obs[:, :2])
+    predicted = learner.policy.class_of(obs)
+    assert torch.equal(read[-1][:, 4:], torch.eye(2)[predicted]) and torch.equal(read[-1][:, :2], obs[:, :2])
     with pytest.raises(BidexError, match="one run that teaches all its 2 classes; got 2 run"):
         ICL(world, learner.config, 0, Sources(teachers=Teachers(world, [tutor, tutor], privileged=knowing)))
     with pytest.raises(BidexError, match=r"one run .* teach 1\. Name one run"):

@@ -239,7 +239,7 @@ def test_output_that_nobody_takes_is_no_traceback(line: str, code: int, tmp_path
     assert int((tmp_path / "code").read_text()) == code, done.stderr
     assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
     # On a busy machine a line of progress ("starting: 4 s so far") comes before the message.
-    assert len([told for told in done.stderr.splitlines() if "so far" not in told]) <= 1
+    assert len([line for line in done.stderr.splitlines() if "so far" not in line]) <= 1
 
 
 def test_a_terminal_that_is_gone_is_a_reader_that_has_ended() -> None:

@@ -22,8 +22,8 @@ class ICLConfig(LearnerConfig):
     trust: Fraction = 0.05  # Factor of each log-likelihood, small because the errors of successive steps correlate.
     head: Layers = (512, 512)  # Widths of the actor's hidden layers.
     actor: Literal["own", "teacher"] = "own"
-    """Who acts: a network that imitates the teachers' actions, or the teacher's policy, to which a network shows the
-    goal by predicting the entries of the observation that the suite hides. This needs a single run as --teacher."""
+    """Source of the actions: a network that imitates the teachers, or the teacher's own policy. For this policy, a
+    network predicts the entries of the observation that the suite hides. It needs a single run as --teacher."""
     init_std: Positive = 0.05  # Standard deviation of the actions in exploring episodes.
     episodes_per_trial: Count = 3  # Episodes that share one memory: the adaptation episodes, and one more.
     max_adapt_steps: Count | None = None  # Steps after which an episode of a trial is cut; None: whole episodes.

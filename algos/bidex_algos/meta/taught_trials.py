@@ -20,7 +20,7 @@ class Steps(NamedTuple):
     obs: Tensor
     """Raw observations (B, d)."""
     labels: Tensor
-    """What the actor learns to output in these states (B, a), such as the teachers' actions."""
+    """Targets of the actor in these states (B, a), such as the teachers' actions."""
     goals: Tensor
     """Goals (B, g, k); the first of the g goals is the hidden values of the step's own task."""
     rewards: Tensor
