@@ -177,7 +177,8 @@ class BatchedWorld(VectorEnv, ABC):
             raise BidexError("Expected reset() before step(): the environments have no episode yet.")
         action = checked.action(action, (self.num_envs, self.action_size), self.device)
         with one_torch_thread():
-            waiting = self.episodes.finished
+            # A recording of the step overwrites the counters, so the environments that wait now are copied.
+            waiting = self.episodes.finished.clone()
             active, broken = self._stepper.run(self._control, action)
             reward, terminated, truncated, info = self._move(active, broken)
             self._clock.stamp(info)

@@ -114,9 +114,9 @@ class Stepper(Protocol):
     """Runs parts of a world's step that read no tensor's value on the host."""
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
-        """Run a method of the world on tensors whose shapes never change, and return its result.
+        """Run a method of the world on tensors and return its result.
 
-        The next run of the same method may overwrite the result.
+        The next run of the same method on tensors of the same shapes may overwrite the result.
         """
         ...
 
@@ -158,7 +158,8 @@ class CapturedStepper:
 
     def run(self, work: Callable[..., Result], *inputs: Tensor) -> Result:
         """See ``Stepper``."""
-        return self._graphs.run(work, work, *inputs)
+        key = (work, *(value.shape for value in inputs))
+        return self._graphs.run(key, work, *inputs)
 
     def keep(self, result: Result) -> Result:
         """See ``Stepper``."""

@@ -167,7 +167,7 @@ class World(BatchedWorld):
             remembered = self._randomiser.remembered
         self._past = torch.zeros(self.num_envs, remembered, self.action_size, device=self.device)
         self._side_by_side = SideBySide(len(groups), self.device)
-        if self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP:
+        if self.device.type == "cuda":
             self._stepper = CapturedStepper(self._state, self._put_state)
         self._painter = Painter()
         self.pictures: Tensor | None = None
@@ -494,6 +494,9 @@ class World(BatchedWorld):
 
     def rewards_if(self, goals: Tensor) -> Tensor:
         """See ``PrivilegedWorld``."""
+        return self._stepper.keep(self._stepper.run(self._rewards_if, goals))
+
+    def _rewards_if(self, goals: Tensor) -> Tensor:
         return self._hidden_parts.rewards(self, goals)
 
     @property
@@ -505,6 +508,13 @@ class World(BatchedWorld):
 
     def with_goals(self, obs: Tensor, goals: Tensor | None = None) -> Tensor:
         """See ``PrivilegedWorld``."""
+        if goals is None:
+            shown = self._stepper.run(self._with_goals, obs)
+        else:
+            shown = self._stepper.run(self._with_goals, obs, goals)
+        return self._stepper.keep(shown)
+
+    def _with_goals(self, obs: Tensor, goals: Tensor | None = None) -> Tensor:
         return self._hidden_parts.with_goals(self, obs, goals)
 
     @cached_property

@@ -81,11 +81,11 @@ def taped(
 
 @pytest.fixture
 def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., tuple[World, list[int]]]]:
-    def make(suite: str, rows: int, tasks: int | None = None) -> tuple[World, list[int]]:
+    def make(suite: str, rows: int, tasks: int | None = None, mode: str = "SAME_STEP") -> tuple[World, list[int]]:
         with monkeypatch.context() as patch:
             maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
             patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
-            made = suite_world(suite, rows, tasks_per_class=tasks)
+            made = suite_world(suite, rows, mode, tasks_per_class=tasks)
         holder: list[CapturedStepper] = []
         count: list[int] = []
         made._stepper = CapturedStepper(made._state, made._put_state, taped(holder, count))
@@ -110,6 +110,46 @@ def test_replayed_steps_are_plain_steps(
     assert number_of_ends(a) >= 9 and a[40]["info/unstable"][3]
     assert all(np.array_equal(*pools) for pools in zip(plain.pools, taped_world.pools, strict=True))
     assert len(count) == 5  # controls, transitions, starts drawn ahead and taken, first observations
+
+
+def told(world: World) -> list[dict[str, Tensor]]:
+    """What a world tells of hidden parts in six steps, for one and for three goals."""
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for action in random_actions(world, 6, seed=1):
+        goals = 2.0 * torch.rand(3, world.num_envs, world.hidden_size, generator=generator) - 1.0
+        obs = world.step(action)[0]
+        told = {"one": world.rewards_if(goals[0]), "three": world.rewards_if(goals)}
+        found.append(told | {"own": world.with_goals(obs), "other": world.with_goals(obs, goals[1])})
+    return found
+
+
+@pytest.mark.parametrize(("suite", "mode"), [("ML1-v2", "DISABLED"), ("ML4", "DISABLED"), ("MT4", "NEXT_STEP")])
+def test_replayed_trials_are_plain_trials(
+    suite: str, mode: str, recorded: Callable[..., tuple[World, list[int]]]
+) -> None:
+    """Episodes of evaluations and trials begin together, with other tasks in each trial."""
+    plain = suite_world(suite, 9, mode)
+    taped_world, count = recorded(suite, 9, mode=mode)
+    actions = random_actions(plain, 90)
+    actions[40, 3] = torch.nan
+    for trial in range(2):
+        for one in (plain, taped_world):
+            names = one.task_names
+            one.set_tasks({name: pool[3 * trial :] for name, pool in zip(names, one.pools, strict=True)})
+            one.reset()
+        for begin in range(0, len(actions), 45):
+            a, b = (play(one, actions[begin : begin + 45]) for one in (plain, taped_world))
+            assert_same(a, b)
+            if plain.hides_goals:
+                assert_same(*(told(one) for one in (plain, taped_world)))
+            if mode == "DISABLED":
+                mask = torch.arange(9) % 2 == begin % 2
+                first, second = (one.reset(options={"reset_mask": mask})[0] for one in (plain, taped_world))
+                assert torch.equal(first, second)
+    assert a[-1]["info/running/l"].unique().numel() > 1  # some episodes have ended before others
+    # Controls and transitions are recorded, and what is told of hidden parts; again with the second trial's tasks.
+    assert len(count) >= 2 * (6 if plain.hides_goals else 2)
 
 
 def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[..., tuple[World, list[int]]]) -> None:
@@ -166,9 +206,12 @@ def test_nothing_of_the_caller_stands_between_jobs_side_by_side(monkeypatch: pyt
 
 
 @pytest.mark.gpu
-def test_graphs_on_cuda_are_plain_steps() -> None:
+@pytest.mark.parametrize(("mode", "recorded"), [("SAME_STEP", 4), ("DISABLED", 2)])
+def test_graphs_on_cuda_are_plain_steps(mode: str, recorded: int) -> None:
     """Nearly everywhere: sums are made in any order there, and what touches something grows apart from then on."""
-    plain, graphs = (Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0") for _ in range(2))
+    plain, graphs = (
+        Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0", autoreset_mode=mode) for _ in range(2)
+    )
     plain._stepper = EagerStepper()
     actions = random_actions(plain, 12)
     for one in (plain, graphs):
@@ -178,4 +221,4 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
         for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/running/l"):
             apart = (x[name].float() - y[name].float()).abs().flatten()
             assert apart.quantile(0.95) < 1e-2, name
-    assert isinstance(graphs._stepper, CapturedStepper) and len(graphs._stepper._graphs._recorded) == 4
+    assert isinstance(graphs._stepper, CapturedStepper) and len(graphs._stepper._graphs._recorded) == recorded

@@ -145,6 +145,8 @@ class PEARL(MTSAC):
         self.bounds[0] = torch.where(over[:, None], self.bounds[1], self.bounds[0])
         self.bounds[1] = torch.where(over[:, None], self.replay.added, self.bounds[1])
         self.played.masked_fill_(over, 0)
+        # Here the host waits for a GPU. Posteriors of all environments would need no wait, but would pass ``context``
+        # transitions per environment through the encoder in each step.
         rows = ended.nonzero().squeeze(1)
         if len(rows):
             mean, std = self.policy.posterior(self._shown(rows, torch.ones_like(rows), self.played[rows]))
