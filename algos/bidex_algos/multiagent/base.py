@@ -19,7 +19,7 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.mtppo import Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig
 from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig, mini_batches
 from bidex_algos.rollout import check_samples
 from bidex_meta.errors import BidexError

@@ -19,7 +19,7 @@ from bidex_algos.multiagent.base import (
     OwnAdams,
     Sequential,
 )
-from bidex_algos.onpolicy.mtppo import Batch
+from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import mini_batches, policy_loss
 from bidex_meta.training.distributed import sum_gradients
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.multiagent.base import LIFT, PAPER, AgentBatch, InTurnConfig, MultiAgentConfig, Sequential
-from bidex_algos.onpolicy.mtppo import Batch
+from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.mttrpo import MTTRPOConfig, gaussian_step, kl_from_itself
 from bidex_meta.utils.validation import Positive
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgentPPOConfig, OwnAdams
 from bidex_algos.nets.networks import autocast, gaussian_log_prob
-from bidex_algos.onpolicy.mtppo import Batch
+from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, mini_batches, policy_loss
 from bidex_meta.training.distributed import sum_gradients
 

@@ -12,7 +12,7 @@ from bidex_algos.nets.architecture import NetworkConfig
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
-from bidex_algos.onpolicy.mtppo import OnPolicyConfig
+from bidex_algos.onpolicy.base import OnPolicyConfig
 from bidex_meta.world.agent_views import AgentView
 
 

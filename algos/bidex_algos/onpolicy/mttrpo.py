@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.networks import Autocast, autocast, gaussian_kl, gaussian_log_prob
-from bidex_algos.onpolicy.mtppo import Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig
 from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.trust_region import trust_region_step
 from bidex_meta.training.distributed import all_sum, sum_gradients
