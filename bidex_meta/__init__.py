@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 from bidex_meta.clients.gymnasium_ids import register_ids
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import Suite, load_suite, suite_names
+from bidex_meta.suite import Suite
+from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.utils.gl_backend import set_aside_what_is_missing
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.rules import Randomisation, versioned_name
-from bidex_meta.suite import MOST_POINTS, OTHER_SEED, OTHERS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
+from bidex_meta.suite import MOST_POINTS, OTHER_SEED, OTHERS, SPLITS, ListedTask, Split, Suite, SuiteClass
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.task import ByClass, Task

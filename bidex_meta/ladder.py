@@ -1,7 +1,7 @@
 """Suites without a file, such as ``MT1-Switch-v2``, which shows its goals, and ``ML1-Switch-v2``, which hides them.
 
-``bidex_meta.suite`` makes these suites from the files of other suites. The door classes and Switch have goals of two
-angles. These classes also have suites with fewer different goals:
+``bidex_meta.suite_files`` makes these suites from the files of other suites. The door classes and Switch have goals of
+two angles. These classes also have suites with fewer different goals:
 
 - ``choice2``, such as ``ML1-Switch-choice2``: two tasks. Both angles are small, or both are large.
 - ``choice4``: four tasks. Each angle is small or large, independently of the other.

@@ -18,7 +18,8 @@ from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.ladder import parts_of
 from bidex_meta.metaworld import CustomML
-from bidex_meta.suite import V1, V2, suite_names
+from bidex_meta.rules import V1, V2
+from bidex_meta.suite_files import suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.task import Task
 

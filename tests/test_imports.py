@@ -20,6 +20,7 @@ ORDER = (
     ("utils",),
     ("ladder", "rules"),
     ("engine", "hands", "suite"),
+    ("suite_files",),
     ("config", "tasks"),
     ("runs", "world"),
     ("benchmark", "evaluation", "training", "viewer"),

@@ -12,7 +12,7 @@ from bidex_meta.cli import main
 from bidex_meta.evaluation import filming
 from bidex_meta.experiments.policies import checkpoint
 from bidex_meta.runs import RunFolder, read_metrics
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from tests.pages import ROOT
 
 _SMALL = ["--num-envs", "8", "--threads", "1", "--device", "cpu", "--points", "24", "--logger", "none"]

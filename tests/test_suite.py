@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.ladder import HIDDEN_NUMBERS, parts_of, rung_of
-from bidex_meta.suite import V1, V2, load_suite, suite_names
+from bidex_meta.rules import V1, V2
+from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.tasks import registry
 
 HEAD = """

@@ -24,7 +24,7 @@ from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.provenance import differences, versions_of
 from bidex_meta.runs.stored import FORMAT, read_study, study_text
-from bidex_meta.suite import load_suite, suite_names
+from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
 

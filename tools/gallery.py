@@ -13,8 +13,8 @@ from torch.overrides import TorchFunctionMode
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
+from bidex_meta.rules import V2
 from bidex_meta.runs import video
-from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import compile_scene

@@ -11,7 +11,9 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.suite import Suite, load_suite, plain_name, suite_names
+from bidex_meta.rules import plain_name
+from bidex_meta.suite import Suite
+from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.tasks import registry
 
 NAMESPACE = "bidex-meta"

@@ -20,7 +20,7 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Reference
-from bidex_meta.suite import Rules
+from bidex_meta.rules import Rules
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block

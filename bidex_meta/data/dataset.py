@@ -15,7 +15,7 @@ from msgspec import Meta
 from bidex_meta.data import other_formats, part_files, seals
 from bidex_meta.data.part_files import H5, Episode, Json
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.suite import V1, Rules
+from bidex_meta.rules import V1, Rules
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
 from bidex_meta.utils.memory import check_memory

@@ -12,7 +12,8 @@ from msgspec import Meta
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.entry_rows import ClassRow, class_row, faults_of_row, row_table
 from bidex_meta.runs.evaluations import ClassSummary
-from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
+from bidex_meta.suite import Suite
+from bidex_meta.suite_files import METAWORLD_SUITES, load_suite, suite_names
 from bidex_meta.utils.validation import Count, Few, NonNegative, Seed, Whole
 
 FORMAT = 3

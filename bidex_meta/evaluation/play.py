@@ -18,7 +18,7 @@ from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.suite import HELD_STEPS
+from bidex_meta.rules import HELD_STEPS
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import Seed

@@ -11,9 +11,9 @@ from bidex_meta.engine.choice import checked_device
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.experiments.conditions import say_differences
 from bidex_meta.experiments.learners import learner_kind
+from bidex_meta.rules import rules_apart
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.suite import rules_apart
 from bidex_meta.training.distributed import LostProcess
 from bidex_meta.training.launch import say
 from bidex_meta.utils.arguments import checked_arguments

@@ -10,9 +10,9 @@ from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.data.joined import check_touch
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.rules import V1, rules_apart
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.suite import V1, rules_apart
 from bidex_meta.tasks.registry import name_among
 from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability

@@ -19,7 +19,7 @@ from bidex_meta.experiments.submitting import Check, compared, judged, new_path,
 from bidex_meta.experiments.transfer_plan import suite_file
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.training.launch import say
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.plugins import short_name

@@ -17,9 +17,9 @@ from bidex_meta.evaluation.play import HeldAgent, RandomAgent, ZeroAgent, evalua
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import alignment, blind_ceiling, identifiability, listed_ceiling
 from bidex_meta.experiments.policies import load_policy, say_other_rules
+from bidex_meta.rules import plain_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import Json
-from bidex_meta.suite import plain_name
 from bidex_meta.training.launch import say
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import scripts_of

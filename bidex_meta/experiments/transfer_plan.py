@@ -21,10 +21,11 @@ from bidex_meta.experiments.learners import learner_kind
 from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.run_data import dataset_metadata
 from bidex_meta.experiments.sweep_plan import PlannedRun
+from bidex_meta.rules import V1, plain_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.runs.folder import AnyConfig
-from bidex_meta.suite import V1, Suite, SuiteClass, plain_name
+from bidex_meta.suite import Suite, SuiteClass
 from bidex_meta.training.launch import say
 from bidex_meta.utils.files import JsonObject, absolute, is_file, read_text
 from bidex_meta.utils.plugins import short_name

@@ -23,7 +23,7 @@ from bidex_meta.metaworld.library import (
     Single,
     make_tasks,
 )
-from bidex_meta.suite import metaworld_classes
+from bidex_meta.suite_files import metaworld_classes
 from bidex_meta.world.base import Transition
 from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import PooledWorld, State
@@ -33,10 +33,10 @@ from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 class MetaWorldWorld(ForeignWorld):
     """A world that runs one of Meta-World's suites on the CPU.
 
-    ``suite`` is a key of ``suite.METAWORLD_SUITES``. Observations are Meta-World's 39 numbers, which include the goal,
-    followed by the one-hot of the class. Rewards are Meta-World's "v2" rewards in [0, 10]. An episode has 500 steps and
-    ends only at the time limit. Start states are part of Meta-World's tasks, so an episode depends only on its task and
-    the actions. The variation of a task is its number among the class's fifty tasks.
+    ``suite`` is a key of ``suite_files.METAWORLD_SUITES``. Observations are Meta-World's 39 numbers, which include the
+    goal, followed by the one-hot of the class. Rewards are Meta-World's "v2" rewards in [0, 10]. An episode has 500
+    steps and ends only at the time limit. Start states are part of Meta-World's tasks, so an episode depends only on
+    its task and the actions. The variation of a task is its number among the class's fifty tasks.
 
     ``seed`` determines Meta-World's tasks. Until ``reset(seed=...)`` is called, it also determines which tasks are
     drawn. Other keywords are those of ``World``. Raises BidexError for an unknown suite or mode, for fewer environments

@@ -12,7 +12,8 @@ from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V1, V2, Split, Suite, SuiteClass, plain_name, versioned_name
+from bidex_meta.rules import V1, V2, plain_name, versioned_name
+from bidex_meta.suite import Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 from bidex_meta.utils.arguments import checked_arguments
 

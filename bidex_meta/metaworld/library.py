@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
 
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import metaworld_classes
+from bidex_meta.suite_files import metaworld_classes
 
 TASKS_PER_CLASS = 50
 OBSERVATION_SIZE = 39

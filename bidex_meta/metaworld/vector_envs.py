@@ -16,7 +16,8 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
-from bidex_meta.suite import V1, known_suite, load_suite, plain_name, versioned_name
+from bidex_meta.rules import V1, plain_name, versioned_name
+from bidex_meta.suite_files import known_suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments

@@ -21,12 +21,13 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Pixels, Whole, true_or_false, whole_number
 from bidex_meta.world.checked import one_row
+from bidex_meta.world.config import WorldConfig
 from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.episodes import check_single_reset
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
-from bidex_meta.world.world import World, WorldConfig
+from bidex_meta.world.world import World
 
 _FAR = 2**31
 

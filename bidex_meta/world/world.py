@@ -5,7 +5,7 @@ An observation is made in these steps: ``Part.advance`` (engine) -> ``sensordata
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from msgspec import Meta
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError, shortened
+from bidex_meta.errors import BidexError
 from bidex_meta.rules import CONTROL_RATE, Randomisation
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.arguments import check_argument
@@ -26,17 +26,16 @@ from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Outcome, Slots
+from bidex_meta.world.config import WorldConfig
 from bidex_meta.world.contract import Info, Options, State, Step
-from bidex_meta.world.depth_sensor import PointsRule
-from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.graphs import CapturedStepper, SideBySide
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.hidden_parts import HiddenParts
-from bidex_meta.world.observations import Rule, observation_groups
+from bidex_meta.world.observations import observation_groups
 from bidex_meta.world.part import Part, base_rotations, collect
 from bidex_meta.world.random import env_keys, uniform
 from bidex_meta.world.randomiser import Randomiser, deviations
-from bidex_meta.world.rendering import MOST_PIXELS, Painter
+from bidex_meta.world.rendering import Painter
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import keep_freed_memory
 
@@ -45,62 +44,6 @@ _MOST_COLUMNS = 1_000_000
 _NOTHING = vars(Randomisation())
 _STATE = ("_action", "_past", "_obs", "task_index")
 """Attributes that a step changes, in addition to the episodes' counters."""
-
-
-@dataclass(frozen=True)
-class WorldConfig:
-    """Options of a world, independent of its slots.
-
-    Attributes:
-        num_envs: Number of environments, split evenly over slots; None: 1024 on the CPU, 8192 on an accelerator.
-        device: "cpu", "auto" (CUDA if there is one) or a CUDA device, e.g. "cuda:0".
-        engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": the faster one on the device.
-        deterministic: Make physics on a GPU repeat bit for bit; on a CPU it always does.
-        switches: Changes of the physics that are on trial, such as "incremental" (``engine.switches.Switches``).
-        seed: Seed of all random draws.
-        autoreset_mode: SAME_STEP (training), NEXT_STEP (training by Gymnasium's tools) or DISABLED (evaluation), as a
-            member or its name.
-        observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
-        pad_to: Number of observation entries before the task id; None: the number of the widest class.
-        task_sampling: "uniform": each autoreset draws a task of the pool; "fixed": environment j keeps task j mod n;
-            "fresh": each episode draws a new task of its class's space; in DISABLED mode this means "fixed".
-        episodes_per_task: Number of consecutive episodes that play one task, if episodes draw tasks.
-        threads: Engine threads; None: all CPUs. Trajectories do not depend on the number.
-        stagger: If true, first episodes in SAME_STEP mode begin at random elapsed steps, so that they do not end
-            together; they do not count in ``episode``. If false, first episodes begin at 0.
-        points: Point cloud before the task id, in place of the objects' states; None: observations show the states.
-        randomisation: Factors that are drawn for environments, and noise that is added; None: neither.
-        pixels: Edge, in pixels, of the square pictures in ``info["pixels"]`` from the classes' cameras; 0: no pictures.
-
-    Raises BidexError for an unknown sampling or observation, a seed below 0, pictures that are too large, or several
-    episodes per task if environments keep their tasks.
-    """
-
-    num_envs: int | None = None
-    device: str | torch.device = "cpu"
-    engine: str = "auto"
-    deterministic: bool = False
-    switches: str = ""
-    seed: int = 0
-    autoreset_mode: str | AutoresetMode | None = None
-    observation: Rule = "plain"
-    pad_to: int | None = None
-    task_sampling: str = "fixed"
-    threads: int | None = None
-    stagger: bool = True
-    points: PointsRule | None = None
-    randomisation: Randomisation | None = None
-    pixels: int = 0
-    episodes_per_task: int = 1
-
-    def __post_init__(self) -> None:
-        checked.choices(self.task_sampling, self.observation, self.points)
-        checked.seed(self.seed)
-        whole_number("pixels", self.pixels, 0, MOST_PIXELS)
-        checked.episodes_per_task(self.episodes_per_task, self.task_sampling, checked_mode(self.autoreset_mode))
-        if self.randomisation is not None and not isinstance(self.randomisation, Randomisation):
-            mend = "Write Randomisation(friction=(0.7, 1.3)), of bidex_meta.suite."
-            raise BidexError(f"randomisation: expected a Randomisation, got {shortened(self.randomisation)}. {mend}")
 
 
 class World(BatchedWorld):

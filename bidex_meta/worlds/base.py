@@ -11,7 +11,8 @@ from bidex_meta.evaluation.eval_protocol import EVALUATION_SEED, Protocol
 from bidex_meta.evaluation.references import Reference, references_for
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.rules import Rules
-from bidex_meta.suite import OTHER_SEED, Suite, load_randomisation
+from bidex_meta.suite import OTHER_SEED, Suite
+from bidex_meta.suite_files import load_randomisation
 from bidex_meta.utils.files import Json
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.eval_protocol import Protocol
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.suite import metaworld_classes
+from bidex_meta.suite_files import metaworld_classes
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.worlds.base import Identity, Worlds, WorldsConfig
 

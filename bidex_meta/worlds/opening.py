@@ -6,7 +6,8 @@ from itertools import chain
 from bidex_meta.errors import BidexError
 from bidex_meta.ladder import RUNGS, rung_of
 from bidex_meta.rules import plain_name
-from bidex_meta.suite import METAWORLD_SUITES, SPLITS, known_suite, load_suite, suite_names
+from bidex_meta.suite import SPLITS
+from bidex_meta.suite_files import METAWORLD_SUITES, known_suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.utils.files import Json
 from bidex_meta.worlds.base import Worlds, WorldsConfig

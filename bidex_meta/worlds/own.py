@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, cast
 
 from bidex_meta.errors import BidexError
 from bidex_meta.rules import V1, V2, Rules, plain_name
-from bidex_meta.suite import Split, Suite, load_suite
+from bidex_meta.suite import Split, Suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import V2_PRESET, Identity, Worlds, WorldsConfig

@@ -10,8 +10,8 @@ from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import run_data
 from bidex_meta.experiments.policies import checkpoint, policy_of
+from bidex_meta.rules import V1, V2
 from bidex_meta.runs import RunFolder
-from bidex_meta.suite import V1, V2
 from bidex_meta.utils import paths
 from bidex_meta.worlds import open_worlds
 from tests.fakes import trained_run

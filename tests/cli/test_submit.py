@@ -26,7 +26,8 @@ from bidex_meta.evaluation.leaderboard import (
 from bidex_meta.experiments import submitted_runs, submitting
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
-from bidex_meta.suite import Suite, load_suite
+from bidex_meta.suite import Suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.utils.files import portable
 from bidex_meta.utils.validation import parse
 from bidex_meta.worlds.own import OwnSuite

@@ -37,9 +37,10 @@ from bidex_meta.experiments.transfer_plan import (
     some_of,
     suite_file,
 )
+from bidex_meta.rules import V2, Rules, plain_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.checkpoints import weights_digest
-from bidex_meta.suite import V2, Rules, load_suite, plain_name
+from bidex_meta.suite_files import load_suite
 from bidex_meta.worlds import WorldsConfig, open_worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import toy

@@ -12,7 +12,7 @@ from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.experiments import catalogue
 from bidex_meta.experiments.learners import ALGOS, learner_kind
-from bidex_meta.suite import suite_names
+from bidex_meta.suite_files import suite_names
 from bidex_meta.tasks import registry
 
 

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from bidex_meta import Benchmark
 from bidex_meta.clients.trial_env import TrialEnv, TrialWorld
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from tests.world.play import random_actions
 
 SUITE = "ML1-CatchUnderarm-v2"

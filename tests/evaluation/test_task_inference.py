@@ -11,7 +11,7 @@ from bidex_meta.cli import main
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability, listed_ceiling
 from bidex_meta.experiments import suite_validity
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.aligned import Error
 from bidex_meta.world import World

@@ -21,7 +21,7 @@ from bidex_meta.metaworld import batched
 from bidex_meta.metaworld import library as client
 from bidex_meta.metaworld.batched import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.runs import RunFolder
-from bidex_meta.suite import METAWORLD_SUITES
+from bidex_meta.suite_files import METAWORLD_SUITES
 from tests.world.play import assert_same, play
 
 ROWS = 6

@@ -24,7 +24,7 @@ from bidex_meta import Benchmark, Task
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
-from bidex_meta.suite import V2
+from bidex_meta.rules import V2
 from bidex_meta.world.single_env import SuiteEnv
 
 BOTH = pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 from bidex_meta import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.evaluation.play import RandomAgent, evaluate
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.worlds import open_worlds

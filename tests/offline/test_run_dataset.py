@@ -19,7 +19,7 @@ from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.run_data import implied
 from bidex_meta.runs import RunFolder
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup

@@ -16,7 +16,7 @@ from bidex_meta import Benchmark
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent, evaluate
-from bidex_meta.suite import load_suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks.task import Task
 from tests.fakes import ToyWorld
 from tests.robust import damage

@@ -35,6 +35,7 @@ from bidex_meta.experiments.transferring import transfer
 from bidex_meta.experiments.verifying import verify
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
+from bidex_meta.rules import Randomisation, Rules
 from bidex_meta.runs import (
     Checkpoints,
     MetricsWriter,
@@ -44,7 +45,7 @@ from bidex_meta.runs import (
     read_metrics,
     training_seconds,
 )
-from bidex_meta.suite import Randomisation, Rules, load_randomisation, metaworld_classes
+from bidex_meta.suite_files import load_randomisation, metaworld_classes
 from bidex_meta.tasks.base import Solver
 from bidex_meta.tasks.layout import Block, Layout, goal_blocks, object_blocks
 from bidex_meta.tasks.placement import placed

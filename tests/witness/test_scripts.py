@@ -6,7 +6,7 @@ import torch
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import V2
+from bidex_meta.rules import V2
 from bidex_meta.tasks.articulated import Switch
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.catches import HandOver

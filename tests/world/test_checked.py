@@ -11,7 +11,8 @@ import torch
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import Randomisation, load_suite
+from bidex_meta.rules import Randomisation
+from bidex_meta.suite_files import load_suite
 from bidex_meta.utils import paths
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.worlds.humanoid import HumanoidWorld

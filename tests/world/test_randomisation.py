@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from bidex_meta import Benchmark, BidexError, load_suite, make_task_world
 from bidex_meta.engine.models import differing_fields
-from bidex_meta.suite import FACTORS, Randomisation, load_randomisation
+from bidex_meta.rules import FACTORS, Randomisation
+from bidex_meta.suite_files import load_randomisation
 from bidex_meta.world import World
 from bidex_meta.worlds import open_worlds
 from tests.world.play import assert_same, engine_state, flat, number_of_ends, play, random_actions

@@ -18,7 +18,8 @@ from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.runs import RunFolder
-from bidex_meta.suite import Suite, load_suite
+from bidex_meta.suite import Suite
+from bidex_meta.suite_files import load_suite
 from bidex_meta.world import World
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.worlds import WorldsConfig, open_worlds

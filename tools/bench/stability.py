@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark, make_task_world
+from bidex_meta.rules import V2
 from bidex_meta.runs.atomic import Json
-from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
