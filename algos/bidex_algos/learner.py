@@ -80,6 +80,8 @@ class Learner(Contract):
         self.env_steps = 0
         self.shape = Shape.of(world)
         check_options(self.name, config, world, self.shape)
+        if isinstance(config, LearnerConfig):
+            config.check_environments(world.num_envs, _train_tasks(world))
         check_discounts(self.name, world, Capability.DISCOUNTS_BY_CLASS in self.capabilities)
         self.inputs = self._inputs(config, self.shape)
         # Weights are drawn from a CPU generator, so that a seed gives the same network on every device.
@@ -241,6 +243,13 @@ class Learner(Contract):
                 f"{self.name}: the checkpoint's world had {what}{there}, this one has {here}. Resume with the run's "
                 "own suite and num_envs."
             )
+
+
+def _train_tasks(world: VectorWorld) -> dict[str, int]:
+    """Return the number of tasks of each slot of a world; 0 stands for new tasks in each episode or trial."""
+    if getattr(world, "endless", False):
+        return dict.fromkeys(world.task_names, 0)
+    return dict(zip(world.task_names, getattr(world, "num_slot_tasks", [1] * world.num_tasks), strict=True))
 
 
 def _saved(part: Any) -> Any:

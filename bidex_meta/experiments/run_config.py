@@ -13,7 +13,7 @@ from bidex_meta.experiments.conditions import check_worlds_of
 from bidex_meta.experiments.learners import choose_preset, learner_kind, resolve_device
 from bidex_meta.runs.folder import AnyConfig, RunFolder
 from bidex_meta.training.launch import launch, resume_command
-from bidex_meta.training.learner import Capability
+from bidex_meta.training.learner import Capability, LearnerConfig
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
 from bidex_meta.worlds import open_worlds
@@ -91,6 +91,8 @@ def check(config: AnyConfig, with_memory: bool = True) -> None:
     run_data.check_offline(kind, config.record, run_data.open_datasets(config.dataset), worlds)
     run_data.check_demonstrations(kind, config.demonstrations, worlds)
     run_teachers.check_teachers(kind, config, worlds)
+    if isinstance(config.learner, LearnerConfig):
+        config.learner.check_environments(config.num_envs, worlds.train_tasks())
     if with_memory and config.device.startswith("cpu"):
         of_learner = kind.make.bytes_held(config.learner, config.num_envs, _WIDTH + 3 * config.points)
         needed = launch().local_count * (of_learner + config.num_envs * (ROW_BYTES + config.points * POINT_BYTES))

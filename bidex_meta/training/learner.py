@@ -42,6 +42,13 @@ class LearnerConfig(Checked):
         """
         return 0
 
+    def check_environments(self, num_envs: int, tasks: Mapping[str, int]) -> None:
+        """Raise BidexError if the learner needs more environments, or other numbers of train tasks.
+
+        ``num_envs`` environments are split evenly over the classes. ``tasks`` are the numbers of train tasks by class;
+        0 stands for new tasks in each episode or trial. A sweep checks all its runs before the first one begins.
+        """
+
 
 @dataclass(frozen=True)
 class Sources:

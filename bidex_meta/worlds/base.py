@@ -111,6 +111,10 @@ class Worlds(ABC):
     def tasks(self, split: str) -> dict[str, list[str]]:
         """Return, by slot, the names of the tasks in a split's pools; the dict is empty if the split has no tasks."""
 
+    def train_tasks(self) -> dict[str, int]:
+        """Return the number of train tasks of each slot; 0 stands for a new task in each episode or trial."""
+        return {name: len(tasks) for name, tasks in self.tasks("train").items()}
+
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
         """Return the classes of the train split by name; raises BidexError for classes of another library."""

@@ -57,6 +57,12 @@ class OwnSuite(Worlds):
         """Return the task names that the file lists, or numbers if it lists none; see ``Worlds``."""
         return self.suite.task_names(cast(Split, split))
 
+    def train_tasks(self) -> dict[str, int]:
+        """See ``Worlds``."""
+        if self.suite.train_tasks == 0:
+            return dict.fromkeys(self.tasks("train"), 0)
+        return super().train_tasks()
+
     def task_classes(self) -> "dict[str, TaskClass]":
         """See ``Worlds``."""
         return self.benchmark.task_classes()

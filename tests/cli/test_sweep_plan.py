@@ -120,6 +120,17 @@ def test_a_bad_file_is_one_line(runs, change: tuple[str, str], told: str) -> Non
         runs(FILE, *change)
 
 
+TOO_FEW = (
+    ('arms = [{ name = "x", algo = "pearl", suites = ["ML1-v2"] }]', "CatchUnderarm has 50 tasks and 8 environments"),
+    (
+        'arms = [{ name = "x", algo = "rl2", suites = ["ML5-v2"], overrides = { num_envs = 2 } }]',
+        "4 mini-batches need as many environments, got 2",
+    ),
+    ('arms = [{ name = "x", algo = "maml", suites = ["ML4-v2"] }]', "has 2 environments for 3 tasks of a meta-batch"),
+)
+"""Arms of learners that need more environments than FILE has."""
+
+
 def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, refused) -> None:
     monkeypatch.chdir(tmp_path)
     for change, told in (
@@ -127,6 +138,7 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
         (('"HandOver"', '"HandOvr"'), "Unknown task 'HandOvr'"),
         (("steps = 6", 'learner = { gama = "x" }'), "sets gama, which this version of ppo does not have"),
         (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
+        *[(('algos = ["ppo"]', line), told) for line, told in TOO_FEW],
     ):
         Path("s.toml").write_text(FILE.replace(*change))
         error = refused("sweep", "s.toml")

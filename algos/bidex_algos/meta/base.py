@@ -174,16 +174,6 @@ class MetaLearner(Learner):
         # Tasks are drawn from these pools, because the world's own pools will hold the tasks of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
         self.endless = getattr(world, "endless", False)
-        counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
-        for name, count, pool in zip(world.task_names, counts, self.pools, strict=True):
-            tasks = config.tasks_per_class
-            if not self.endless:
-                tasks = min(tasks, len(pool))
-            if count < tasks:
-                raise BidexError(
-                    f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
-                    f"at least {tasks * world.num_tasks}, or lower tasks_per_class."
-                )
         self.tasks_generator = torch.Generator().manual_seed(seed)
         self.rows = TaskRows(world.task_id)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)

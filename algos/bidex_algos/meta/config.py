@@ -1,11 +1,13 @@
 """The options of every gradient-based meta-learner; imports no torch, so that a command line can show them quickly."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from bidex_algos.meta.adaptation import Adapted, StepSizeKind
 from bidex_algos.nets.architecture import Options, network_bytes
 from bidex_algos.nets.networks import Activation, Layers
+from bidex_meta.errors import BidexError
 from bidex_meta.training.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
@@ -49,6 +51,18 @@ class MetaConfig(LearnerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
+
+    def check_environments(self, num_envs: int, tasks: Mapping[str, int]) -> None:
+        """Raise BidexError if a class has fewer environments than tasks of a meta-batch."""
+        share, rest = divmod(num_envs, len(tasks))
+        for place, (name, count) in enumerate(tasks.items()):
+            rows = share + (place < rest)
+            batch = min(self.tasks_per_class, count or self.tasks_per_class)
+            if rows < batch:
+                raise BidexError(
+                    f"{self.algo}: {name} has {rows} environments for {batch} tasks of a meta-batch. Use num_envs of "
+                    f"at least {batch * len(tasks)}, or lower tasks_per_class."
+                )
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""

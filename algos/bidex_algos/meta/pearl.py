@@ -8,6 +8,7 @@ critics' loss and the divergence from the prior. See docs/learners/pearl.md.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -52,6 +53,22 @@ class PEARLConfig(MTSACConfig):
     value_heads: bool = False  # Give each critic one output per class; the latent then need not identify the class.
     replay_steps: Count = 4000  # Vector steps that the replay keeps, if replay_memory allows.
     updates_per_step: Count = 1  # Updates of all networks after each vector step.
+
+    def check_environments(self, num_envs: int, tasks: Mapping[str, int]) -> None:
+        """Raise BidexError if a task would have no environment, or if tasks are new in each episode."""
+        if 0 in tasks.values():
+            raise BidexError(
+                "pearl: expected a fixed number of train tasks, because it replays transitions by task, got "
+                "tasks_per_class 0. Use --tasks-per-class 100 or another number, and as many environments per class."
+            )
+        share, rest = divmod(num_envs, len(tasks))
+        for place, (name, count) in enumerate(tasks.items()):
+            rows = share + (place < rest)
+            if rows < count:
+                raise BidexError(
+                    f"pearl: {name} has {count} tasks and {rows} environments, each of which keeps its task. Raise "
+                    f"num_envs to {max(tasks.values()) * len(tasks)}."
+                )
 
 
 # The preset v2 uses MT-PPO's discount.
@@ -223,19 +240,5 @@ class PEARL(MTSAC):
 
 
 def _tasks(world: TaskWorld) -> Tensor:
-    """Return the task number of each environment, (N,), counted over all classes.
-
-    Raises BidexError if a task has no environment, or if the world draws new tasks in each episode.
-    """
-    if getattr(world, "endless", False):
-        raise BidexError(
-            "pearl: expected a fixed number of train tasks, because it replays transitions by task, got "
-            "tasks_per_class 0. Use --tasks-per-class 100 or another number, and as many environments per class."
-        )
-    for name, rows, tasks in zip(world.task_names, world.slot_env_ids, world.num_slot_tasks, strict=True):
-        if rows.stop - rows.start < tasks:
-            raise BidexError(
-                f"pearl: {name} has {tasks} tasks and {rows.stop - rows.start} environments, each of which keeps its "
-                f"task. Raise num_envs to {max(world.num_slot_tasks) * world.num_tasks}."
-            )
+    """Return the task number of each environment, (N,), counted over all classes."""
     return world.task_id * max(world.num_slot_tasks) + world.task_index

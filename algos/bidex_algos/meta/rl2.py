@@ -6,6 +6,7 @@ starts with an empty memory. The first trial is only used to measure statistics.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +70,14 @@ class RL2Config(PPOConfig):
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
+    def check_environments(self, num_envs: int, tasks: Mapping[str, int]) -> None:
+        """Raise BidexError if there are fewer environments than mini-batches."""
+        if num_envs < self.num_minibatches:
+            raise BidexError(
+                f"{self.algo}: {self.num_minibatches} mini-batches need as many environments, got {num_envs}. Raise "
+                "num_envs or lower num_minibatches."
+            )
+
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Estimate the memory that the learner takes, in bytes, if it stores ``width`` numbers per environment step."""
         memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + self.hidden[-1])
@@ -120,11 +129,6 @@ class RL2(TrialLearner):
 
     def __init__(self, world: PooledWorld, config: RL2Config, seed: int):
         super().__init__(world, config, seed)
-        if world.num_envs < config.num_minibatches:
-            raise BidexError(
-                f"rl2: {config.num_minibatches} mini-batches need as many environments, got {world.num_envs}. Raise "
-                "num_envs or lower num_minibatches."
-            )
         heads = world.num_tasks if config.value_heads else 1
         self.critic = self._make_critic(heads).to(self.device)
         self.adams = AdaptiveAdams(
