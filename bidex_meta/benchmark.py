@@ -5,7 +5,6 @@ names, so that code for Meta-World also runs here.
 """
 
 import hashlib
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Literal, cast
@@ -126,14 +125,24 @@ class Benchmark:
 
     @property
     def others(self) -> "Benchmark":
-        """Return the same suite with the same number of unseen tasks.
+        """Return the same suite with unseen tasks.
 
-        These tasks are drawn with a seed that no run uses for training.
+        They are the listed test tasks of classes that list some. Otherwise there are as many as train tasks, drawn with
+        a seed that no run uses for training. Raises BidexError if the suite lists all its tasks, and no test tasks.
         """
-        suite = self.suite
-        if suite.train_tasks == 0:
-            suite = replace(suite, train_tasks=None)
-        return Benchmark(suite, self.seed + OTHER_SEED)
+        return self.with_new_tasks(self.seed + OTHER_SEED)
+
+    def with_new_tasks(self, seed: int) -> "Benchmark":
+        """Return the same suite with unseen tasks, as ``others`` does, but drawn with ``seed``."""
+        found = Benchmark(self.suite.unseen(), seed)
+        known = set(self.train_tasks)
+        for task in found.train_tasks:
+            if task in known:
+                raise BidexError(
+                    f"{self.name}: expected a suite with unseen tasks of its train classes, but it lists all tasks of "
+                    f"{task.env_name}. Leave unseen tasks out: play the train or test tasks."
+                )
+        return found
 
     @property
     def padded_size(self) -> int:
@@ -168,8 +177,7 @@ class Benchmark:
         training world keeps each drawn task for that number of episodes.
 
         Args:
-            split: `"train"`, `"test"`, or `"others"`: the same number of unseen tasks of the train classes, drawn with
-                a seed that no run trains with.
+            split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes; see the property `others`.
             num_envs: Number of environments, divided evenly among the classes; None: 1024 on the CPU, 8192 on an
                 accelerator.
             device: `"auto"` (CUDA if there is a GPU), `"cpu"`, `"cuda"`, ... or a `torch.device`.

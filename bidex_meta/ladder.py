@@ -145,13 +145,12 @@ class Parts(NamedTuple):
 
         The tasks of a split are evenly spaced over the class's range of angles. Test tasks lie midway between train
         tasks. The order is not that of the angles, because evaluations may play only the first tasks. A suite that
-        shows its goals has only train tasks.
+        shows its goals plays the test tasks only as unseen tasks.
         """
-        splits = ("train",) if self.shows_goals else ("train", "test")
         tasks = []
         for place in range(_SHARED_TASKS):
             number = place * _STRIDE % _SHARED_TASKS
-            for split in splits:
+            for split in ("train", "test"):
                 share = (number + 0.25 + 0.5 * (split == "test")) / _SHARED_TASKS
                 angle = choice.lowest + share * (choice.highest - choice.lowest)
                 tasks.append((f"{split}-{number:02}", split, {choice.first: angle, choice.second: angle}))

@@ -147,6 +147,15 @@ class Suite:
             slots |= {f"{name}/{task}": [task] for task in pool}
         return slots
 
+    def unseen(self) -> "Suite":
+        """Return the suite with unseen tasks as the train tasks of its train classes.
+
+        If a class lists test tasks, these are its unseen tasks. Any other task depends on the seed, apart from the
+        components that the file lists.
+        """
+        train_tasks = self.train_tasks or None
+        return replace(self, classes=tuple(map(_unseen, self.classes)), train_tasks=train_tasks)
+
     def with_train_tasks(self, count: int | None) -> "Suite":
         """Return the suite with ``train_tasks`` replaced; None leaves the suite unchanged.
 
@@ -188,6 +197,13 @@ def _without_version(suite: Suite, entry: SuiteClass) -> SuiteClass:
         mend = f'Write name = "{plain}", and for version 2 of the whole suite {rules}.'
         raise error(suite.file, "classes", "names without a version in a suite of other rules", entry.class_name, mend)
     return replace(entry, name=plain_name(entry.name), class_name=plain)
+
+
+def _unseen(entry: SuiteClass) -> SuiteClass:
+    held_out = [replace(task, split="both") for task in entry.tasks if task.split == "test"]
+    if held_out and "train" in entry.splits:
+        return replace(entry, tasks=tuple(held_out))
+    return entry
 
 
 def check_drawn(name: str, classes: tuple[SuiteClass, ...], count: int) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_type_hints
 
 import tyro
 
@@ -124,6 +124,11 @@ def parse(
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
+        # tyro may take a flag that it does not know for a positional argument, and then complains about that.
+        known = {*_flags(options if default is None else default), "--help", "--help-all"}
+        for word in arguments:
+            if word.startswith("--") and len(word) > 2 and word.split("=")[0] not in known:
+                _refuse(word, options if default is None else default, command)
         raise BidexError(f"{_one_line(complaint.getvalue())}. See bidex-meta {command} --help.") from None
     if unknown:
         _refuse(unknown[0], options if default is None else default, command)
@@ -212,8 +217,14 @@ def _near(flag: str, known: list[str]) -> list[str]:
 
 
 def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
-    """Yield every flag of a dataclass and of the dataclasses that it holds."""
+    """Yield every flag of a dataclass and of the dataclasses that it holds; positional arguments are no flags."""
+    hints = get_type_hints(options if isinstance(options, type) else type(options), include_extras=True)
     for field in dataclasses.fields(options):
+        marks = getattr(hints[field.name], "__metadata__", ())
+        if tyro.conf.Positional in marks:
+            continue
+        for mark in marks:
+            yield from getattr(mark, "aliases", None) or ()
         name = field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
         if dataclasses.is_dataclass(value):

@@ -148,7 +148,7 @@ class FinalEvaluation:
     """Episodes of each task in the final evaluation. None: 4, or 1 if a task has a fixed start (metaworld/...); for
     learners that adapt, the number of --rollouts."""
     other_tasks: Switch = False
-    """In the final evaluation, also play an equal number of tasks that the run was not trained on. For learners that
+    """In the final evaluation, also play tasks of the train classes that the run was not trained on. For learners that
     adapt, use --split others instead."""
     split: Played = "auto"
     """Tasks of the final evaluation of learners that adapt (maml, promp, rl2, ...). auto: train and test tasks (on
@@ -168,6 +168,8 @@ class FinalEvaluation:
                 raise BidexError(f"{config.algo} adapts: --split others plays unseen tasks of its train classes.")
             metatest.splits_of(open_worlds(config.to_json()), self.split)
             return
+        if self.other_tasks:
+            _ = open_worlds(config.to_json()).others  # raises BidexError if there are no unseen tasks
         if self.hidden_rewards:
             raise BidexError(f"{config.algo} does not adapt to tasks, got --hidden-rewards. Leave it out.")
         for name in ("split", "shots", "rollouts", "tasks"):
@@ -242,12 +244,12 @@ def evaluate(
         beside = ", and the same of a random policy"
     else:
         beside = ""
+    unseen = worlds.others if other_tasks else None
     say(f"Evaluating: {count} episode{'s' * (count > 1)} of each task{beside}.")
     own = _played(worlds, policy, split, size, random)
-    if other_tasks:
-        others = _played(worlds.others, policy, split, size, random)
-    else:
-        others = None
+    others = None
+    if unseen is not None:
+        others = _played(unseen, policy, split, size, random)
     found = RunEvaluation(folder, config.algo, worlds, steps, own, others, conditions(worlds, num_envs))
     if save:
         write_evaluation(folder.evaluation_path, found.record())

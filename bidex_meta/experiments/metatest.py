@@ -184,10 +184,12 @@ def check_worlds(worlds: Worlds, name: str) -> None:
 def splits_of(worlds: Worlds, asked: str) -> list[str]:
     """Return the splits that a meta-test plays: the named split, all splits for ``auto``, two for ``unseen``.
 
-    Raises BidexError for another word, and for a split that the worlds do not have.
+    Raises BidexError for another word, and for a split or unseen tasks that the worlds do not have.
     """
     if asked not in get_args(Played):
         raise BidexError(f"split: expected one of {', '.join(get_args(Played))}, got {shortened(asked)}.")
+    if asked in (OTHERS, "unseen"):
+        _ = worlds.others  # raises BidexError if there are no unseen tasks
     if asked == OTHERS:
         return [OTHERS]
     wanted = "test" if asked == "unseen" else asked

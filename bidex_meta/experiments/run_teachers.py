@@ -13,6 +13,7 @@ from bidex_meta.experiments import run_data
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.experiments.policies import checkpoint, policy_of, slots_of
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.versions import read_versions
 from bidex_meta.training.launch import launch, say
 from bidex_meta.training.learner import Capability
 from bidex_meta.witness.demonstrators import Scripted
@@ -147,7 +148,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
         rows = _rows(world, slots, learn)
         if name != SCRIPTS and len(rows):
             folder = RunFolder.open(Path(name))
-            state, _ = checkpoint(folder)
+            state, steps = checkpoint(folder)
             policy = policy_of(folder, state, device)
             origin = {"algo": folder.config().algo, "policy": state["learner"]["policy"]}
             other = open_worlds(folder.config().to_json())
@@ -160,7 +161,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
                 their = _same_classes(classes, other.task_classes())
                 names = [their[slots[i]] for i in world.task_id[rows].tolist()]
                 more = _appended(other, names, width).to(world.device)
-            tutors.append(Tutor(policy, rows, width, more, origin))
+            tutors.append(Tutor(policy, rows, width, more, origin, (name, steps)))
     if untaught := [task for task in classes if task not in assigned]:
         rest = ", and not learned" * (Capability.TAUGHT in learner_kind(config.algo).make.capabilities)
         say(f"Without a teacher{rest}: {', '.join(untaught)}.")
@@ -173,6 +174,23 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
     mask = torch.zeros(world.num_envs, dtype=torch.bool)
     mask[_rows(world, slots, scripted)] = True
     return Teachers(world, tutors, Scripted(inner, names=names), mask, privileged)
+
+
+def steps_of(teachers: Teachers) -> list[int]:
+    """Return the environment steps of each run that teaches, in the order of the tutors."""
+    return [tutor.trained[1] for tutor in teachers.tutors if tutor.trained is not None]
+
+
+def check_same(folder: RunFolder, teachers: Teachers) -> None:
+    """Raise BidexError if a teacher of a resumed run has trained on since the run began."""
+    before = read_versions(folder.path).get("teacher_steps")
+    for was, tutor in zip(before or (), teachers.tutors, strict=False):
+        if tutor.trained is not None and tutor.trained[1] != was:
+            name, steps = tutor.trained
+            raise BidexError(
+                f"{folder.path}: its teacher {name} had {was:,} steps when the run began, and has {steps:,} now. A run "
+                "keeps its teachers: copy the teacher's old checkpoint back, or start a new run."
+            )
 
 
 def _appended(other: OwnSuite, names: Sequence[str], width: int) -> Tensor:

@@ -198,7 +198,7 @@ def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, de
     if episodes is None:
         episodes = _EPISODES if track == MULTI_TASK else _EPISODES_OF_TRIALS
     seed = evaluation_seed(run.weights for run in runs)
-    worlds = [_worlds(run.config, seed, device) for run in runs]
+    worlds = [_worlds(run.config, seed, device, track) for run in runs]
     parts = {}
     for place, name in enumerate(("own", "new")):
         played = []
@@ -219,14 +219,17 @@ def _played(runs: Sequence[SubmittedRun], track: Track, episodes: int | None, de
     }  # fmt: skip
 
 
-def _worlds(stored: RunConfig, seed: int, device: str) -> tuple[Worlds, Worlds]:
-    """Open the suite of a run twice: with the tasks that the run was trained on, and with the same number of new tasks.
+def _worlds(stored: RunConfig, seed: int, device: str, track: str) -> tuple[Worlds, Worlds]:
+    """Open the suite of a run twice: with the tasks that the run was trained on, and with new tasks.
 
-    ``seed`` draws the new tasks.
+    ``seed`` draws the new tasks. Raises BidexError in the multi-task track if the suite lists all its tasks.
     """
     config = stored.to_json()
     config |= {"device": resolve_device(device, open_worlds(config).on_gpu), "engine": "auto"}
-    return open_worlds(config), open_worlds({**config, "task_seed": seed, "tasks_per_class": None})
+    drawn = {**config, "tasks_per_class": None}
+    if track == MULTI_TASK:
+        return open_worlds(config), open_worlds(drawn).with_new_tasks(seed)
+    return open_worlds(config), open_worlds({**drawn, "task_seed": seed})
 
 
 @dataclass(frozen=True)

@@ -213,8 +213,12 @@ def _begin(
             place = new or new_folder_name(config)
         world = together(lambda: run_recording.recorded(config, place, world))
     note("Making the learner")
-    learner = together(lambda: _make_learner(config, kind, worlds, world, fresh=loaded is None))
-    own = together(lambda: old or (_new_folder(config, new, worlds, held) if launch().rank == 0 else None))
+    sources = together(lambda: _sources(config, worlds, world, old))
+    learner = together(lambda: _make_learner(config, kind, worlds, world, sources, fresh=loaded is None))
+    identity: Json = dict(worlds.identity())
+    if sources.teachers is not None:
+        identity["teacher_steps"] = run_teachers.steps_of(sources.teachers)
+    own = together(lambda: old or (_new_folder(config, new, identity, held) if launch().rank == 0 else None))
     path = distributed.share(own and own.path)[0]
     assert path is not None
     folder = RunFolder(path)
@@ -224,13 +228,14 @@ def _begin(
     return _Run(folder, kind, worlds, world, learner, is_resumed=old is not None)
 
 
-def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, fresh: bool) -> Any:
-    """Return the learner of a config, with its data sets, demonstrations and teachers.
+def _make_learner(
+    config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: VectorWorld, sources: Sources, fresh: bool
+) -> Any:
+    """Return the learner of a config.
 
     If the run is ``fresh``, that is, not resumed, the learner starts from the policy of ``config.start_from``, if that
     is set.
     """
-    sources = _sources(config, worlds, world)
     # A learner of another package that takes no sources may lack this argument.
     if sources == NO_SOURCES:
         more = {}
@@ -248,8 +253,11 @@ def _make_learner(config: AnyConfig, kind: LearnerKind, worlds: Worlds, world: V
     return learner
 
 
-def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld) -> Sources:
-    """Return the data, demonstrations and teachers that a config names."""
+def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld, old: RunFolder | None) -> Sources:
+    """Return the data, demonstrations and teachers that a config names.
+
+    Raises BidexError if a teacher has changed since the resumed run ``old`` began.
+    """
     data = None
     demonstrations = None
     teachers = None
@@ -260,11 +268,13 @@ def _sources(config: AnyConfig, worlds: Worlds, world: VectorWorld) -> Sources:
         demonstrations = join(found, world, every=False)
     if config.teacher:
         teachers = run_teachers.teachers_of(config, worlds, world)
+        if old is not None:
+            run_teachers.check_same(old, teachers)
     return Sources(data, demonstrations, teachers)
 
 
-def _new_folder(config: AnyConfig, path: Path | None, worlds: Worlds, held: contextlib.ExitStack) -> RunFolder:
-    folder = RunFolder.create(config, path, identity=worlds.identity())
+def _new_folder(config: AnyConfig, path: Path | None, identity: Json, held: contextlib.ExitStack) -> RunFolder:
+    folder = RunFolder.create(config, path, identity=identity)
     held.enter_context(folder.locked())
     return folder
 

@@ -35,6 +35,7 @@ class Versions:
     cpus: Whole | None = None
     gpus: list[Text] | None = None
     git: GitState | None = None
+    teacher_steps: list[Whole] | None = None  # environment steps of the runs that teach
 
 
 def parse_versions(content: Json, where: str) -> Versions:

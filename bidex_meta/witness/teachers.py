@@ -22,7 +22,8 @@ class Tutor:
     ``rows`` (k,), int64, are these environments. The policy reads the first ``width`` entries of an observation and
     then ``more`` (k, m), such as the padding and the task id of the suite that it was trained on. A policy of one class
     reads neither. ``source`` has the name of the learner that made the policy (``algo``) and the state from which this
-    learner loads it again (``policy``). It is None for a policy that was not loaded from a run.
+    learner loads it again (``policy``). It is None for a policy that was not loaded from a run. ``trained`` are the
+    folder of this run and its environment steps.
     """
 
     policy: Agent
@@ -30,6 +31,7 @@ class Tutor:
     width: int
     more: Tensor | None = None
     source: Mapping[str, Any] | None = None
+    trained: tuple[str, int] | None = None
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return the policy's actions (k, a) for the observations (N, d) of all environments."""

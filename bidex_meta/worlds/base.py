@@ -143,11 +143,16 @@ class Worlds(ABC):
 
     @property
     def others(self) -> "Worlds":
-        """Return worlds of the same suite or class whose tasks are drawn with another seed.
+        """Return worlds with unseen tasks, drawn with a seed that no run is trained with; see ``with_new_tasks``."""
+        return self.with_new_tasks(self.seed + OTHER_SEED)
 
-        These worlds have the same number of tasks. The tasks are unseen, because no run is trained with this seed.
+    def with_new_tasks(self, seed: int) -> "Worlds":
+        """Return worlds of the same suite or class with unseen tasks.
+
+        If a suite lists test tasks for its train classes, these are the unseen tasks. Otherwise there are as many as
+        train tasks, drawn with ``seed``. Raises BidexError if the suite lists all its tasks, and no test tasks.
         """
-        return type(self)(self._opened_as, replace(self.config, task_seed=self.seed + OTHER_SEED))
+        return type(self)(self._opened_as, replace(self.config, task_seed=seed))
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """Return the default numbers of environments and of environment steps for training.

@@ -42,6 +42,13 @@ class OwnSuite(Worlds):
 
         return Benchmark(self.suite, seed=self.seed)
 
+    def with_new_tasks(self, seed: int) -> "OwnSuite":
+        """See ``Worlds``."""
+        found = OwnSuite(self._opened_as, replace(self.config, task_seed=seed))
+        found.benchmark = self.benchmark.with_new_tasks(seed)
+        found.suite = found.benchmark.suite
+        return found
+
     def world(self, split: str = "train", rows: int | None = None, mode: str | None = None) -> "PooledWorld":
         """See ``Worlds``."""
         if rows is None:

@@ -84,6 +84,7 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("run --suite MT4 --lr 3e-4", "Did you mean --learner.learning-rate? See"),
         ("run --suite ML4 --algo promp --lr=1", "--learner.inner-learning-rate or --learner.outer-learning-rate?"),
         ("run --suite MT4 --xyzzy", "Unknown flag --xyzzy of bidex-meta run. See"),
+        ("render --run x --out f.webp", "Unknown flag --run of bidex-meta render. Did"),
         ("run --suite MT4 --num-envs many", "--num-envs"),
         ("run --suite MT4 --num-envs 0", "--num-envs"),
         ("run --suite MT4 --steps 2.5", "2e7"),

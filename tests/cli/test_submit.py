@@ -502,6 +502,8 @@ def test_runs_that_nobody_else_could_play_are_refused(toy_suite, tmp_path: Path,
     shown("run", *SMALL[2:], "--suite", suite, "--steps", "24", "--run-dir", run, "--no-evaluate")
     told = refused("submit", run, "--out", tmp_path, *TUNED)
     assert "trained on mine.toml. The leaderboard is for shipped suites" in told
+    listed = copied(run, suite="MT1-Switch-choice4")
+    assert "expected a suite with unseen tasks" in refused("submit", listed, "--out", tmp_path, *TUNED)
     change(run, suite="MT4", points=16)
     assert "saw clouds of points" in refused("submit", run, "--out", tmp_path, *TUNED)
 

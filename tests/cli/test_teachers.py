@@ -1,5 +1,6 @@
 """``--teacher``: short runs on real physics with scripts and with a run's policy, and what is refused."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,18 @@ def test_a_suite_learns_from_a_run_of_one_class_and_leaves_others_out(
     assert "Without a teacher, and not learned: CatchAbreast." in said
     assert "Loss/imitation/Switch" in rows[-1] and "Loss/imitation/CatchAbreast" not in rows[-1]
     assert RunFolder.open(tmp_path / "r").config().teacher == (str(student), "scripts")
+
+
+def test_a_teacher_that_learned_on_is_told_when_its_pupil_is_resumed(student: Path, tmp_path: Path, refused) -> None:
+    teacher = tmp_path / "teacher"
+    shutil.copytree(student, teacher)
+    begun = RunFolder.open(teacher).checkpoints.newest_step() or 0
+    run(tmp_path / "pupil", 32, "--task", "Switch-v2", "--teacher", str(teacher), "--teacher", "scripts")
+    resume = ["run", "--resume", str(tmp_path / "pupil"), "--no-evaluate"]
+    assert main([*resume, "--steps", "64"]) == 0
+    assert main(["run", "--resume", str(teacher), "--steps", str(begun + 32), "--no-evaluate"]) == 0
+    told = f"its teacher {teacher} had {begun} steps when the run began, and has {begun + 32} now"
+    assert told in refused(*resume, "--steps", "96")
 
 
 def test_a_memory_learns_from_scripts_and_a_run_what_a_suite_hides(

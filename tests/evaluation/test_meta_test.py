@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from bidex_meta import Benchmark
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import meta_test
 from bidex_meta.evaluation.eval_protocol import Protocol
@@ -14,7 +15,11 @@ from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
 from bidex_meta.evaluation.trial_agents import AdaptingTrialAgent
+from bidex_meta.experiments import metatest
+from bidex_meta.experiments.evaluating import FinalEvaluation
+from bidex_meta.experiments.run_config import resolve
 from bidex_meta.metaworld.adapters import FromMetaWorld
+from bidex_meta.suite import SPLITS
 from bidex_meta.worlds import open_worlds
 from tests.fakes import ToyWorld
 from tests.points import Climber, Finder, PointWorld, Still, ring
@@ -294,7 +299,7 @@ def test_one_protocol_says_what_is_played():
     assert len(meta_evaluate(Finder(), world(), 1, protocol=protocol).adapt_steps) == 1
 
 
-@pytest.mark.parametrize("suite", ["ML1", "MT4-v2"])
+@pytest.mark.parametrize("suite", ["ML4", "MT1", "MT4-v2"])
 def test_others_are_tasks_of_another_seed(suite):
     worlds = open_worlds({"suite": suite, "threads": 1, "seed": 7})
     own, others = (each.world("train", 4).pools[0] for each in (worlds, worlds.others))
@@ -303,6 +308,44 @@ def test_others_are_tasks_of_another_seed(suite):
     by_name = benchmark.make_world("others", 4, device="cpu", autoreset_mode="DISABLED", threads=1)
     assert np.array_equal(by_name.pools[0], others)
     assert len(set(benchmark.train_tasks) & set(benchmark.others.train_tasks)) == 0
+
+
+@pytest.mark.parametrize("suite", ["ML1", "ML1-Switch-shared", "ML2-Doors-shared", "MT2-Doors-shared"])
+def test_others_are_the_test_tasks_that_a_file_lists(suite: str) -> None:
+    """Only what the file lists is the same: version 1's goals come with other starts."""
+    others = open_worlds({"suite": suite, "threads": 1}).others
+    hidden = Benchmark(suite.replace("MT", "ML"))
+    for entry in hidden.suite.split_classes("train"):
+        listed = indices_of(hidden, entry.name)
+        found, train, test = (
+            {tuple(task.variation[listed]) for task in tasks}
+            for tasks in (others.benchmark.tasks_of(entry.name), *(hidden.tasks_of(entry.name, of) for of in SPLITS))
+        )
+        assert found == test and not found & train
+    world = others.world("train", 4)
+    assert len(world.pools[0]) == len(hidden.tasks_of(entry.name, "test"))
+
+
+def indices_of(benchmark: Benchmark, name: str) -> list[int]:
+    """The components of a class that the file lists."""
+    [entry] = [each for each in benchmark.suite.classes if each.name == name]
+    names = benchmark.task_classes()[name].variation_space.names
+    return [names.index(each) for each in entry.tasks[0].fixed]
+
+
+@pytest.mark.parametrize("suite", ["ML1-Switch-choice2", "MT1-DoorOpenOutward-choice4"])
+def test_a_suite_that_lists_all_its_tasks_has_no_others(suite: str) -> None:
+    worlds = open_worlds({"suite": suite, "threads": 1})
+    for look in (
+        lambda: Benchmark(suite).others,
+        lambda: Benchmark(suite).make_world("others", 4, device="cpu"),
+        lambda: worlds.others,
+        lambda: metatest.splits_of(worlds, "others"),
+        lambda: metatest.splits_of(worlds, "unseen"),
+        lambda: FinalEvaluation(other_tasks=True).check(resolve(RunConfig(suite=suite, algo="mtppo"))),
+    ):
+        with pytest.raises(BidexError, match="expected a suite with unseen tasks of its train classes, but it lists"):
+            look()
 
 
 @pytest.mark.parametrize("returned", [torch.zeros(12, 2), (torch.zeros(12, 2),), (torch.zeros(12, 2), None), None])
