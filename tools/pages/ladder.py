@@ -39,6 +39,8 @@ _VALIDITY = {"blind": "blind at best", "named": "named by its start", "identifie
 """Figures of ``bidex-meta validity`` and their headings."""
 _GOAL_SHOWN_AT_LEAST = 0.6
 _BLIND_AT_MOST = 0.15
+_LEAST_GAP = 0.1
+"""Smallest gain of goal-shown PPO over blind PPO of which the table says how much a learner closes."""
 _PAIRS_AT_LEAST = 3
 _SEEDS_AT_LEAST = 3
 
@@ -201,7 +203,7 @@ def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
     if SHOWN in lines and BLIND in lines and name not in (SHOWN, BLIND):
         low = lines[BLIND].last.mean()
         gap = lines[SHOWN].last.mean() - low
-        if gap > 0:
+        if gap > _LEAST_GAP:
             closed = mean_and_range(100.0 * (line.last[:, 0] - low) / gap, ".0f", " %")
     steps = f"{int(np.mean(line.steps)):,}"
     return [name, line.given, str(len(line.shares)), steps, f"{np.mean(line.minutes):.0f}", *shown, closed]
