@@ -66,7 +66,7 @@ class Line:
 def ladder_table(*studies: Study) -> Iterator[str]:
     """Yield three items for each suite: a table of learners, a verdict, and a table of pairs of learners.
 
-    The verdict says whether the suite separates the learners. "Gap closed" is a learner's success after the last
+    The verdict says whether the suite separates the learners; a table of a single split has none. "Gap closed" is a learner's success after the last
     exploring episode on a scale from blind PPO (0 %) to goal-shown PPO (100 %). Results are on the test tasks, or on
     the ``split`` of a study if it has one.
     """
@@ -77,7 +77,8 @@ def ladder_table(*studies: Study) -> Iterator[str]:
         rows = [_row(name, line, lines) for name, line in lines.items()]
         yield from table(_HEAD, rows)
         pairs = list(_pairs(lines))
-        yield from ("", _verdict(suite, lines, pairs))
+        if not any(study.split for study in studies):
+            yield from ("", _verdict(suite, lines, pairs))
         if pairs:
             head = ("first", "second", "probability that the first is better [95 %]", "separated")
             yield from ("", *table(head, pairs))
