@@ -66,9 +66,9 @@ class Line:
 def ladder_table(*studies: Study) -> Iterator[str]:
     """Yield three items for each suite: a table of learners, a verdict, and a table of pairs of learners.
 
-    The verdict says whether the suite separates the learners; a table of a single split has none. "Gap closed" is a learner's success after the last
-    exploring episode on a scale from blind PPO (0 %) to goal-shown PPO (100 %). Results are on the test tasks, or on
-    the ``split`` of a study if it has one.
+    The verdict says whether the suite separates the learners; a table of a single split has none. "Gap closed" is a
+    learner's success after the last exploring episode on a scale from blind PPO (0 %) to goal-shown PPO (100 %).
+    Results are on the test tasks, or on the ``split`` of a study if it has one.
     """
     for number, (suite, lines) in enumerate(_suites(studies).items()):
         if number:
