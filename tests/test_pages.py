@@ -21,6 +21,8 @@ from gymnasium.spaces import Box
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.cli.parsing import flags_of, parse
 from bidex_meta.evaluation.play import RandomAgent
+from bidex_meta.runs.evaluations import MetaTestEvaluation
+from bidex_meta.runs.stored import read_study
 from tests.pages import PAGES, ROOT, blocks, files_of
 from tools.english import prose
 
@@ -204,6 +206,18 @@ def test_the_readme_is_short() -> None:
 def _prose(page: Path) -> int:
     """Words of a page outside of code blocks, comments, tables and image lines."""
     return len(re.findall(r"[\w][\w'’./-]*", prose(page.read_text(encoding="utf-8"))))
+
+
+def test_readme_says_what_the_ladder_found() -> None:
+    found: dict[str, list[float]] = {}
+    for run in read_study(ROOT / "results" / "data" / "ladder-rung1.json"):
+        evaluation = run.evaluation()
+        if isinstance(evaluation, MetaTestEvaluation):
+            (last,) = evaluation.splits["test"].by_shot[-1].classes.values()
+            found.setdefault(run.arm, []).append(100 * last.success)
+    icl, varibad, maml = (sum(found[name]) / len(found[name]) for name in ("icl", "VariBAD", "MAML"))
+    told = f"in-context learning {icl:.0f} %, VariBAD {varibad:.0f} %, MAML {maml:.0f} %"
+    assert told in (ROOT / "README.md").read_text()
 
 
 def test_the_documentation_is_short() -> None:

@@ -257,7 +257,9 @@ def print_evaluation(found: "RunEvaluation", brief: bool = False) -> None:
     If ``brief`` is true and a random policy was evaluated too, the tables are short enough for a terminal.
     """
     title = f"{found.algo} on {found.worlds.name}"
-    if not brief:
+    if not brief and found.own.split == "train" and 0 in found.worlds.train_tasks().values():
+        title += ", tasks that training never draws"
+    elif not brief:
         title += f", {found.own.split} tasks"
     title += f", {found.steps:,} steps"
     if found.worlds.config.randomisation:

@@ -40,8 +40,8 @@ class ValidityFlags:
     """
 
     suite: str = "ML20-v2"
-    """Suite to measure: a name or a suite file. Its train tasks are measured, and the test tasks of a meta suite
-    too."""
+    """Suite to measure: a name or a suite file. The train tasks of its train classes are measured, and the test tasks
+    of its test classes. If a class is in both splits, only its test tasks are measured."""
     policy: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
     """Folder of a run whose policy knows the tasks; the run must have the rules of this suite, and its policy may know
     only some of the classes. Repeat the flag for several runs."""

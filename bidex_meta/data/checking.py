@@ -140,6 +140,7 @@ class _Formulas:
         # The suite's file says whether bases move. If that file is gone, the number of actions shows whether they do.
         self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
         self._touch = bool(about.get("touch"))
+        self._noisy = bool((about.get("randomisation") or {}).get("observation_noise"))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
         self._known: dict[str, tuple[TaskClass, _Shown] | None] = {}
 
@@ -150,6 +151,9 @@ class _Formulas:
         scale = self._scales.get(episode.task_name)
         if known is None or not scale:
             findings.skipped.setdefault(name, "its formula is not known here")
+            return
+        if self._noisy:
+            findings.skipped[name] = "its observations have noise"
             return
         task, shown = known
         variation = torch.from_numpy(np.array(episode.variation, np.float64)).expand(len(episode), -1)
@@ -269,7 +273,7 @@ def summary(dataset: Dataset) -> list[SlotSummary]:
                 returns=(returns.min(), float(np.median(returns)), returns.mean(), returns.max()),
                 success=float(table["success"][own].mean()),
                 score=None if scores is None else float(scores.mean()),
-                tasks=len(np.unique(table["task_index"][own])),
+                tasks=len(np.unique(table["variation"][own], axis=0)),
                 broken=int(table["broken"][own].sum()),
             )
         )

@@ -174,8 +174,11 @@ def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[
     if repeats >= 1:
         return rows, repeats
     count = min(world.num_envs, math.ceil(_SLACK * missing / mean))
+    # The first environment of each class comes first, then the second of each. They have different tasks.
+    place = np.concatenate([np.arange(own.stop - own.start) for own in world.slot_env_ids])
+    order = np.argsort(place, kind="stable")
     rows[:] = False
-    rows[np.arange(count) * world.num_envs // count] = True  # spread over all classes and tasks
+    rows[order[:count]] = True
     return rows, 1
 
 

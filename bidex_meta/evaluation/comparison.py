@@ -12,7 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
 from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, iqm_difference, iqm_over_seeds
 from bidex_meta.runs.atomic import Json
-from bidex_meta.runs.evaluations import ClassSummary, PolicyEvaluation
+from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation, PolicyEvaluation
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.plots import Curve
@@ -22,7 +22,7 @@ from bidex_meta.utils.files import portable
 from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
-_SETTINGS += ("base", "points", "touch", "object", "tasks_per_class", "switches")
+_SETTINGS += ("base", "points", "touch", "object", "tasks_per_class", "switches", "processes")
 _MADE = "made with"  # entry for versions that differ from those of other runs on the same worlds
 _POINTS = 200  # number of points of a curve over several runs
 
@@ -41,6 +41,7 @@ class Group:
     returns: np.ndarray  # mean return, (seeds, classes)
     scores: np.ndarray | None  # score, (seeds, classes); None if a class has no reference
     steps: int  # environment steps, summed over the runs of a seed, then averaged over seeds
+    version: int  # 2: rules of version 2, whose success and score mean something else than version 1's
     steps_range: tuple[int, int]  # smallest and largest number of steps of a seed
     hours: float  # hours of training without evaluation, summed and averaged like ``steps``
     paths: list[Path]  # the runs' folders, or JSON files
@@ -58,7 +59,7 @@ def read_groups(runs: Sequence[Run]) -> list[Group]:
 
     Raises BidexError if a run is not evaluated, two runs are the same, or a group's seeds cover different classes.
     """
-    kinds = [run_kind(run.config(), run.evaluation().split) for run in runs]
+    kinds = [run_kind(run.config(), run.evaluation().split) | _played(run.evaluation()) for run in runs]
     return [group_of(label, members) for label, members in _by_kind(kinds, runs)]
 
 
@@ -77,6 +78,15 @@ def run_kind(config: AnyConfig, split: str = "train") -> Json:
     for name, value in config.learner_values.items():
         kind[f"learner.{name}"] = value
     return kind
+
+
+def _played(evaluation: Evaluated) -> Json:
+    """Return the settings of an evaluation on which success depends."""
+    found: Json = {"randomised": evaluation.randomisation}
+    if isinstance(evaluation, MetaTestEvaluation):
+        for split, part in evaluation.splits.items():
+            found[f"shots on {split}"] = f"{part.shots} of {part.rollouts}"
+    return found
 
 
 def _data(config: AnyConfig, names: Sequence[str]) -> str | None:
@@ -172,7 +182,7 @@ def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Inter
 def success_over(group: Group, first: Group) -> Estimate | None:
     """Return the interquartile mean of a group's success minus that of the first group, with an interval over seeds.
 
-    The result is None if ``group`` is the first group, or if the two groups have different classes.
+    The result is None if ``group`` is the first group, or if the two groups have different classes or versions.
     """
     if not _comparable(group, first):
         return None
@@ -182,8 +192,8 @@ def success_over(group: Group, first: Group) -> Estimate | None:
 def score_over(group: Group, first: Group) -> Estimate | None:
     """Return the interquartile mean of a group's score minus that of the first group, with an interval.
 
-    The result is None if ``group`` is the first group, if the groups have different classes, or if either group has no
-    scores.
+    The result is None if ``group`` is the first group, if the groups have different classes or versions, or if either
+    group has no scores.
     """
     if not _comparable(group, first) or group.scores is None or first.scores is None:
         return None
@@ -191,7 +201,7 @@ def score_over(group: Group, first: Group) -> Estimate | None:
 
 
 def _comparable(group: Group, first: Group) -> bool:
-    return group is not first and set(group.classes) == set(first.classes)
+    return group is not first and (set(group.classes), group.version) == (set(first.classes), first.version)
 
 
 def scored_classes(run: Run) -> dict[str, ClassSummary]:
@@ -241,10 +251,11 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         return np.array(rows, dtype=float)
 
     scores = table("score")
+    is_v2 = any(row.episode_steps is not None for rows in by_seed.values() for row in rows.values())
     return Group(
         label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("mean_return"),
         scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
-        steps_range=(min(steps.values()), max(steps.values())),
+        steps_range=(min(steps.values()), max(steps.values())), version=2 if is_v2 else 1,
         hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from bidex_meta.training.launch import say
 from bidex_meta.training.learner import Capability
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import open_worlds
+from bidex_meta.worlds.own import OwnSuite
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,11 @@ def control_runs(
         here = resolve_device(device, open_worlds(stored.to_json()).on_gpu)
         config = replace(stored, device=here, engine=engine)
         worlds = open_worlds(config.to_json())
+        if isinstance(worlds, OwnSuite) and set(worlds.benchmark.train_tasks) & set(worlds.benchmark.test_tasks):
+            raise BidexError(
+                f"{folder.path}: {worlds.name} has the same tasks in both splits, so data of train tasks are no data "
+                "of other tasks. Name runs on a suite whose splits differ."
+            )
         set_up_torch(config.threads, config.deterministic)
         counts = [len(pool) for pool in worlds.tasks("test").values()]
         adaptation = metatest.Adaptation.of(worlds, config)

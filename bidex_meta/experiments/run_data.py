@@ -34,6 +34,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     - ``tasks``: names of the world's slots (classes, or listed tasks as Class/task)
     - ``instructions``: instruction of each slot's class
     - ``reward_scales``: factor of the reward by slot; ``rules``: the suite's rules; ``hides_goals``
+    - ``randomisation``: fields of the world's ``Randomisation``; None: nothing was randomised
     - ``observation_groups``: name and index ranges of each group
     - ``kind`` (``random``, ``medium``, ...), ``policies``, and ``seed`` of the tasks
     - ``references``: {class: fields of ``evaluation.references.Reference``}, unscaled returns
@@ -54,6 +55,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     slots = getattr(world, "slots", ())
     rules = asdict(slots[0].task_class.rules) if slots else asdict(V1)
     version = source.suite.version if source.suite else None
+    drawn = getattr(getattr(world, "unwrapped", world), "randomisation", None)
     return {
         "suite": None if alone else source.name,
         "suite_version": version,
@@ -61,6 +63,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "base": base,
         "tasks": list(world.task_names),
         "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
+        "randomisation": None if drawn is None else asdict(drawn),
         "reward_scales": {slot.name: slot.reward_scale for slot in slots},
         "rules": rules,
         "hides_goals": source.hides_goals,
@@ -115,10 +118,16 @@ def implied(datasets: Sequence[Dataset]) -> Json:
 
 
 def task_seed(datasets: Sequence[Dataset]) -> int | None:
-    """Return the seed of the tasks of the first data set: a learner is evaluated on those tasks."""
-    if datasets:
-        return datasets[0].metadata.get("seed")
-    return None
+    """Return the seed of the tasks of the data sets: a learner is evaluated on those tasks.
+
+    If the seeds differ, the first data set's seed is returned, and a line is logged.
+    """
+    if not datasets:
+        return None
+    seeds = [dataset.metadata.get("seed") for dataset in datasets]
+    if len({*seeds}) > 1:
+        say(f"The data sets have tasks of the seeds {', '.join(map(str, seeds))}; evaluations play those of the first.")
+    return seeds[0]
 
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:

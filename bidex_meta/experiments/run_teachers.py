@@ -110,7 +110,12 @@ def _known_to(name: str, source: Worlds) -> set[str]:
 
 def _same_form(source: Worlds, other: Worlds) -> bool:
     """Return whether two suites that show goals have the same observations."""
-    return other.class_name is None and not source.hides_goals and slots_of(source) == slots_of(other)
+    if other.class_name is not None or source.hides_goals or slots_of(source) != slots_of(other):
+        return False
+    if isinstance(source, OwnSuite) and isinstance(other, OwnSuite):
+        there = other.suite.observation, other.benchmark.padded_size
+        return (source.suite.observation, source.benchmark.padded_size) == there
+    return True
 
 
 def _is_by_class(other: Worlds) -> bool:

@@ -34,12 +34,31 @@ def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
     """Measure, for each class, whether a policy must and can find out the task; return a row per class.
 
     For example, a row has the success of policies that do not know the task, and of policies that know it. ``runs`` are
-    folders of runs whose policies know the tasks. Raises BidexError for suites without hands (Meta-World).
+    folders of runs whose policies know the tasks. If a class is in both splits, its test tasks are measured. Raises
+    BidexError for suites without hands (Meta-World), for runs whose policies do not see the goal, and for folders
+    without a name of their own.
     """
+    _check_runs(runs)
     rows: dict[str, Json] = {}
-    for split in worlds.splits:
-        rows |= _of_split(worlds, split, runs)
-    return rows
+    for split in reversed(worlds.splits):
+        if not rows.keys() >= worlds.tasks(split).keys():
+            rows = _of_split(worlds, split, runs) | rows
+    return {name: rows[name] for split in worlds.splits for name in worlds.tasks(split)}
+
+
+def _check_runs(runs: Sequence[Path]) -> None:
+    known = {"uniform", "zero", "held", "witness", "script", "misled"}
+    for path in runs:
+        folder = RunFolder.open(path)
+        worlds = open_worlds(folder.config().to_json())
+        if worlds.hides_goals:
+            raise BidexError(
+                f"--policy {path} learned {worlds.name}, which hides goals: it does not know the task. Name a run on a "
+                "suite that shows goals, or on a single class."
+            )
+        if folder.path.name in known:
+            raise BidexError(f"--policy {path}: {folder.path.name} already names a policy. Rename the folder.")
+        known.add(folder.path.name)
 
 
 def blind_share(slot: Slot, worlds: Worlds) -> float:

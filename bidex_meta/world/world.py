@@ -103,6 +103,7 @@ class World(BatchedWorld):
         self._describe_observations(groups)
         own = (self.slots, config.observation, self.observation_size, self.num_envs, self._sights)
         self.parts = [Part(group, *own) for group in groups]
+        self.randomisation = config.randomisation
         self._randomiser = None
         remembered = 0
         if config.randomisation is not None:

@@ -33,7 +33,7 @@ class OwnSuite(Worlds):
         self.touch = self.suite.touch
         if self.suite.rules.success == "at-end":
             self.preset = V2_PRESET
-        self.hides_goals = self.suite.kind == "meta" and self.suite.observation == "masked"
+        self.hides_goals = self.suite.observation == "masked"
 
     @cached_property
     def benchmark(self):

@@ -94,6 +94,7 @@ def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, refused):
         ({"steps": 48}, runs, "differ in steps"),
         ({"steps": 24, "start_from": "/runs/1"}, runs, "differ in started"),
         ({"start_from": None, "suite": "MT4"}, runs[1:], "but MT4 shows them"),
+        ({"suite": "ML1-Switch-choice2"}, runs[1:], "ML1-Switch-choice2 has the same tasks in both splits"),
         ({"algo": "mtppo"}, runs[1:], "does not adapt"),
         ({}, [], "Name the run folders"),
         ({}, [runs[0], runs[0]], "both have seed 0. Name one run for each seed."),

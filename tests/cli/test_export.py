@@ -38,7 +38,7 @@ POLICIES: list[tuple[str, dict[str, object]]] = [
     ("mtsac", {"architecture": "towers"}), ("mtppo", {"architecture": "soft_modules"}),
     ("mtppo", {"architecture": "transformer", "hidden": (8,)}),
     ("dagger", {"architecture": "moore", "normalise_per_task": True}),
-    ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}),
+    ("mappo", {"agents": "a=action/0+action/1;b=action/2+action/3"}), ("bcq", {}), ("iql", {}),
 ]  # fmt: skip
 
 

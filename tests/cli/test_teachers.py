@@ -67,6 +67,15 @@ def test_a_suite_learns_from_a_run_of_one_class_and_leaves_others_out(
     assert RunFolder.open(tmp_path / "r").config().teacher == (str(student), "scripts")
 
 
+def test_a_suite_that_shows_no_task_id_teaches_one_that_does(student: Path, tmp_path: Path) -> None:
+    (tmp_path / "pair.toml").write_text(SUITE)
+    (tmp_path / "plain.toml").write_text(SUITE.replace('"one-hot"', '"plain"'))
+    words = "--suite", str(tmp_path / "pair.toml"), "--teacher", "scripts"
+    run(tmp_path / "teacher", 32, *words)
+    rows = run(tmp_path / "r", 32, "--suite", str(tmp_path / "plain.toml"), "--teacher", str(tmp_path / "teacher"))
+    assert "Loss/imitation/Switch" in rows[-1]
+
+
 def test_a_teacher_that_learned_on_is_told_when_its_pupil_is_resumed(student: Path, tmp_path: Path, refused) -> None:
     teacher = tmp_path / "teacher"
     shutil.copytree(student, teacher)

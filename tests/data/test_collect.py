@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
-from bidex_meta.data.collect import Actor, resumed_writer
+from bidex_meta.data.collect import Actor, _plan, resumed_writer
 from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.errors import BidexError
 from tests.data.worlds import rough, same
@@ -124,6 +125,20 @@ def _killed(work: Callable[[], object], at: int) -> bool:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_the_last_round_plays_each_task_once_before_any_task_twice() -> None:
+    ids = [slice(0, 20), slice(20, 40)]  # environment j of a class plays task j modulo 10
+    space = SimpleNamespace(shape=(4,))
+    world: Any = SimpleNamespace(
+        num_envs=40, slot_env_ids=ids, max_episode_steps=torch.full((40,), 10), single_observation_space=space,
+        single_action_space=space,
+    )  # fmt: skip
+    now: Any = SimpleNamespace(episodes=[0], steps=[0])
+    rows, repeats = _plan(world, 180, now, 0)
+    chosen = np.flatnonzero(rows)
+    assert repeats == 1 and len(chosen) == 19
+    assert [len({row % 20 % 10 for row in chosen if row // 20 == of}) for of in (0, 1)] == [10, 9]
+
+
 def test_killed_at_ten_moments_it_ends_with_the_same_data(tmp_path: Path) -> None:
     """Steps of the world, episodes on their way to the disk, before and after each renaming, and in the index."""
     expected = list(record(tmp_path / "whole").episodes())

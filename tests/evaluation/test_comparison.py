@@ -1,12 +1,13 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import over_runs, read_groups, read_histories
+from bidex_meta.evaluation.comparison import over_runs, read_groups, read_histories, score_over, success_over
 from bidex_meta.runs import RunFolder
 from tests.fakes import change, evaluated_run, log
 
@@ -62,6 +63,39 @@ def test_runs_of_other_data_or_worlds_are_other_groups(
     )
     assert (len(first.seeds), second.seeds) == (len(runs), [0]), "configs that do not know the entry have the usual"
     assert second.label == f"bc, {entry} {label}"
+
+
+def told(path: Path, **entries: Any) -> Path:
+    """The run, with other entries in its evaluation."""
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps(found | entries))
+    return path
+
+
+def test_evaluations_by_another_protocol_are_other_groups(tmp_path: Path):
+    runs = [evaluated_run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1, 2)]
+    told(runs[1], randomisation={"action_noise": 1.0})
+    change(runs[2], processes=2)
+    assert [group.seeds for group in groups(*runs)] == [[0], [1], [2]]
+    shots = []
+    for seed, count in enumerate((1, 2)):
+        path = evaluated_run(tmp_path, seed, {"A": 0.5}, "rl2")
+        row = {"classes": {"A": {"success": 0.5, "return": 1.0}}}
+        part = {"shots": count, "rollouts": 2, "trials": 1, "before": row, "after": row, "by_shot": [row]}
+        (path / "evaluation.json").write_text(json.dumps({"splits": {"test": part}}))
+        shots.append(path)
+    assert [group.label for group in groups(*shots)] == [f"rl2, shots on test {count} of 2" for count in (1, 2)]
+
+
+def test_versions_of_the_rules_are_not_compared(tmp_path: Path):
+    old, new = (evaluated_run(tmp_path, seed, {"A": 0.5}, gamma=seed / 10) for seed in (1, 2))
+    classes = {"A": {"success": 0.5, "return": 5.0, "score": 50.0, "episode_steps": 100}}
+    told(new, policy={"classes": classes})
+    first, second = groups(old, new)
+    assert success_over(second, first) is None and score_over(second, first) is None
+    told(old, policy={"classes": classes})
+    first, second = groups(old, new)
+    assert success_over(second, first) is not None and score_over(second, first) is not None
 
 
 def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):

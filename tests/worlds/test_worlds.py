@@ -80,6 +80,14 @@ def test_a_meta_suite_may_show_its_goals(tmp_path: Path) -> None:
     assert not shown.hides_goals and shown.splits == ["train", "test"]
 
 
+def test_a_multi_task_suite_may_hide_its_goals(tmp_path: Path) -> None:
+    file = tmp_path / "hidden.toml"
+    file.write_text((paths.suites_dir() / "MT4.toml").read_text().replace('"one-hot"', '"masked"'))
+    hidden = open_worlds({"suite": str(file), "threads": 1})
+    world: Any = hidden.world("train", 4)
+    assert hidden.hides_goals and world.hides_goals and hidden.splits == ["train"]
+
+
 def test_references_are_of_moving_bases() -> None:
     assert open_worlds({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
     for config in ({"task": "HandOver"}, {"suite": "metaworld/MT3"}, {"task": "gymnasium/Humanoid-v5"}):

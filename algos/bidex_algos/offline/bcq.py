@@ -130,18 +130,20 @@ class BCQPolicy(nn.Module):
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
         """Return the action for raw observations (N, d): (N, a) in [-1, 1]."""
+        # No size is read as a number: in an exported policy, the number of observations stays variable.
         count = len(self.codes)
-        rows = len(obs)
-        many = self.observations(obs).repeat_interleave(count, 0)
+        many = self.observations(obs)[:, None].expand(-1, count, -1).flatten(0, 1)
+        codes = self.codes.expand(obs.shape[0], -1, -1).flatten(0, 1)
         with autocast(obs.device, self.low_precision):
-            actions = self.propose(self.actor, many, self.codes.repeat(rows, 1))
+            actions = self.propose(self.actor, many, codes)
             if self.critic.heads > 1:
                 task = self.task(many).argmax(1)
             else:
-                task = many.new_zeros(len(many), dtype=torch.int64)
+                task = torch.zeros_like(many[:, 0], dtype=torch.int64)
             values = self.critic(many, actions, task)[0]
-        best = values.view(rows, count).argmax(1)
-        return actions.view(rows, count, -1)[torch.arange(rows, device=obs.device), best]
+        best = values.unflatten(0, (-1, count)).argmax(1)
+        actions = actions.unflatten(0, (-1, count))
+        return actions.gather(1, best[:, None, None].expand(-1, 1, actions.shape[2])).squeeze(1)
 
 
 class BCQ(Offline):
