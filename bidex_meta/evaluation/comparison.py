@@ -4,6 +4,7 @@ import json
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -251,11 +252,13 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
         return np.array(rows, dtype=float)
 
     scores = table("score")
-    is_v2 = any(row.episode_steps is not None for rows in by_seed.values() for row in rows.values())
+    # Only results of version 2 store the length of a full episode.
+    all_rows = chain.from_iterable(rows.values() for rows in by_seed.values())
+    version = 1 + any(row.episode_steps is not None for row in all_rows)
     return Group(
         label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("mean_return"),
         scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
-        steps_range=(min(steps.values()), max(steps.values())), version=2 if is_v2 else 1,
+        steps_range=(min(steps.values()), max(steps.values())), version=version,
         hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
     )  # fmt: skip
 

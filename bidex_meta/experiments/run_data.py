@@ -56,6 +56,8 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     rules = asdict(slots[0].task_class.rules) if slots else asdict(V1)
     version = source.suite.version if source.suite else None
     drawn = getattr(getattr(world, "unwrapped", world), "randomisation", None)
+    if drawn is not None:
+        drawn = asdict(drawn)
     return {
         "suite": None if alone else source.name,
         "suite_version": version,
@@ -63,7 +65,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "base": base,
         "tasks": list(world.task_names),
         "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
-        "randomisation": None if drawn is None else asdict(drawn),
+        "randomisation": drawn,
         "reward_scales": {slot.name: slot.reward_scale for slot in slots},
         "rules": rules,
         "hides_goals": source.hides_goals,

@@ -43,7 +43,7 @@ def validity_rows(worlds: Worlds, runs: Sequence[Path]) -> dict[str, Json]:
     for split in reversed(worlds.splits):
         if not rows.keys() >= worlds.tasks(split).keys():
             rows = _of_split(worlds, split, runs) | rows
-    return {name: rows[name] for split in worlds.splits for name in worlds.tasks(split)}
+    return {name: rows[name] for name in chain.from_iterable(map(worlds.tasks, worlds.splits))}
 
 
 def _check_runs(runs: Sequence[Path]) -> None:

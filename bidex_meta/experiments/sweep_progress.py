@@ -8,8 +8,10 @@ from statistics import mean
 from typing import Literal, NamedTuple
 
 from bidex_meta.errors import BidexError, one_line
+from bidex_meta.experiments.evaluating import FinalEvaluation
 from bidex_meta.experiments.run_config import check, resolve
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
+from bidex_meta.runs.evaluations import Evaluated, MetaTestEvaluation
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import last_rows
 from bidex_meta.utils.files import JsonObject, absolute, exists, is_file
@@ -76,7 +78,7 @@ def state_of(run: PlannedRun) -> State:
             )
         if is_file(run.folder.metrics_path):
             last = (last_rows(run.folder.metrics_path) or [last])[-1]
-        evaluated = run.folder.evaluated
+        evaluated = run.folder.evaluated and _played(run.final, run.folder.evaluation())
     why = last_line(beside(run, "failed"))
     steps = run.config.goal(last)
     if locked(run):
@@ -88,6 +90,18 @@ def state_of(run: PlannedRun) -> State:
     else:
         state = "left"
     return State(run, state, last["step"], steps, last.get("Perf/training_time") or 0.0, why)
+
+
+def _played(final: FinalEvaluation, evaluation: Evaluated) -> bool:
+    """Return whether a stored evaluation has all parts that a sweep asks for; its file may have changed since."""
+    if not isinstance(evaluation, MetaTestEvaluation):
+        return not final.other_tasks or evaluation.other_tasks is not None
+    wanted = {"auto": (), "unseen": ("others", "test")}.get(final.split, (final.split,))
+    if not evaluation.splits.keys() >= set(wanted):
+        return False
+    parts = evaluation.splits.values()
+    same_shots = final.shots is None or all(part.shots == final.shots for part in parts)
+    return same_shots and (not final.hidden_rewards or all(part.hidden_by_shot is not None for part in parts))
 
 
 def hours_left(states: Sequence[State]) -> list[float]:

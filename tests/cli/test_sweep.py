@@ -19,9 +19,11 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments import sweep_progress
 from bidex_meta.experiments import sweeping as queue
+from bidex_meta.experiments.evaluating import FinalEvaluation
 from bidex_meta.experiments.sweep_plan import PlannedRun, SweepPlan
-from bidex_meta.experiments.sweep_progress import State, state_of
+from bidex_meta.experiments.sweep_progress import State, _played, state_of
 from bidex_meta.runs import RunFolder
+from bidex_meta.runs.evaluations import parse_evaluation
 from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config
 from tests.pages import ROOT
@@ -196,6 +198,23 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
         state(SweepPlan.read(file).runs[0], replace(CONFIG, num_envs=16))
     more = state(SweepPlan.read(file).runs[0], replace(CONFIG, steps=12))
     assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"
+    run = SweepPlan.read(file).runs[0]
+    others = replace(run, final=FinalEvaluation(other_tasks=True))
+    assert (state(run, CONFIG).state, state(others, CONFIG).state) == ("done", "left"), "it is evaluated again"
+
+
+def test_an_evaluation_has_the_parts_that_a_file_asks_for() -> None:
+    row = {"classes": {"A": {"success": 0.5, "return": 1.0}}}
+    part = {"shots": 2, "rollouts": 1, "trials": 1, "before": row, "after": row, "by_shot": [row]}
+    found = parse_evaluation({"splits": {"train": part, "test": part}}, "here")
+    for final, done in (
+        (FinalEvaluation(), True),
+        (FinalEvaluation(split="test", shots=2), True),
+        (FinalEvaluation(split="unseen"), False),
+        (FinalEvaluation(shots=1), False),
+        (FinalEvaluation(hidden_rewards=True), False),
+    ):
+        assert _played(final, found) is done
 
 
 @pytest.mark.parametrize(
