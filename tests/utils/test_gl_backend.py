@@ -31,7 +31,8 @@ def machine(monkeypatch):
     """A machine without a screen whose backends are given by name; others cannot be imported."""
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # what the test sets later is then unset at its end
+        monkeypatch.delenv(name)
     monkeypatch.setattr(gl_backend, "_impossible", None)
     monkeypatch.setattr(gl_context, "GLContext", Broken)
     monkeypatch.setattr(gl_backend, "find_library", lambda name: f"lib{name}.so")
