@@ -127,8 +127,9 @@ class Benchmark:
     def others(self) -> "Benchmark":
         """Return the same suite with unseen tasks.
 
-        They are the listed test tasks of classes that list some. Otherwise there are as many as train tasks, drawn with
-        a seed that no run uses for training. Raises BidexError if the suite lists all its tasks, and no test tasks.
+        They are the listed test tasks of classes that list some. Otherwise their number is that of the train tasks, and
+        they are drawn with a seed that no run uses for training. Raises BidexError if the suite lists all its tasks,
+        and no test tasks.
         """
         return self.with_new_tasks(self.seed + OTHER_SEED)
 

@@ -1,7 +1,7 @@
 """Interface of a learner to the commands and to the training loop."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum, auto
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -48,6 +48,14 @@ class LearnerConfig(Checked):
         ``num_envs`` environments are split evenly over the classes. ``tasks`` are the numbers of train tasks by class;
         0 stands for new tasks in each episode or trial. A sweep checks all its runs before the first one begins.
         """
+
+    @staticmethod
+    def environments_of(num_envs: int, classes: Iterable[str]) -> dict[str, int]:
+        """Return the number of environments of each class; the first classes take the remainder."""
+        names = list(classes)
+        share = num_envs // len(names)
+        rest = num_envs % len(names)
+        return {name: share + (place < rest) for place, name in enumerate(names)}
 
 
 @dataclass(frozen=True)

@@ -149,8 +149,8 @@ class Worlds(ABC):
     def with_new_tasks(self, seed: int) -> "Worlds":
         """Return worlds of the same suite or class with unseen tasks.
 
-        If a suite lists test tasks for its train classes, these are the unseen tasks. Otherwise there are as many as
-        train tasks, drawn with ``seed``. Raises BidexError if the suite lists all its tasks, and no test tasks.
+        If a suite lists test tasks for its train classes, these are the unseen tasks. Otherwise their number is that of
+        the train tasks, and ``seed`` draws them. Raises BidexError if the suite lists all its tasks, and no test tasks.
         """
         return type(self)(self._opened_as, replace(self.config, task_seed=seed))
 

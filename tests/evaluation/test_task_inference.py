@@ -8,9 +8,13 @@ import pytest
 
 from bidex_meta import Benchmark
 from bidex_meta.cli import main
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability, listed_ceiling
 from bidex_meta.experiments import suite_validity
+from bidex_meta.experiments.run_config import resolve
+from bidex_meta.runs import RunFolder
 from bidex_meta.suite_files import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.aligned import Error
@@ -102,3 +106,12 @@ def test_alignment_counts_pairs_of_successful_and_other_episodes() -> None:
     assert found == Alignment(rank=pytest.approx((3 + 1 - 1) / 6), solved=3.5, unsolved=3.0)
     assert alignment({"a": result([1.0, 2.0], [1.0, 0.0])}) is None, "no policy always fails"
     assert alignment({"b": result([1.0, 2.0], [0.0, 0.0])}) is None, "nobody succeeds"
+
+
+@pytest.mark.parametrize(
+    ("suite", "name", "told"), [("ML1-v2", "mine", "which hides goals"), ("MT1-v2", "script", "already names a policy")]
+)
+def test_validity_refuses_policies_that_it_would_mislabel(suite: str, name: str, told: str, tmp_path: Path) -> None:
+    RunFolder.create(resolve(RunConfig(suite=suite, algo="mtppo", device="cpu")), tmp_path / name)
+    with pytest.raises(BidexError, match=told):
+        suite_validity.validity_rows(open_worlds({"suite": "MT1-v2"}), [tmp_path / name])

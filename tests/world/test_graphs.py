@@ -113,7 +113,7 @@ def test_replayed_steps_are_plain_steps(
 
 
 def told(world: World) -> list[dict[str, Tensor]]:
-    """What a world tells of hidden parts in six steps, for one and for three goals."""
+    """Return what a world tells of hidden parts in six steps, for one and for three goals."""
     generator = torch.Generator().manual_seed(0)
     found = []
     for action in random_actions(world, 6, seed=1):

@@ -54,10 +54,8 @@ class MetaConfig(LearnerConfig):
 
     def check_environments(self, num_envs: int, tasks: Mapping[str, int]) -> None:
         """Raise BidexError if a class has fewer environments than tasks of a meta-batch."""
-        share, rest = divmod(num_envs, len(tasks))
-        for place, (name, count) in enumerate(tasks.items()):
-            rows = share + (place < rest)
-            batch = min(self.tasks_per_class, count or self.tasks_per_class)
+        for name, rows in self.environments_of(num_envs, tasks).items():
+            batch = min(self.tasks_per_class, tasks[name] or self.tasks_per_class)
             if rows < batch:
                 raise BidexError(
                     f"{self.algo}: {name} has {rows} environments for {batch} tasks of a meta-batch. Use num_envs of "

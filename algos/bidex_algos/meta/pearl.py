@@ -61,13 +61,11 @@ class PEARLConfig(MTSACConfig):
                 "pearl: expected a fixed number of train tasks, because it replays transitions by task, got "
                 "tasks_per_class 0. Use --tasks-per-class 100 or another number, and as many environments per class."
             )
-        share, rest = divmod(num_envs, len(tasks))
-        for place, (name, count) in enumerate(tasks.items()):
-            rows = share + (place < rest)
-            if rows < count:
+        for name, rows in self.environments_of(num_envs, tasks).items():
+            if rows < tasks[name]:
                 raise BidexError(
-                    f"pearl: {name} has {count} tasks and {rows} environments, each of which keeps its task. Raise "
-                    f"num_envs to {max(tasks.values()) * len(tasks)}."
+                    f"pearl: {name} has {tasks[name]} tasks and {rows} environments, each of which keeps its task. "
+                    f"Raise num_envs to {max(tasks.values()) * len(tasks)}."
                 )
 
 
