@@ -165,7 +165,7 @@ class Benchmark:
         stagger: bool = True,
         randomisation: Randomisation | bool | None = None,
         pixels: int = 0,
-        episodes_per_task: int = 1,
+        episodes_per_task: int | None = None,
         deterministic: bool = False,
         switches: str = "",
     ) -> World:
@@ -174,8 +174,8 @@ class Benchmark:
         In a training world (autoreset mode SAME_STEP) of a multi-task suite, every episode draws one task of the
         environment's class. In a meta suite, and in every evaluation world (mode DISABLED), environment j of a class
         keeps task j modulo the number of tasks. There are two exceptions. With `tasks_per_class=0` every episode of a
-        training world of the train split draws a new task. With `episodes_per_task` above 1, each environment of a
-        training world keeps each drawn task for that number of episodes.
+        training world of the train split draws a new task. With `episodes_per_task`, each environment of a training
+        world draws tasks, and keeps each of them for that number of episodes.
 
         Args:
             split: `"train"`, `"test"`, or `"others"`: unseen tasks of the train classes; see the property `others`.
@@ -193,7 +193,7 @@ class Benchmark:
                 only in training worlds; or a `Randomisation` (docs/randomisation.md).
             pixels: Edge length of the square pictures in `info["pixels"]`, pixels (docs/looking.md); 0: no pictures.
             episodes_per_task: Number of consecutive episodes in which an environment keeps a drawn task, as in a trial
-                (docs/clients.md#trials-as-episodes).
+                (docs/clients.md#trials-as-episodes). None: as described above.
             deterministic: Whether physics on a GPU repeats bit for bit, which takes longer (docs/gpu.md); on the CPU it
                 always does.
             switches: Experimental changes of the physics, such as `"incremental"` (docs/gpu.md#switches).
@@ -219,7 +219,7 @@ class Benchmark:
             seed = self.seed
         if split == "train" and self.suite.train_tasks == 0:
             task_sampling = "fresh"
-        elif evaluates or (self.suite.kind == "meta" and episodes_per_task == 1):
+        elif evaluates or (self.suite.kind == "meta" and episodes_per_task is None):
             task_sampling = "fixed"
         else:
             task_sampling = "uniform"
@@ -243,7 +243,7 @@ class Benchmark:
             points=points,
             randomisation=randomisation,
             pixels=pixels,
-            episodes_per_task=episodes_per_task,
+            episodes_per_task=1 if episodes_per_task is None else episodes_per_task,
         )
         return World(slots, config)
 
@@ -274,7 +274,8 @@ class Benchmark:
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
             own = entry.reward_scale, entry.class_name, self.suite.rules, points, bool(entry.tasks)
-            recipe = EnvRecipe(entry.name, *look, *own, self.suite.touch)
+            randomisation = self.suite.randomisation if split == "train" else None
+            recipe = EnvRecipe(entry.name, *look, *own, self.suite.touch, randomisation)
             classes[recipe.env_name] = recipe.make_class()
         return ByClass(classes, self.suite.rules)
 

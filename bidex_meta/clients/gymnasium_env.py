@@ -65,7 +65,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._over:
             raise BidexError("Expected reset() before step(): there is no running episode.")
-        obs, reward, terminated, truncated, batch = self.world.step(one_row(action))
+        obs, reward, terminated, truncated, batch = self.world.step(one_row(action, self.action_space))
         info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
         self._over = bool(terminated[0] or truncated[0])

@@ -3,6 +3,7 @@
 An id of a suite makes only vector environments. An id of a task class makes single and vector environments.
 """
 
+import inspect
 import secrets
 from itertools import product
 from typing import Any
@@ -10,13 +11,15 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from bidex_meta.errors import BidexError, shortened
+from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.rules import plain_name
 from bidex_meta.suite import Suite
 from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.tasks import registry
 
 NAMESPACE = "bidex-meta"
+OF_SINGLES = frozenset({"vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name"})
+"""Options with which an id of a suite makes Meta-World's vector of single environments instead of a world."""
 
 
 def suite_ids(suite: Suite) -> dict[str, str]:
@@ -69,15 +72,22 @@ def make_suite_world(
     shortened episodes. Other arguments are as in `Benchmark.make_world`.
 
     With `vector_strategy`, `meta_batch_size`, `total_tasks_per_cls` or `env_name` the result is Meta-World's vector of
-    single environments with NumPy arrays, and `num_envs` is ignored.
+    single environments with NumPy arrays, and `num_envs` is ignored. These environments have no `stagger`.
     """
     check_render_mode(render_mode)
     task_seed, start_seed = both_seeds(seed, benchmark_seed)
-    if options.keys() & {"vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name"}:
+    if options.keys() & OF_SINGLES:
         from bidex_meta.metaworld.vector_envs import make_split
 
-        return make_split(suite, split, task_seed, start_seed, **options)
+        if stagger:
+            raise BidexError("stagger: expected False for Meta-World's vector of single environments. Leave it out.")
+        return make_split(suite, split, task_seed, start_seed, render_mode=render_mode, **options)
     from bidex_meta.benchmark import Benchmark
+
+    known = inspect.signature(Benchmark.make_world).parameters
+    for name in options.keys() - known:
+        fault = unknown_name("option", name, known.keys() - {"self"})
+        raise BidexError(f"{fault} Options of Meta-World need vector_strategy, such as 'sync'.")
 
     benchmark = Benchmark(suite, seed=task_seed)
     return benchmark.make_world(split, num_envs=num_envs, seed=start_seed, stagger=stagger, **options)

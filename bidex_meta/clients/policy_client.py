@@ -48,7 +48,7 @@ class PolicyClient:
 
     `evaluate(PolicyClient(url, world), world)` plays the usual evaluation. A `with` block closes the connection. The
     server has `timeout` seconds for each answer. Raises BidexError if the server cannot be reached, disconnects,
-    answers too late, reports an error, or answers anything but actions of the world's shape.
+    answers too late, reports an error, or answers anything but finite actions of the world's shape.
     """
 
     @checked_arguments
@@ -110,6 +110,8 @@ class PolicyClient:
             raise self._failed(wanted, f"its error {shortened(reply.error)}", "Look at the server's output.")
         if action.shape != shape or action.dtype.kind != "f":
             raise self._failed(wanted, f"{action.dtype} of shape {action.shape}", "Serve a policy of this world.")
+        if not np.isfinite(action).all():
+            raise self._failed(wanted, "numbers that are not finite", "Look at the server's policy.")
         return torch.from_numpy(action.astype(np.float32))
 
     def _failed(self, wanted: str, got: object, mend: str) -> BidexError:

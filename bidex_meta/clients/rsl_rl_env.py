@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.clients.trial_env import TrialWorld
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.utils.arguments import checked_arguments
@@ -30,7 +31,7 @@ class RslRlVecEnv(VecEnv):
 
     `stagger` shortens first episodes (docs/clients.md). rsl-rl's "Mean reward" counts these episodes, but `log` does
     not. Raises BidexError for a world in another autoreset mode than SAME_STEP, for an unknown group, or if
-    `episode_length_buf` is set to values that are negative or not whole.
+    `episode_length_buf` is set to values that are negative or not whole, or is set for a `TrialWorld`.
     """
 
     @checked_arguments
@@ -63,12 +64,16 @@ class RslRlVecEnv(VecEnv):
     def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Steps that each environment's running episode has lasted, int64 (num_envs,).
 
-        Setting the property shortens the running episodes, which then do not count.
+        Setting the property shortens the running episodes, which then do not count. Trials cannot be shortened.
         """
+        if isinstance(self.world, TrialWorld):
+            return self.world.elapsed
         return self.world.episodes.elapsed.clone()
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
+        if isinstance(self.world, TrialWorld):
+            raise BidexError("episode_length_buf: expected whole trials. Leave init_at_random_ep_len False.")
         given = dense(value, self.world.device)
         if given is None:
             steps = torch.zeros(0)

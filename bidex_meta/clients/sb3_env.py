@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.errors import BidexError
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, VectorWorld
@@ -74,14 +75,27 @@ class SB3VecEnv(vec_env.VecEnv):
         return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: _Rows = None) -> None:
-        """Set an attribute of the world."""
+        """Set an attribute of the world; raise BidexError if ``indices`` leave out environments."""
+        self._check_all("set_attr", indices)
         setattr(self.world, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: object, indices: _Rows = None, **method_kwargs: object
     ) -> list[object]:
-        """Call a method of the world once; return its result for each environment."""
+        """Call a method of the world once; return its result for each environment in ``indices`` (None: all).
+
+        ``render`` is called for each of these environments. Raises BidexError if ``reset`` leaves out environments.
+        """
+        if method_name == "render":
+            rows = self._get_indices(indices)
+            return [self.world.render(*method_args, env_id=row, **method_kwargs) for row in rows]
+        if method_name == "reset":
+            self._check_all(method_name, indices)
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
+
+    def _check_all(self, method: str, indices: _Rows) -> None:
+        if len(set(self._get_indices(indices))) < self.num_envs:
+            raise BidexError(f"{method}: expected all environments of the world, got {indices}. Leave indices out.")
 
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
         """Return for each environment whether a wrapper is present: True only for `Monitor`.

@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.clients.gymnasium_ids import both_seeds, make_suite_world
+from bidex_meta.clients.gymnasium_ids import OF_SINGLES, both_seeds, make_suite_world
 from bidex_meta.clients.needs import check_training
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.suite import SPLITS, Suite
@@ -43,9 +43,10 @@ class TrialWorld(PooledWorldWrapper):
     be passed to the other adapters, such as `SB3VecEnv`. Return and length are those of the trial; success is that of
     the trial's last episode. Within a trial, the next episode starts in the step that ends the previous one, and
     neither `terminated` nor `truncated` is set. The trial ends when its last episode ends, or when physics breaks.
-    Staggered starts are switched off, so no episode is shortened.
+    Staggered starts are switched off, so no episode is shortened; call `reset` before the first `step`.
 
-    Raises BidexError for a world in another autoreset mode than SAME_STEP, or one that shows its goals.
+    Raises BidexError for a world in another autoreset mode than SAME_STEP, one whose environments keep their tasks, or
+    one that shows its goals.
     """
 
     world: World
@@ -54,6 +55,11 @@ class TrialWorld(PooledWorldWrapper):
     def __init__(self, world: World) -> None:
         check_training(world, stagger=False)
         _check_hides(world.hides_goals, ", ".join(world.task_names))
+        if not world.draws_tasks:
+            raise BidexError(
+                "Expected a world that draws a task for each trial, got one whose environments keep their tasks. Make "
+                "it with episodes_per_task, also for trials of one episode."
+            )
         super().__init__(world)
         self.episodes_per_task = world.episodes_per_task
         self.max_episode_steps = world.max_episode_steps * self.episodes_per_task
@@ -66,6 +72,12 @@ class TrialWorld(PooledWorldWrapper):
         self._last = torch.zeros(world.num_envs, world.action_size + 2, device=world.device)
         self._sums: dict[str, Tensor] = {}
         self._forget(everywhere)
+        self._begun = False
+
+    @property
+    def elapsed(self) -> Tensor:
+        """Return the steps that each environment's running trial has lasted, int64 (num_envs,)."""
+        return self._sums["l"] + self.world.episodes.elapsed
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Start trials; see `VectorWorld.reset`."""
@@ -75,10 +87,13 @@ class TrialWorld(PooledWorldWrapper):
             mask = torch.ones(self.num_envs, dtype=torch.bool)
         mask = torch.as_tensor(mask, device=self.device)
         self._forget(mask)
+        self._begun = True
         return self._begin(mask, obs, info)
 
     def step(self, action: Tensor | np.ndarray, /) -> Step:
-        """Take actions; see `VectorWorld.step`."""
+        """Take actions; see `VectorWorld.step`. Raises BidexError before the first reset."""
+        if not self._begun:
+            raise BidexError("TrialWorld: expected reset() before step(), because no trial has begun.")
         is_last = self._episode_of_trial() == self.episodes_per_task - 1
         given, _ = checked.clean(checked.action(action, self.action_space.shape, self.device))
         obs, reward, terminated, truncated, own = self.world.step(action)
@@ -142,6 +157,7 @@ class TrialWorld(PooledWorldWrapper):
         trials = {name: value.to(self.device, copy=True) for name, value in state["trials"].items()}
         self._last = trials.pop("last")
         self._sums = trials
+        self._begun = True
 
 
 class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -205,7 +221,8 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._env = self._envs[self.task.env_name]
         self._env.set_task(self.task)
         self._left = self.episodes
-        return self._seen(self._begin_episode(), np.zeros(self._num_actions), 0.0, False), {}
+        self._last = np.zeros(self._num_actions + 2, np.float32)
+        return self._seen(self._begin_episode()), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Advance 1/60 s by an action (a,) in [-1, 1]; if an episode of the trial ends, begin the next one.
@@ -225,9 +242,11 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             info["is_success"] = self._solved
         elif ended:
             obs = self._begin_episode()
-        # The end of a trial is not marked, because its last observation has the value of an ongoing episode.
-        seen = self._seen(obs, action, reward, ended and not over)
-        return seen, reward, terminated and over, truncated and over, info
+        if not info["unstable"]:
+            # The end of a trial is not marked, because its last observation has the value of an ongoing episode.
+            applied, _ = checked.clean(checked.one_row(action, self._env.action_space))
+            self._last[:] = *applied[0], reward, ended and not over
+        return self._seen(obs), reward, terminated and over, truncated and over, info
 
     def _drawn_task(self) -> Task:
         task = self._tasks[int(self.np_random.integers(len(self._tasks)))]
@@ -242,9 +261,8 @@ class TrialEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, _ = self._env.reset(seed=int(self.np_random.integers(_SEEDS)))
         return obs
 
-    def _seen(self, obs: np.ndarray, action: np.ndarray, reward: float, ended: bool) -> np.ndarray:
-        applied = np.clip(np.nan_to_num(action, posinf=0.0, neginf=0.0), -1.0, 1.0)
-        return np.concatenate((obs, applied, (reward, ended)), dtype=np.float32)
+    def _seen(self, obs: np.ndarray) -> np.ndarray:
+        return np.concatenate((obs, self._last), dtype=np.float32)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Return a picture (height, width, 3), uint8; None without a render mode."""
@@ -262,8 +280,14 @@ def make_trials(
 ) -> TrialWorld:  # fmt: skip
     """Make the world of `gymnasium.make_vec("bidex-meta/trials", num_envs=64, suite="ML1-v2")`.
 
-    `episodes` is the number of episodes in a trial; other arguments are those of `make_suite_world`.
+    `episodes` is the number of episodes in a trial; other arguments are those of `make_suite_world`, without `stagger`.
     """
+    chosen = Benchmark(suite, both_seeds(seed, benchmark_seed)[0]).suite
+    _check_hides(chosen.observation == "masked", chosen.name)
+    for name in options.keys() & OF_SINGLES:
+        raise BidexError(f"{name}: expected options of a world for trials. Leave it out.")
+    if options.pop("stagger", False):
+        raise BidexError("stagger: expected False, because trials are not shortened. Leave it out.")
     options["episodes_per_task"] = episodes
     made = make_suite_world(suite, split, num_envs, seed, benchmark_seed, render_mode, **options)
     return TrialWorld(cast(World, made))  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all

@@ -176,7 +176,9 @@ class MetaWorldEnvs(VectorEnv):
 
     @checked_arguments
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Start an episode in every environment and return observations (num_envs, d)."""
+        """Start an episode in every environment and return observations (num_envs, d). There are no options."""
+        if options:
+            raise BidexError(f"MetaWorldEnvs: expected reset() without options, got {shortened(options)}.")
         obs, _ = self.world.reset(seed=seed)
         self._returns.zero_()
         self._lengths.zero_()
@@ -222,11 +224,13 @@ class MetaWorldEnvs(VectorEnv):
             raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
 
     def sample_tasks(self) -> None:
-        """Choose the next tasks in the order of each pool, one per environment; they apply from the next reset on."""
+        """Choose the next tasks in the order of each pool, one per environment; they apply from the next reset on.
+
+        Environment j of a class plays task j of its pool, so the pools are turned. They keep all their tasks.
+        """
         chosen = {}
         for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_env_ids, strict=True):
-            count = rows.stop - rows.start
-            chosen[name] = pool[(self._samples * count + np.arange(count)) % len(pool)]
+            chosen[name] = np.roll(pool, -self._samples * (rows.stop - rows.start), axis=0)
         self.world.set_tasks(chosen)
         self._samples += 1
 

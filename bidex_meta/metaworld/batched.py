@@ -76,7 +76,8 @@ class MetaWorldWorld(ForeignWorld):
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
             # The comparison is false for NaN.
-            if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):
+            whole = flat and bool((numbers == np.floor(numbers)).all())
+            if not whole or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):
                 fault = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
                 raise BidexError(f"{fault}, got {numbers.tolist()}.")
             chosen[name] = [int(number) for number in numbers.flatten()]

@@ -4,16 +4,18 @@ Each environment is wrapped in Meta-World's own wrappers, and Gymnasium's vector
 Keywords mean the same as in Meta-World.
 """
 
+import inspect
 import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.errors import BidexError, known_name
+from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
 from bidex_meta.metaworld.library import mended
 from bidex_meta.rules import V1, plain_name, versioned_name
@@ -22,11 +24,13 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments
 from bidex_meta.utils.validation import Count, Few, true_or_false
+from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.episodes import checked_mode
-from bidex_meta.world.single_env import AnyTask, EnvRecipe
+from bidex_meta.world.single_env import AnyTask, EnvRecipe, SuiteEnv
 
 Option = Any  # a keyword argument of Meta-World's functions; ``make_env`` and ``SuiteEnv`` define the types
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
+_OF_VECTORS = {"vector_strategy", "autoreset_mode", "meta_batch_size", "total_tasks_per_cls"}
 
 
 @checked_arguments
@@ -42,6 +46,10 @@ def make_mt_envs(
     that hides its goals.
     """
     if _is_class(name):
+        if fault := sorted(_OF_VECTORS & options.keys()):
+            raise BidexError(
+                f"{fault[0]}: expected a suite with it, such as MT4, because {name} is one environment. Leave it out."
+            )
         benchmark = MT1(name, seed)
         [(env_name, env_class)] = benchmark.train_classes.items()
         env_id = 0 if true_or_false("use_one_hot", options.get("use_one_hot", False)) else None
@@ -147,6 +155,7 @@ def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = 
         raise BidexError(f"{benchmark.name} hides its goals: make_ml_envs({benchmark.name!r}) makes its environments.")
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
         raise BidexError(f"meta_batch_size and total_tasks_per_cls are for meta suites; {benchmark.name} is not one.")
+    _check_numbered(benchmark)
     classes = benchmark.train_classes
     envs = [(env_class.recipe, benchmark.tasks_of(name)) for name, env_class in classes.items()]
     return _make_vector(envs, seed, num_tasks=num_tasks or len(envs), **options)
@@ -165,6 +174,7 @@ def _meta(
     if split not in benchmark.suite.splits:
         raise BidexError(f"split: expected train or test, got {split!r}.")
     if split == "train":
+        _check_numbered(benchmark)
         classes = benchmark.train_classes
     else:
         classes = benchmark.test_classes
@@ -178,8 +188,22 @@ def _meta(
     envs = []
     for name, env_class in classes.items():
         tasks = benchmark.tasks_of(name, split)[:total_tasks_per_cls]
+        if len(tasks) < (total_tasks_per_cls or 0):
+            raise BidexError(
+                f"total_tasks_per_cls: expected at most {len(tasks)}, the tasks of {name}, got {total_tasks_per_cls}. "
+                "Lower it, or leave it out."
+            )
         envs += [(env_class.recipe, share) for share in _split_tasks(tasks, size // len(classes))]
     return _make_vector(envs, seed, **options)
+
+
+def _check_numbered(benchmark: Benchmark) -> None:
+    """Raise BidexError if training draws new tasks without number, because its `train_tasks` are then unseen tasks."""
+    if benchmark.suite.train_tasks == 0:
+        raise BidexError(
+            f"{benchmark.name}: expected train tasks, but training draws new tasks (tasks_per_class = 0). Set "
+            "tasks_per_class, or use Benchmark(...).make_world or TrialEnv."
+        )
 
 
 @checked_arguments
@@ -204,27 +228,33 @@ def make_env(
 
     The environment plays the given `tasks`. With `task_select="random"` a task is drawn at each reset. With
     `"pseudorandom"` each call of `sample_tasks()` takes the next task of a shuffled list. `seed` determines the start
-    states and the order of tasks, which are random if it is None.
+    states and the order of tasks, which are random if it is None. `max_episode_steps` shortens episodes; in version 2
+    success is then judged at this limit.
 
     `use_one_hot` appends the one-hot of `env_id` among `num_tasks` to observations. `recurrent_info_in_obs` appends the
     last action, the last reward and whether the episode ended. The reward is divided by 10 if
     `normalize_reward_in_recurrent_info` is True. `options` are those of `SuiteEnv`.
     """
+    known = inspect.signature(SuiteEnv.__init__).parameters
+    for name in options.keys() - known:
+        raise unknown_name("option", name, inspect.signature(make_env).parameters.keys() | known.keys() - {"self"})
     wrappers = mended().wrappers  # the package's other names do not need these wrappers
-    single = recipe.make_class()(**options)
+    single = recipe.make_class()(max_episode_steps=max_episode_steps, **options)
     if seed is not None:
         single.seed(seed)
     single.toggle_terminate_on_success(terminate_on_success)
     env: gymnasium.Env = single
-    if max_episode_steps is not None:
-        env = gymnasium.wrappers.TimeLimit(env, max_episode_steps)
     if use_one_hot:
         if env_id is None or num_tasks is None:
             raise BidexError("use_one_hot: expected env_id and num_tasks with it, got none. Give both.")
+        if not 0 <= env_id < num_tasks:
+            raise BidexError(f"num_tasks: expected more than env_id, {env_id}, got {num_tasks}. Raise num_tasks.")
         with warnings.catch_warnings(action="ignore"):  # Meta-World's space has float64 bounds
             env = wrappers.OneHotWrapper(env, env_id, num_tasks)
     if recurrent_info_in_obs:
         env = wrappers.RNNBasedMetaRLWrapper(env, normalize_reward=normalize_reward_in_recurrent_info)
+    if use_one_hot or recurrent_info_in_obs:  # these two return float64
+        env = gymnasium.wrappers.DtypeObservation(env, np.float32)
     if reward_normalization_method == "gymnasium":
         env = gymnasium.wrappers.NormalizeReward(env)
     elif reward_normalization_method == "exponential":
@@ -233,7 +263,22 @@ def make_env(
         env = gymnasium.wrappers.NormalizeObservation(env)
     env = gymnasium.wrappers.RecordEpisodeStatistics(env)
     select = wrappers.RandomTaskSelectWrapper if task_select == "random" else wrappers.PseudoRandomTaskSelectWrapper
-    return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.env_name}_{env_id}")
+    return wrappers.CheckpointWrapper(_SeedFirst(select(env, list(tasks))), f"{recipe.env_name}_{env_id}")
+
+
+class _SeedFirst(gymnasium.Wrapper):
+    """Seeds an environment before Meta-World's wrappers draw its task, so that ``reset(seed=...)`` fixes the task."""
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
+        if seed is not None:
+            self.unwrapped.seed(seed)  # type: ignore[attr-defined]
+        return super().reset(seed=seed, options=options)
+
+    def get_checkpoint(self) -> dict:
+        return self.env.get_checkpoint()  # type: ignore[attr-defined]
+
+    def load_checkpoint(self, ckpt: dict) -> None:
+        self.env.load_checkpoint(ckpt)  # type: ignore[attr-defined]
 
 
 @checked_arguments

@@ -5,6 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
@@ -108,13 +109,10 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, ...], device: torch.dev
     return tensor
 
 
-def one_row(action: np.ndarray) -> np.ndarray | Tensor:
-    """Return the action (a,) of a single environment as a batch (1, a).
-
-    Anything but an array of numbers is returned unchanged.
-    """
-    given = dense(action, torch.device("cpu"))
-    return action if given is None else given[None]
+def one_row(given: Tensor | np.ndarray, space: Space) -> Tensor:
+    """Return the action (a,) of a single environment as a batch (1, a); raises BidexError as :func:`action` does."""
+    assert space.shape is not None
+    return action(given, space.shape, torch.device("cpu"))[None]
 
 
 def clean(action: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,11 +15,12 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.rules import CONTROL_RATE, V1, Rules, versioned_name
+from bidex_meta.rules import CONTROL_RATE, V1, Randomisation, Rules, versioned_name
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.task import Task
 from bidex_meta.utils.arguments import checked_arguments
-from bidex_meta.utils.validation import Pixels, Whole, true_or_false, whole_number
+from bidex_meta.utils.validation import Count, Pixels, Whole, true_or_false, whole_number
 from bidex_meta.world.checked import one_row
 from bidex_meta.world.config import WorldConfig
 from bidex_meta.world.contract import Info, Options
@@ -33,7 +34,7 @@ _FAR = 2**31
 
 
 class AnyTask(Protocol):
-    """The part of a task (`bidex_meta.Task`) that `set_task` reads."""
+    """The part of a task (`bidex_meta.Task`, or Meta-World's) that `set_task` reads."""
 
     @property
     def env_name(self) -> str:
@@ -41,8 +42,8 @@ class AnyTask(Protocol):
         ...
 
     @property
-    def variation(self) -> np.ndarray:
-        """Variation of the task, shape (size,)."""
+    def data(self) -> bytes:
+        """Variation of the task, as in `bidex_meta.Task`."""
         ...
 
 
@@ -68,6 +69,8 @@ class EnvRecipe:
     """True if the suite's file lists the tasks; these may lie outside of the class's variation space."""
     touch: bool = False
     """True if observations show touch sensors."""
+    randomisation: Randomisation | None = None
+    """Randomisation of the environments; None: nothing is randomised."""
 
     @property
     def env_name(self) -> str:
@@ -105,6 +108,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     end of an episode, so that `success` is 0.0 before the last step. An episode is a success if any of its steps has
     `success` 1.0.
 
+    The suite's randomisation applies to the classes in `train_classes`. `max_episode_steps` shortens the time limit of
+    episodes; in version 2 success is then judged at this limit.
+
     `render_mode` is None or `"rgb_array"`. `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`;
     `camera_id` may give its index in this list instead. Pictures have `width` x `height` pixels. There is only the
     suite's reward: `reward_function_version` must be `"v2"`, Meta-World's default. Raises BidexError for other values.
@@ -124,6 +130,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         width: Pixels = 480,
         height: Pixels = 480,
         reward_function_version: str = "v2",
+        max_episode_steps: Count | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
@@ -134,6 +141,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             )
         self.render_mode = render_mode
         self._picture = (width, height, _camera(camera_name, camera_id))
+        self._limit = self.task_class.episode_steps
+        if max_episode_steps is not None:
+            self._limit = min(self._limit, max_episode_steps)
         recipe = self.recipe
         space = self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
@@ -146,14 +156,15 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             observation="masked" if recipe.hides_goal else "plain",
             pad_to=recipe.padded_size,
             points=points,
+            randomisation=recipe.randomisation,
         )
         self._world = World([slot], config)
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space
         self.goal_space = Box(np.array(space.low), np.array(space.high), dtype=np.float64)
         self.terminate_on_success = False
-        self._task: AnyTask | None = None
-        self._given: AnyTask | None = None  # the task waits for the next reset
+        self._task: Task | None = None
+        self._given: Task | None = None  # the task waits for the next reset
         self._over = True
 
     @property
@@ -164,7 +175,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     @property
     def max_path_length(self) -> int:
         """Return the time limit of an episode, steps of 1/60 s."""
-        return self.task_class.episode_steps
+        return self._limit
 
     def seed(self, seed: int) -> list[int]:
         """Seed the random numbers of starts and wrappers, as `reset(seed=...)` does, and those of the spaces."""
@@ -186,7 +197,8 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
                 f"Expected a task of {name}, got one of {task.env_name}. Take tasks and classes of one benchmark."
             )
         space = self.task_class.variation_space
-        variation = task.variation
+        given = Task(name, task.data)
+        variation = given.variation
         if variation.shape != (space.size,):
             raise BidexError(f"Expected a task of {space.size} numbers, got {variation.shape}.")
         if not self.recipe.listed and not space.contains(variation):
@@ -195,7 +207,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
                 f"Expected a task of {name} with {space.names[outside]} from {space.low[outside]:g} to "
                 f"{space.high[outside]:g}, got {variation[outside]:g}. Take tasks and classes of one benchmark."
             )
-        self._given = task
+        self._given = given
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode; return observation (d,), float32, and an empty info. A seed always gives the same episode.
@@ -224,14 +236,15 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")
-        obs, reward, terminated, truncated, info = self._world.step(one_row(action))
-        ended = bool(terminated | truncated)
+        obs, reward, terminated, truncated, info = self._world.step(one_row(action, self.action_space))
+        cut = bool(truncated) or int(self._world.episodes.length) >= self._limit
+        ended = bool(terminated) or cut
         success = bool(info["success"]) and (ended or not self._world.success_at_end)
         lost = bool(terminated) or (self.terminate_on_success and success)
-        self._over = lost or bool(truncated)
+        self._over = lost or cut
         step_info = {"success": float(success), "unscaled_reward": float(info["reward_unscaled"])}
         step_info["unstable"] = bool(info["unstable"])
-        return _array(obs), float(reward), lost, bool(truncated) and not lost, step_info
+        return _array(obs), float(reward), lost, cut and not lost, step_info
 
     def toggle_terminate_on_success(self, on: bool) -> None:
         """Set whether an episode ends at its first success; in version 2 no success comes before the time limit."""

@@ -88,7 +88,10 @@ class World(BatchedWorld):
         super().__init__(table, num_envs, device, config.autoreset_mode, config.stagger, config.seed)
         self.episodes_per_task = config.episodes_per_task
         self.endless = config.task_sampling == "fresh"
-        self._renews_tasks = self.endless and self.autoreset_mode != AutoresetMode.DISABLED
+        draws = self.autoreset_mode != AutoresetMode.DISABLED
+        self.draws_tasks = draws and config.task_sampling != "fixed"
+        """Whether environments draw their tasks; otherwise each of them keeps its task."""
+        self._renews_tasks = draws and self.endless
         if self._renews_tasks:
             # Entry j of a pool belongs to environment j, and each episode start replaces it.
             self.slots = [_with_entries(*each) for each in zip(self.slots, self.slot_env_ids, strict=True)]

@@ -261,6 +261,11 @@ def test_sb3_seeds_options_and_attributes() -> None:
     assert all(env.env_is_wrapped(import_module("stable_baselines3.common.monitor").Monitor))
     env.set_attr("note", 1)
     assert env.get_attr("note", 0) == [1]
+    for call in (lambda: env.set_attr("note", 2, indices=[0]), lambda: env.env_method("reset", indices=[1])):
+        with pytest.raises(BidexError, match=r"expected all environments of the world, got \[[01]\]"):
+            call()
+    env.world.render = lambda env_id: env_id
+    assert env.env_method("render", indices=[3, 1]) == [3, 1]
     env.set_options({"env_idx": 1})
     with pytest.raises(BidexError, match="env_idx"):
         env.reset()

@@ -149,6 +149,7 @@ FAULTS: dict[str, tuple[Any, str]] = {
     "short": ({"action": {"dtype": "<f4", "shape": [2, 2], "data": b"\0" * 8}}, "got ValueError: cannot reshape"),
     "words": ({"action": {"dtype": "words", "shape": [2, 2], "data": b""}}, "got TypeError: data type 'words'"),
     "objects": ({"action": {"dtype": "O", "shape": [2, 2], "data": b"\0" * 32}}, "got ValueError"),
+    "broken": (packed(np.full((2, 2), np.nan, "<f4")), "got numbers that are not finite"),
     "error": ({"error": "no weights\nhere"}, "got its error 'no weights.*Look at the server's output"),
 }
 

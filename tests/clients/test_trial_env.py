@@ -1,6 +1,7 @@
 """Trials as episodes: one environment, and a world of them."""
 
 import warnings
+from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -152,11 +153,67 @@ def test_numpy_and_ids_show_trials() -> None:
     assert singles.single_observation_space.shape == (size,)
 
 
+def test_trials_of_one_episode_draw_tasks_too() -> None:
+    world: Any = gymnasium.make_vec("bidex-meta/trials", num_envs=2, suite=SUITE, episodes=1, seed=0, device="cpu")
+    tasks = [world.reset() and world.task_index for _ in range(8)]
+    assert len(torch.cat(tasks).unique()) > 4
+    with pytest.raises(BidexError, match=r"draws a task for each trial.* Make it with episodes_per_task"):
+        TrialWorld(Benchmark(SUITE).make_world("train", 2, "cpu"))
+
+
+def test_a_started_world_begins_whole_trials() -> None:
+    """Its own first episodes were shortened."""
+    inner = Benchmark(SUITE).make_world("train", 2, "cpu", threads=1, episodes_per_task=2)
+    inner.reset(seed=0)
+    world = TrialWorld(inner)
+    with pytest.raises(BidexError, match=r"expected reset\(\) before step\(\)"):
+        world.step(torch.zeros(2, ACTIONS))
+    world.reset()
+    assert not inner.episodes.elapsed.any()
+
+
+def test_rsl_rl_reads_the_length_of_trials_and_cannot_shorten_them() -> None:
+    world = trial_world(2)
+    env = import_module("bidex_meta.clients.rsl_rl_env").RslRlVecEnv(world)
+    env.reset(seed=0)
+    lasted = torch.zeros(2, dtype=torch.int64)
+    later = False
+    for action in random_actions(world, int(world.world.max_episode_steps[0]) + 2):
+        dones = env.step(action)[2]
+        lasted = (lasted + 1).masked_fill(dones, 0)
+        assert torch.equal(env.episode_length_buf, lasted)
+        later = later or bool((lasted > world.world.episodes.elapsed).any())
+    assert later, "a trial is longer than its running episode"
+    with pytest.raises(BidexError, match="init_at_random_ep_len False"):
+        env.episode_length_buf = torch.zeros(2)
+
+
+def test_one_environment_and_a_world_show_the_same_after_broken_physics() -> None:
+    env, world = TrialEnv(SUITE, episodes=2, seed=0), trial_world(1)
+    env.reset()
+    world.reset()
+    actions = torch.full((2, ACTIONS), 0.5)
+    actions[1, 0] = torch.nan
+    for action in actions:
+        obs, _, _, truncated, info = env.step(action.numpy())
+        of_world = world.step(action[None])[-1]
+    assert truncated and info["unstable"]
+    # The last step's action stays the one before, which was applied. The two have different rewards.
+    assert np.array_equal(obs[-ACTIONS - 2 : -2], of_world["final_obs"][0, -ACTIONS - 2 : -2]) and obs[-2] != 0.0
+
+
 def test_what_is_no_trial_is_refused() -> None:
     with pytest.raises(BidexError, match=r"Expected a suite that hides its goals.* MT4-v2 shows them"):
         TrialEnv("MT4-v2")
     with pytest.raises(BidexError, match="split"):
         TrialEnv(SUITE, "others")
+    for suite, fault, options in (
+        ("MT4-v2", "hides its goals", {}),
+        (SUITE, "stagger", {"stagger": True}),
+        (SUITE, "vector_strategy", {"vector_strategy": "sync"}),
+    ):
+        with pytest.raises(BidexError, match=fault):
+            gymnasium.make_vec("bidex-meta/trials", num_envs=1, suite=suite, **options)
     with pytest.raises(BidexError, match="episodes"):
         TrialEnv(SUITE, episodes=0)
     with pytest.raises(BidexError, match="Expected a suite that hides its goals"):

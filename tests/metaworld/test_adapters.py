@@ -158,6 +158,8 @@ def test_tasks_are_sampled_in_turns():
         envs.call("sample_tasks")
         envs.reset()
         assert np.allclose(place.goal[:3], ring(8)[expected], atol=1e-6)
+    # The world keeps all its tasks, for the next evaluation.
+    assert [len(pool) for pool in place.pools] == [8, 8] and len(np.unique(place.pools[0], axis=0)) == 8
 
 
 def test_refusals_name_the_mend():
@@ -165,6 +167,8 @@ def test_refusals_name_the_mend():
         MetaWorldEnvs(points(mode="SAME_STEP"))
     with pytest.raises(BidexError, match="sample_tasks"):
         MetaWorldEnvs(points()).call("toggle_sample_tasks_on_reset", True)
+    with pytest.raises(BidexError, match=r"expected reset\(\) without options"):
+        MetaWorldEnvs(points()).reset(options={"reset_mask": np.ones(16, bool)})
 
 
 @pytest.mark.parametrize("algo", ["maml", "promp", "rl2"])

@@ -1,22 +1,20 @@
 """Code written for Meta-World runs here by changing the import: the same functions on its module and on ours."""
 
-import copy
-import pickle
 import random
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cloudpickle
 import gymnasium
 import metaworld as original
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils import seeding
-from gymnasium.utils.env_checker import check_env
 from metaworld import evaluation as original_evaluation
 
 import bidex_meta.metaworld as ours
@@ -25,7 +23,6 @@ from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
 from bidex_meta.rules import V2
-from bidex_meta.world.single_env import SuiteEnv
 
 BOTH = pytest.mark.parametrize(
     ("metaworld", "name"), [(original, "reach-v3"), (ours, "HandOver")], ids=["metaworld", "bidex-meta"]
@@ -43,6 +40,14 @@ env = metaworld.make_mt_envs("reach-v3", seed=0)
 env.reset()
 assert env.step(env.action_space.sample())[0].shape == (39,)
 """
+
+
+def endless() -> str:
+    """A file of a suite whose training draws new tasks."""
+    path = Path(tempfile.mkdtemp()) / "endless.toml"
+    text = Path("suites/ML1-v2.toml").read_text()
+    path.write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 0"))
+    return str(path)
 
 
 # Meta-World's examples; the benchmark is an argument.
@@ -153,38 +158,41 @@ def test_wrappers_keep_their_meaning(metaworld: ModuleType, name: str) -> None:
         obs, _, _, truncated, info = env.step(action)
     np.testing.assert_array_equal(obs[size + 3 : -2], action)
     assert truncated and obs[-1] == 1.0 and info["episode"]["l"] == 8
+    assert metaworld is original or env.observation_space.contains(obs)
     env_id, state = env.get_checkpoint()
     assert len(state["tasks"]) == 50 and isinstance(env_id, str)
 
 
+@pytest.mark.parametrize("make", [ours.make_mt_envs, ours.make_ml_envs])
+def test_a_checkpoint_of_their_wrappers_goes_on_alike(make: Callable[..., Any]) -> None:
+    first, second = (make("CatchUnderarm" if make is ours.make_ml_envs else "MT4", seed=seed) for seed in (0, 1))
+    for envs in (first, second):
+        envs.reset()
+        if make is ours.make_ml_envs:
+            envs.call("sample_tasks")
+    second.call("load_checkpoint", list(first.call("get_checkpoint")))
+    for _ in range(2):
+        seen = []
+        for envs in (first, second):
+            if make is ours.make_ml_envs:
+                envs.call("sample_tasks")
+            seen.append(envs.reset()[0])
+        np.testing.assert_array_equal(*seen)
+
+
+def test_reset_with_a_seed_fixes_the_task_too() -> None:
+    envs: Any = ours.make_mt_envs("MT4", seed=0)
+    first, again, other = (envs.reset(seed=seed)[0] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any(axis=1).all()
+
+
+def test_render_mode_of_make_vec_reaches_the_environments() -> None:
+    envs: Any = gymnasium.make_vec("bidex-meta/MT4-v1", vector_strategy="sync", render_mode="rgb_array")
+    assert envs.get_attr("render_mode") == ("rgb_array",) * 4
+
+
 # What is ours.
-
-
-def test_an_environment_plays_what_a_row_of_the_world_plays() -> None:
-    benchmark, seed = Benchmark("MT20", 3), 5
-    drawn = int(seeding.np_random(seed)[0].integers(2**31))
-    classes = list(benchmark.train_classes.items())
-    world = benchmark.make_world(num_envs=len(classes), device="cpu", autoreset_mode="DISABLED", threads=1)
-    world_obs, _ = world.reset(seed=drawn)
-    envs = []
-    for i, (name, env_cls) in enumerate(classes):
-        env = env_cls()
-        env.set_task(next(task for task in benchmark.train_tasks if task.env_name == name))
-        obs, _ = env.reset(seed=seed)
-        np.testing.assert_array_equal(obs, world_obs[i, : len(obs)].numpy(), err_msg=name)
-        envs.append(env)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(4):
-        actions = 2.0 * torch.rand(len(envs), 52, generator=generator) - 1.0
-        world_obs, reward, terminated, truncated, info = world.step(actions)
-        for i, env in enumerate(envs):
-            if env._over:
-                continue
-            obs, *rest, told = env.step(actions[i].numpy())
-            np.testing.assert_array_equal(obs, world_obs[i, : len(obs)].numpy(), err_msg=env.task_name)
-            assert rest == [float(reward[i]), bool(terminated[i]), bool(truncated[i])]
-            assert told["success"] == float(info["success"][i])
-            assert told["unscaled_reward"] == float(info["reward_unscaled"][i])
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -307,105 +315,6 @@ def test_ids_of_custom_benchmarks_and_of_one_class() -> None:
     assert {task for share in split.get_attr("tasks") for task in share} == set(ours.ML1("Switch", 1).test_tasks)
 
 
-def test_an_environment_ends_as_its_class_says_and_at_success_if_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    mt1 = ours.MT1("CatchUnderarm", 0)
-    env = mt1.train_classes["CatchUnderarm"]()
-    env.set_task(mt1.train_tasks[0])
-    env.toggle_terminate_on_success(True)
-    for _ in range(2):
-        env.reset(seed=0)
-        terminated = False
-        while not terminated:  # it falls long before the time is up
-            _, _, terminated, truncated, info = env.step(np.full(52, -1.0, np.float32))
-            assert not truncated
-        assert info["success"] == 0.0
-    env.reset(seed=0)
-    monkeypatch.setattr(type(env.task_class), "success", lambda self, state: torch.ones(1, dtype=torch.bool))
-    assert env.step(np.zeros(52, np.float32))[2:4] == (True, False)
-    env.toggle_terminate_on_success(False)
-    env.reset(seed=0)
-    assert env.step(np.zeros(52, np.float32))[2:4] == (False, False)
-
-
-@pytest.mark.parametrize("terminate", [False, True])
-def test_in_version_2_success_counts_at_the_end_alone(monkeypatch: pytest.MonkeyPatch, terminate: bool) -> None:
-    benchmark = Benchmark("MT1-v2", 0)
-    env = benchmark.train_classes["CatchUnderarm"]()
-    env.set_task(benchmark.train_tasks[0])
-    env.toggle_terminate_on_success(terminate)
-    solved, limit = [False], env.max_path_length
-    monkeypatch.setattr(type(env.task_class), "success", lambda self, state: torch.tensor(solved))
-    monkeypatch.setattr(type(env.task_class), "failed", lambda self, state: torch.zeros(1, dtype=torch.bool))
-    for held, expected in ((range(20), 0.0), (range(limit - 15, limit), 1.0)):
-        env.reset(seed=0)
-        told = []
-        for step in range(limit):
-            solved[0] = step in held
-            _, _, terminated, truncated, info = env.step(np.zeros(52, np.float32))
-            told.append(info["success"])
-            assert (terminated or truncated) == (step == limit - 1)
-        assert told == [0.0] * (limit - 1) + [expected]
-
-
-def test_seeds_repeat_an_episode_and_tasks_hold_from_the_next_reset() -> None:
-    ml1 = ours.ML1("HandOver", 0)
-    env = ml1.train_classes["HandOver"]()
-    with pytest.raises(BidexError, match="set_task"):
-        env.reset()
-    env.set_task(ml1.train_tasks[0])
-    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other) and not np.array_equal(env.reset()[0], env.reset()[0])
-    env.set_task(ml1.train_tasks[1])
-    env.step(np.zeros(52, np.float32))
-    assert env._task == ml1.train_tasks[0]
-    env.reset()
-    assert env._task == ml1.train_tasks[1]
-    assert env.seed(1) == [1]
-    env.set_task(ml1.train_tasks[0])
-    np.testing.assert_array_equal(env.reset()[0], first)
-
-
-@pytest.mark.filterwarnings("ignore:.*infinity")
-def test_an_environment_passes_gymnasiums_checker() -> None:
-    env = ours.MT1("Switch").train_classes["Switch"]()
-    env.set_task(ours.MT1("Switch").train_tasks[0])
-    check_env(env, skip_render_check=True)
-
-
-def test_classes_are_the_same_objects_and_travel() -> None:
-    env_cls = Benchmark("MT4").train_classes["HandOver"]
-    assert env_cls is Benchmark("MT4", 1).train_classes["HandOver"]
-    assert env_cls is not Benchmark("ML4").train_classes["HandOver"]
-    assert (env_cls.__name__, env_cls.task_class.name) == ("HandOver", "HandOver")
-    assert pickle.loads(pickle.dumps(env_cls.recipe)).make_class() is env_cls
-    assert pickle.loads(pickle.dumps(env_cls)) is copy.deepcopy(env_cls) is env_cls
-    assert pickle.loads(pickle.dumps(SuiteEnv)) is SuiteEnv
-    assert cloudpickle.loads(cloudpickle.dumps(env_cls))().task_name == "HandOver"
-    assert set(ours.ALL_V3_ENVIRONMENTS) == set(ours.MT1.ENV_NAMES)
-
-
-@pytest.mark.parametrize("begun", [False, True])
-def test_environments_pickle_and_go_on_alike(begun: bool) -> None:
-    benchmark = ours.ML1("CatchUnderarm", seed=2)
-    env = benchmark.train_classes["CatchUnderarm"]()
-    env.seed(3)
-    env.set_task(benchmark.train_tasks[4])
-    if begun:
-        env.reset()
-        env.step(np.ones(52, np.float32))
-    vector = ours.make_ml_envs("CatchUnderarm", seed=0)
-    assert pickle.loads(pickle.dumps(vector)).num_envs == 1
-    action = np.linspace(-1, 1, 52, dtype=np.float32)
-    seen = []
-    for each in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env), env):
-        obs = [] if begun else [each.reset()[0]]
-        seen.append([*obs, *(each.step(action)[0] for _ in range(3)), each.reset()[0], each.step(action)[0]])
-        assert type(each) is type(env) and each._task == benchmark.train_tasks[4]
-    np.testing.assert_array_equal(seen[0], seen[2])
-    np.testing.assert_array_equal(seen[1], seen[2])
-
-
 @pytest.mark.parametrize("first", ["metaworld", "bidex_meta.metaworld"])
 def test_a_benchmark_is_one_of_meta_worlds_whose_own_code_runs_beside_ours(first: str) -> None:
     """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
@@ -446,6 +355,13 @@ def test_constructors_take_what_meta_worlds_take() -> None:
         (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", env_name="HandOver"), "make_mt_envs('HandOver')"),
         (lambda: gymnasium.make_vec("bidex-meta/ML4-train-v2", env_name="handover"), "make_ml_envs('HandOver-v2')"),
         (lambda: gymnasium.make_vec("bidex-meta/ML1-test-v1", env_name="HandOver-v2"), "ends in -v2"),
+        (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", vector_strategy="sync", stagger=True), "stagger"),
+        (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", use_one_hot=True), "need vector_strategy"),
+        (lambda: ours.make_ml_envs("HandOver", total_tasks_per_cls=100), "at most 50, the tasks of HandOver, got 100"),
+        (lambda: ours.make_mt_envs("HandOver", vector_strategy="sync"), "vector_strategy: expected a suite with it"),
+        (lambda: ours.make_mt_envs("HandOver", one_hot=True), "Did you mean 'use_one_hot'?"),
+        (lambda: ours.make_mt_envs("MT4", use_one_hot=True, num_tasks=2), "num_tasks: expected more than env_id, 2"),
+        (lambda: ours.make_ml_envs(endless(), seed=0), "training draws new tasks (tasks_per_class = 0)"),
         (lambda: ours.ML4().train_classes["HandOver"]().set_task(ours.MT1("Switch").train_tasks[0]), "one of Switch"),
     ],
 )
