@@ -15,6 +15,7 @@ from typing import Any
 import tyro
 from torch import nn
 
+from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.experiments.policies import load_policy
 from bidex_meta.experiments.sweep_plan import SweepPlan
@@ -27,6 +28,7 @@ from bidex_meta.runs.stored import FORMAT, read_study, study_text
 from bidex_meta.suite_files import load_suite, suite_names
 from bidex_meta.utils.files import portable, read_text
 from bidex_meta.utils.plugins import short_name
+from tools.standard import check_standard
 
 POINTS = 60
 """Largest number of points of a curve."""
@@ -35,8 +37,9 @@ _TAG = re.compile(
     r"|Perf/steps_per_second"
 )
 _TRAINED = "Train/return/"
-_OF_A_RUN = ("task", "algo", "seed", "learner")
-"""Config entries that must be equal if a run replaces a stored run of the same name."""
+_FREE = ("device", "engine", "deterministic", "threads", "preset", "record", "record_share")
+"""Config entries that may differ if a run replaces a stored run of the same name, besides those that a resumed run may
+change. The engine is compared as resolved, because ``auto`` depends on the device."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """Measures of a class that are stored for each shot; the evaluation after the last shot also has counts and lengths."""
 
@@ -62,9 +65,12 @@ def collect(
         content = condensed(folder, arm or label, _parameters(folder))
         name = content["name"]
         known = contents.get(name)
-        another = known is not None and any(known["config"].get(key) != content["config"][key] for key in _OF_A_RUN)
-        if name in added or another:
-            raise BidexError(f"{into}:{name} is another run than {path}. Rename the run's folder, or remove the entry.")
+        differing = [] if known is None else _differing(known, content)
+        if name in added or differing:
+            told = f" ({', '.join(differing)} differ)" if differing else ""
+            raise BidexError(
+                f"{into}:{name} is another run than {path}{told}. Rename the run's folder, or remove the entry."
+            )
         contents[name] = content
         added.append(name)
     into.parent.mkdir(parents=True, exist_ok=True)
@@ -111,6 +117,16 @@ def arm_of(path: Path, config: Json) -> str:
     return short_name(config["algo"]) if not name or re.match(r"\d{4}-\d\d-\d\d", name) else name
 
 
+def _differing(known: Json, content: Json) -> list[str]:
+    """Return the names of the entries that show that two entries of a study with one name are different runs."""
+    one = config_of(known["config"], "the stored run's config")
+    other = config_of(content["config"], "the run's config")
+    names = [name for name, _, _ in one.differences(other, _FREE)]
+    if known["engine"] != content["engine"]:
+        names.append("engine")
+    return names
+
+
 def _named(path: Path, out: Path) -> list[tuple[Path, str | None]]:
     """Return the folders of the runs that a path names, each with its arm (its name in tables).
 
@@ -149,8 +165,7 @@ def _check(folder: RunFolder, evaluation: Evaluated, rows: Sequence[Json]) -> No
     versions = versions_of(folder)
     if versions.git is None or not versions.git.commit:
         raise BidexError(f"{folder.path / 'versions.json'} names no commit, so the run cannot be repeated.")
-    if evaluation.split != "train":
-        raise BidexError(f"{folder.evaluation_path} is of {evaluation.split} tasks. Write it again: {folder.again}")
+    check_standard(folder, evaluation)
     other = [str(each) for each in differences(versions, evaluation.conditions) if each.is_of_worlds]
     if other:
         raise BidexError(

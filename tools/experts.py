@@ -8,11 +8,13 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Kind, load, store
+from bidex_meta.rules import V1
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import PolicyEvaluation
 from bidex_meta.runs.stored import Run, open_runs
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.worlds import open_worlds
+from tools.standard import check_standard
 
 _SOLVES = 0.5
 """Smallest success over all tasks of a class for which a policy counts as an expert."""
@@ -43,7 +45,8 @@ def best_known(names: Collection[str], runs: Sequence[Path]) -> dict[str, Json]:
     """Find return and source of the best policy of each class among those that solve at least half of the tasks.
 
     A class without such a policy is left out. ``runs`` are folders of evaluated runs, or entries that ``collect`` has
-    stored. Raises BidexError if a run has no evaluation, or plays a class with fixed bases.
+    stored. Raises BidexError if a run has no evaluation on train tasks without randomisation, plays a class with fixed
+    bases, or plays by other rules than those of version 1.
     """
     candidates: list[tuple[str, Json]] = []
     for run in chain.from_iterable(map(open_runs, runs)):
@@ -67,7 +70,13 @@ def _of_run(run: Run) -> list[tuple[str, Json]]:
         raise BidexError(
             f"Expected a run with moving bases, as in suites, but {run.path} plays {source.name} with fixed ones."
         )
+    if source.rules != V1:
+        raise BidexError(
+            f"Expected a run by the rules of version 1, but {run.path} plays {source.name} by other rules. Leave it "
+            "out, because its returns cannot be compared."
+        )
     evaluation = run.evaluation()
+    check_standard(run, evaluation)
     if not isinstance(evaluation, PolicyEvaluation):
         raise BidexError(
             f"Expected the evaluation of one policy, but that of {run.path} is a meta-test. Name a run of "

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from bidex_meta.runs.stored import open_runs, read_study, study_text
 from tests.fakes import change, evaluated_run, log
 from tools import collect as tool
 from tools import experts
+from tools.pages.pretrained import pretrained_table
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -100,6 +102,39 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
         collect(good, into=into)
 
 
+@pytest.mark.parametrize("entries", [{"suite": "MT20"}, {"num_envs": 16}, {"touch": True}, {"dataset": ("A/b-v0",)}])
+def test_a_run_with_other_settings_does_not_replace_a_stored_run(tmp_path: Path, entries: dict[str, Any]) -> None:
+    run, into = evaluated(tmp_path, 0, 0.5, "run"), tmp_path / "data.json"
+    collect(run, into=into)
+    collect(change(run, threads=3, minutes=60.0), into=into)
+    assert read_study(into)[0].config().threads == 3
+    before = into.read_text()
+    with pytest.raises(BidexError, match=rf"is another run than .* \({next(iter(entries))} differ\)"):
+        collect(change(run, **entries), into=into)
+    assert into.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("entries", "told"),
+    [
+        ({"randomisation": {"joint_noise": 0.1}}, "without randomisation, got one with --randomisation"),
+        ({"split": "test"}, "of train tasks, got test tasks"),
+    ],
+)
+def test_only_evaluations_on_train_tasks_without_randomisation_are_shown(
+    tmp_path: Path, entries: dict[str, Any], told: str
+) -> None:
+    path = evaluated(tmp_path / "results", 0, 0.5, "run")
+    evaluation = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({**evaluation, **entries}))
+    with pytest.raises(BidexError, match=told):
+        collect(path, into=tmp_path / "data.json")
+    with pytest.raises(BidexError, match=told):
+        experts.best_known(["A"], [path])
+    with pytest.raises(BidexError, match=told):
+        list(pretrained_table("policies", tmp_path / "results" / "data"))
+
+
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     content = tool.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5, "good")), "x", 7)
@@ -145,3 +180,9 @@ def test_the_expert_is_the_best_that_solves_half_of_the_tasks(tmp_path: Path, mo
         "CatchAbreast": (6.0, "mtppo on MT4, 1,000 steps, seed 3"),
         "CatchUnderarm": (5.0, "witness"),
     }
+
+
+def test_runs_of_version_2_are_no_experts_of_version_1(tmp_path: Path) -> None:
+    path = change(evaluated_run(tmp_path, 0, {"Switch": 1.0}), suite="MT20-v2")
+    with pytest.raises(BidexError, match=r"rules of version 1, but .* plays MT20-v2 by other rules"):
+        experts.best_known(["Switch"], [path])

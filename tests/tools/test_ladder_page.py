@@ -8,21 +8,34 @@ from typing import Any
 import pytest
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.evaluations import ClassSummary, MetaTestEvaluation, PolicyEvaluation, SplitSummary, Summary
-from tools.pages.gained import adaptation_table
+from bidex_meta.runs.evaluations import (
+    ClassSummary,
+    Estimate,
+    Gains,
+    MetaTestEvaluation,
+    OtherTasks,
+    PolicyEvaluation,
+    SplitSummary,
+    Summary,
+)
+from tools.pages.gained import adaptation_table, gains_table
 from tools.pages.ladder import BLIND, SHOWN, ladder_figure, ladder_table, suites_table
 
-SUITE = "ML1-Door-choice4"
+SUITE = "ML1-DoorOpenOutward-choice4"
+OTHER_TEST_TASKS = "ML1-DoorOpenOutward-shared"
 
 
 def summary(success: float) -> Summary:
     return Summary(classes={"Door": ClassSummary(success=success, mean_return=1.0)})
 
 
-def run(arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None) -> Any:
+def run(
+    arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float | None = None, unseen: float | None = None
+) -> Any:
     """A stored run: of a learner that adapts if there is success after several numbers of episodes."""
     if len(success) == 1:
-        found: Any = PolicyEvaluation(policy=summary(success[0]))
+        other_tasks = None if unseen is None else OtherTasks(policy=summary(unseen))
+        found: Any = PolicyEvaluation(policy=summary(success[0]), other_tasks=other_tasks)
         algo = "mtppo"
     else:
         shots = [summary(share) for share in success]
@@ -34,7 +47,8 @@ def run(arm: str, seed: int, *success: float, suite: str = SUITE, hidden: float 
         algo = arm if arm == "icl" else "rl2"
     content = {"steps": 1000, "seconds": 120.0, "suite": {"name": suite}}
     config = SimpleNamespace(algo=algo, seed=seed)
-    return SimpleNamespace(arm=arm, content=content, evaluation=lambda: found, config=lambda: config)
+    path = Path("results/data/ladder.json")
+    return SimpleNamespace(arm=arm, path=path, content=content, evaluation=lambda: found, config=lambda: config)
 
 
 def table(*runs: Any) -> list[str]:
@@ -94,6 +108,32 @@ def test_suites_stand_with_their_validity_and_both_lines(tmp_path: Path) -> None
     assert row == [SUITE, "left_angle", "25.0 %", "26.4 % (25 %)", "100.0 %", "10 % (10 to 10)", "91 % (90 to 92)"]
     runs[0].path = tmp_path / "elsewhere" / "data" / "ladder.json"
     assert cells(list(suites_table(study))[2])[:5] == [SUITE, "", "", "", ""]
+
+
+def test_success_on_train_tasks_is_marked_unless_they_are_the_test_tasks() -> None:
+    seen = [run("ppo", seed, 0.1, suite=OTHER_TEST_TASKS) for seed in (0, 1)]
+    unseen = [run("ppo", seed, 0.1, suite=OTHER_TEST_TASKS, unseen=0.3) for seed in (0, 1)]
+    for rows in (table(*seen), list(suites_table(SimpleNamespace(split=None, runs=seen)))):  # pyright: ignore
+        assert any("| 10 % (10 to 10) on train tasks |" in line for line in rows)
+    assert any("| 30 % (30 to 30) |" in line for line in table(*unseen))
+    assert not any("on train tasks" in line for line in table(*learners())), "a choice suite tests its train tasks"
+    with pytest.raises(BidexError, match=f"blind PPO on {OTHER_TEST_TASKS}, but some are only on train tasks"):
+        table(seen[0], unseen[1])
+
+
+def test_gains_are_compared_with_a_control_of_the_same_budget() -> None:
+    runs = []
+    for arm, value, most in (("control", 1.0, 150), ("ProMP", 3.0, 150), ("ProMP whole episodes", 4.0, 500)):
+        gains = Gains({"Door": {"return": Estimate(value, None)}}, {})
+        part = SplitSummary(
+            shots=2, rollouts=4, trials=1, max_adapt_steps=most, before=summary(0.1), after=summary(0.2), gain=gains,
+            by_shot=[summary(0.1)],
+        )  # fmt: skip
+        runs.append(run(arm, 0, 0.1, 0.2))
+        runs[-1].evaluation = lambda part=part: MetaTestEvaluation(splits={"test": part})
+    study: Any = SimpleNamespace(name="s", split=None, runs=runs)
+    over = {cells(line)[1]: cells(line)[-1] for line in list(gains_table(study))[2:]}
+    assert over == {"ProMP": "+2", "ProMP whole episodes": "", "control": ""}
 
 
 def test_classes_have_success_by_shot_above_what_is_possible_without_the_goal(tmp_path: Path) -> None:

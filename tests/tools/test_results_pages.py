@@ -14,6 +14,7 @@ from tests.tools.test_collect import collect, evaluated
 from tools.pages.blocks import fill, filled_pages
 from tools.pages.studies import bars_figure, read_studies
 from tools.pages.tables import arms_table, best_table, classes_table
+from tools.pages.validity import validity_table
 
 no_weights = test_collect.no_weights
 
@@ -70,6 +71,25 @@ def test_success_on_other_tasks_stands_beside_that_on_its_own() -> None:
     mean = pytest.approx(np.mean([row.success for each in of_others for row in each.values()]), abs=6e-4)
     head, _, arm, *_ = map(cells, arms_table(study))
     assert percent(arm[head.index("other tasks, mean")]) == percent(rows[-1][2]) == mean
+
+
+def test_arms_are_in_the_order_of_the_success_that_the_table_shows() -> None:
+    (study,) = read_studies(ROOT / "results" / "data", "one-policy-v2")
+    head, _, *rows = map(cells, arms_table(study))
+    success = [percent(row[head.index("success, mean")]) for row in rows if row[0] != "uniform actions"]
+    assert success == sorted(success, reverse=True) and len(success) == 7
+
+
+def test_a_mean_over_fewer_classes_says_how_many(tmp_path: Path) -> None:
+    shares = {"hidden": [], "blind": 0.25, "chance": 0.02, "named": 0.1}
+    known = {**shares, "solved": 0.5, "alignment": {"rank": 0.75, "solved": 2.0, "unsolved": 1.0}}
+    (tmp_path / "validity").mkdir()
+    rows = {"A": known, "B": {**shares, "blind": 0.75, "alignment": None}}
+    (tmp_path / "validity" / "S.json").write_text(json.dumps({"classes": rows}))
+    head, _, *_, mean = map(cells, validity_table("S", tmp_path / "data"))
+    found = dict(zip(head, mean, strict=True))
+    assert (found["blind at best"], found["named by its start"], found["zero"]) == ("50.0 %", "10.0 %", "")
+    assert (found["knowing the task"], found["rank"]) == ("50.0 % (1 of 2)", "0.75 (1 of 2)")
 
 
 @pytest.fixture

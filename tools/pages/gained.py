@@ -24,9 +24,10 @@ def gains_table(study: Study) -> Iterator[str]:
     """Yield a table of gains, with one row for each class and run; a gain whose interval excludes zero is bold.
 
     A gain is the meta-test's gain in return, with an interval over adaptations and their episodes. "Over control" is
-    the gain minus the gain of the control's run with the same seed. The half width of its interval is the root of the
-    sum of both gains' squared half widths (independent errors). The split is the study's split, by default ``test``.
-    Raises BidexError if a run has no meta-test of the split, or if an arm has several runs with the same seed.
+    the gain minus the gain of the control's run with the same seed, if both adapted with the same budget. The half
+    width of its interval is the root of the sum of both gains' squared half widths (independent errors). The split is
+    the study's split, by default ``test``. Raises BidexError if a run has no meta-test of the split, or if an arm has
+    several runs with the same seed.
     """
     split = study.split or "test"
     parts: dict[tuple[str, int], tuple[StoredRun, SplitSummary]] = {}
@@ -46,7 +47,8 @@ def gains_table(study: Study) -> Iterator[str]:
             over = ""
             if arm != CONTROL and (CONTROL, seed) in parts:
                 _, control = parts[CONTROL, seed]
-                over = _bold(_over(gain, _gain(control, name)))
+                if _budget(control) == _budget(part):
+                    over = _bold(_over(gain, _gain(control, name)))
             rows.append([
                 name, arm, str(seed), f"{run.content['steps']:,}", f"{part.shots} × {part.rollouts}",
                 _both(part, name, "success", 100.0, " %"), _both(part, name, "mean_return"), _bold(gain), over,
@@ -91,6 +93,11 @@ def _splits(run: StoredRun) -> dict[str, SplitSummary]:
     if isinstance(evaluation, MetaTestEvaluation):
         return evaluation.splits
     return {}
+
+
+def _budget(part: SplitSummary) -> tuple[int, int, int | None]:
+    """Return the shots of a meta-test, its rollouts per shot, and the limit on a rollout's steps."""
+    return part.shots, part.rollouts, part.max_adapt_steps
 
 
 def _gain(part: SplitSummary, name: str) -> Estimate:

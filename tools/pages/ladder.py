@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import crossed_estimate, probability_of_improvement
 from bidex_meta.experiments.learners import learner_class
 from bidex_meta.runs import plots
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.evaluations import ClassSummary, Evaluated, MetaTestEvaluation
 from bidex_meta.runs.stored import StoredRun
+from bidex_meta.suite_files import load_suite, suite_names
 from tools.pages.studies import Study
 from tools.pages.tables import mean_and_range, table
 from tools.pages.validity import share_cell
@@ -31,6 +33,7 @@ BLIND = "blind PPO"
 SHOWN = "goal-shown PPO"
 """Name of MT-PPO on the multi-task version of the suite, which shows goals."""
 _OWN = "own rewards"
+_MARK = " on train tasks"
 _HEAD = (
     "learner", "given in training", "seeds", "steps", "minutes", "before", "after 1", "after 2", "after 2, hidden",
     "gap closed",
@@ -56,6 +59,13 @@ class Line:
     """Success in an episode with hidden rewards after all exploring episodes, for each seed that has such episodes."""
     steps: list[int] = field(default_factory=list)
     minutes: list[float] = field(default_factory=list)
+    on_train_tasks: bool = False
+    """True if the results are on train tasks although the suite has other test tasks."""
+
+    @property
+    def mark(self) -> str:
+        """Return the text that follows the success in tables; empty unless the success is on train tasks."""
+        return _MARK if self.on_train_tasks else ""
 
     @property
     def last(self) -> np.ndarray:
@@ -68,7 +78,7 @@ def ladder_table(*studies: Study) -> Iterator[str]:
 
     The verdict says whether the suite separates the learners; a table of a single split has none. "Gap closed" is a
     learner's success after the last exploring episode on a scale from blind PPO (0 %) to goal-shown PPO (100 %).
-    Results are on the test tasks, or on the ``split`` of a study if it has one.
+    Results are on the test tasks, or on the ``split`` of a study if it has one. Success on train tasks is marked.
     """
     for number, (suite, lines) in enumerate(_suites(studies).items()):
         if number:
@@ -101,8 +111,12 @@ def suites_table(*studies: Study) -> Iterator[str]:
             known = [row[figure] for row in classes if row.get(figure) is not None]
             means[figure] = float(np.mean(known)) if known else None
         cells += [share_cell(means, figure) for figure in _VALIDITY]
-        for line in (BLIND, SHOWN):
-            cells.append(mean_and_range(100.0 * lines[line].last[:, 0], ".3g", " %") if line in lines else "")
+        for name in (BLIND, SHOWN):
+            if name in lines:
+                line = lines[name]
+                cells.append(mean_and_range(100.0 * line.last[:, 0], ".3g", " %") + line.mark)
+            else:
+                cells.append("")
         rows.append(cells)
     yield from table(("suite", "hidden", *_VALIDITY.values(), BLIND, SHOWN), rows)
 
@@ -138,7 +152,8 @@ def ladder_figure(*studies: Study) -> "Figure":
 def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
     """Group runs by meta suite and learner, and order the learners of each suite.
 
-    Goal-shown PPO comes first, then the other learners by success, and blind PPO last.
+    Goal-shown PPO comes first, then the other learners by success, and blind PPO last. Raises BidexError if only some
+    runs of a learner are evaluated on unseen tasks.
     """
     found: dict[str, dict[str, Line]] = {}
     runs = [(study.split or "test", run) for study in studies for run in study.runs]
@@ -150,7 +165,15 @@ def _suites(studies: Sequence[Study]) -> dict[str, dict[str, Line]]:
         names = [name for name in by_shot[0] if name in classes.get(suite, by_shot[0])]
         if not names:
             continue
-        line = found.setdefault(suite, {}).setdefault(*_named(run))
+        learner, new = _named(run)
+        line = found.setdefault(suite, {}).setdefault(learner, new)
+        on_train_tasks = _on_train_tasks(run)
+        if line.shares and on_train_tasks != line.on_train_tasks:
+            raise BidexError(
+                f"Expected unseen tasks in the evaluations of all runs of {learner} on {suite}, but some are only on "
+                "train tasks. Evaluate those with --other-tasks, and collect them again."
+            )
+        line.on_train_tasks = on_train_tasks
         line.shares.append([float(np.mean([shot[name].success for name in names])) for shot in by_shot])
         evaluation = run.evaluation()
         if isinstance(evaluation, MetaTestEvaluation) and (shots := evaluation.splits[split].hidden_by_shot):
@@ -179,13 +202,35 @@ def _split(evaluation: Evaluated, split: str) -> list[dict[str, ClassSummary]]:
     """Return the results by class after 0, 1, ... exploring episodes.
 
     PPO does not explore and has a single entry: the results on unseen tasks if PPO was evaluated on them, otherwise the
-    results on its own tasks. If PPO's suite lists its tasks, its unseen tasks have the same goals as its own tasks, but
-    other initial states.
+    results on its own tasks.
     """
     if isinstance(evaluation, MetaTestEvaluation):
         return [shot.classes for shot in evaluation.splits[split].by_shot]
     unseen = evaluation.other_tasks
     return [evaluation.policy.classes if unseen is None else unseen.policy.classes]
+
+
+def _on_train_tasks(run: StoredRun) -> bool:
+    """Return whether :func:`_split` takes a run's results on train tasks although its suite has other test tasks."""
+    evaluation = run.evaluation()
+    if isinstance(evaluation, MetaTestEvaluation) or evaluation.other_tasks is not None:
+        return False
+    return not _tests_train_tasks(run.content["suite"])
+
+
+def _tests_train_tasks(suite: Json) -> bool:
+    """Return whether all classes of a suite list the same tasks for training and for testing.
+
+    The result is False if the suite is not a shipped one.
+    """
+    if "file" in suite or suite["name"] not in suite_names():
+        return False
+    for entry in load_suite(suite["name"]).classes:
+        trained = [task for task in entry.tasks if task.of("train")]
+        tested = [task for task in entry.tasks if task.of("test")]
+        if not tested or trained != tested:
+            return False
+    return True
 
 
 def _place(item: tuple[str, Line]) -> tuple[int, float]:
@@ -194,7 +239,8 @@ def _place(item: tuple[str, Line]) -> tuple[int, float]:
 
 
 def _row(name: str, line: Line, lines: dict[str, Line]) -> list[str]:
-    shown = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*line.shares, strict=True)]
+    shares = [mean_and_range(100.0 * np.array(each), ".3g", " %") for each in zip(*line.shares, strict=True)]
+    shown = [share + line.mark for share in shares]
     shown += [""] * (3 - len(shown))
     if line.hidden:
         shown.append(mean_and_range(100.0 * np.array(line.hidden), ".3g", " %"))

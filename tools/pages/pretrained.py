@@ -8,6 +8,7 @@ from bidex_meta.runs.evaluations import Estimate, PolicyEvaluation, Summary
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.utils.paths import shipped_policy
 from tools.pages.tables import table
+from tools.standard import check_standard
 
 _FOLDERS = {"policies": ("assets/policies/*", "results/*"), "teachers": ("results/teachers/*",)}
 """Patterns of run folders in the repository, by the value of a block's option ``on``."""
@@ -34,6 +35,7 @@ def _row(folder: Path, name: str) -> list[str]:
     run = RunFolder.open(folder)
     config = run.config()
     evaluation = run.evaluation()
+    check_standard(run, evaluation)
     if not isinstance(evaluation, PolicyEvaluation):
         raise BidexError(f"{folder}: expected the evaluation of a policy, got a meta-test. Show it on another page.")
     if evaluation.other_tasks is None:

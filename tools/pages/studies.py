@@ -68,7 +68,7 @@ class Study:
 
     @cached_property
     def arms(self) -> list[Arm]:
-        """Return the arms of the study, best first.
+        """Return the arms of the study, best first by the measure of success that tables show.
 
         Raises BidexError if runs of an arm differ in more than the seed, or do not cover the same classes.
         """
@@ -78,6 +78,8 @@ class Study:
         for name, runs in by_arm.items():
             refuse_differing(name, runs)
         arms = [Arm(self._only(group_of(name, runs)), runs) for name, runs in by_arm.items()]
+        if shows_means(arms):
+            return sorted(arms, key=lambda arm: -arm.group.success.mean())
         return sorted(arms, key=lambda arm: -arm.success.value)
 
     def _only(self, group: Group) -> Group:
@@ -98,6 +100,11 @@ class Study:
     def classes(self) -> list[str]:
         """All classes of the study's arms."""
         return list(dict.fromkeys(chain.from_iterable(arm.group.classes for arm in self.arms)))
+
+
+def shows_means(arms: Sequence[Arm]) -> bool:
+    """Return whether tables show means of success, not interquartile means: an arm was evaluated on other tasks."""
+    return any(arm.others is not None for arm in arms)
 
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:

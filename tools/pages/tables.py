@@ -13,7 +13,7 @@ from bidex_meta.runs.evaluations import ClassSummary
 from bidex_meta.runs.stored import StoredRun
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import open_worlds
-from tools.pages.studies import Study, classes_of_others, classes_of_random
+from tools.pages.studies import Study, classes_of_others, classes_of_random, shows_means
 
 _FEW = 4
 """The table of arms shows returns per class for at most this many classes."""
@@ -64,7 +64,7 @@ def arms_table(study: Study) -> Iterator[str]:
     Success is the interquartile mean. If an arm was also evaluated on other tasks, all success rates are means instead.
     """
     classes = study.classes if len(study.classes) <= _FEW else []
-    means_only = any(arm.others is not None for arm in study.arms)
+    means_only = shows_means(study.arms)
     measures = ["success, mean", "other tasks, mean"] if means_only else ["success, IQM", "score, IQM"]
     head = ["arm", "seeds", "steps", *measures, *classes, "parameters", "hours"]
     rows = []

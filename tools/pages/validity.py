@@ -1,6 +1,7 @@
 """Tables of the results of ``bidex-meta validity``."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
@@ -19,7 +20,11 @@ _SHARES = {
 
 
 def validity_table(suite: str, data: Path) -> list[str]:
-    """Return a suite's table from ``validity/SUITE.json`` next to the folder of data; the last row is the mean."""
+    """Return a suite's table from ``validity/SUITE.json`` next to the folder of data.
+
+    The last row has the mean of each column. If some classes have no value, the number of classes with a value follows
+    in brackets.
+    """
     classes = read_validity(data.parent, suite)
     lines = [f"| class | hidden | {' | '.join(_SHARES.values())} | rank | return |"]
     lines.append("|---|---|" + "---|" * (len(_SHARES) + 2))
@@ -32,9 +37,10 @@ def validity_table(suite: str, data: Path) -> list[str]:
         else:
             cells += [f"{aligned['rank']:.2f}", f"{aligned['solved']:.4g} / {aligned['unsolved']:.4g}"]
         lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
-    means = (_mean([row.get(key) for row in classes.values()]) for key in _SHARES)
-    ranks = _mean([row["alignment"] and row["alignment"]["rank"] for row in classes.values()])
-    return [*lines, f"| mean | | {' | '.join(map(_percent, means))} | {'' if ranks is None else f'{ranks:.2f}'} | |"]
+    rows = list(classes.values())
+    means = [_mean_cell([row.get(key) for row in rows], 100.0, ".1f", " %") for key in _SHARES]
+    means.append(_mean_cell([row["alignment"] and row["alignment"]["rank"] for row in rows], 1.0, ".2f"))
+    return [*lines, f"| mean | | {' | '.join(means)} | |"]
 
 
 def read_validity(results: Path, suite: str) -> Json:
@@ -57,9 +63,13 @@ def share_cell(row: Json, figure: str) -> str:
     return cell
 
 
-def _mean(values: list[float | None]) -> float | None:
+def _mean_cell(values: Sequence[float | None], factor: float, form: str, unit: str = "") -> str:
+    """Format the mean of the known values times ``factor``; if some values are None, append how many are known."""
     known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
+    if not known:
+        return ""
+    cell = f"{factor * sum(known) / len(known):{form}}{unit}"
+    return cell if len(known) == len(values) else f"{cell} ({len(known)} of {len(values)})"
 
 
 def _percent(share: float | None) -> str:
