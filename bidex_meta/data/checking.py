@@ -89,7 +89,8 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
         findings.episodes += 1
         findings.steps += len(episode)
         faults = list(_faults(episode, {name: column[number] for name, column in table.items()}, dataset))
-        faults += list(formulas.check(episode, findings))
+        if len(episode):
+            faults += list(formulas.check(episode, findings))
         findings.count += bool(faults)
         if faults and len(findings.wrong) < _EXAMPLES:
             findings.wrong.append(f"episode {number} ({episode.task_name}): {'; '.join(faults)}")
@@ -113,7 +114,7 @@ def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -
         return
     for name in ("observations", "actions", "rewards"):
         if not np.isfinite(getattr(episode, name)).all():
-            yield f"{name} that are not finite"
+            yield f"{name} that are not finite as float32"
     if "reward_scales" in dataset.metadata and np.abs(episode.actions).max() > 1.0:
         yield "actions outside [-1, 1]"
     ends = episode.terminated.astype(int) + episode.truncated
@@ -299,6 +300,8 @@ def coverage(dataset: Dataset) -> Json:
     bounds = 0
     first = np.zeros(0)
     for _, episode in _spread_episodes(dataset, _MOST_COVERED):
+        if not len(episode):
+            continue
         values = np.concatenate([episode.observations[:-1], episode.actions], 1).astype(np.float64)
         if len(first) == 0:
             first = values[0].copy()
@@ -310,6 +313,8 @@ def coverage(dataset: Dataset) -> Json:
         high = np.maximum(high, values[:, :d].max(0))
         bounds = bounds + int((np.abs(episode.actions) >= 1.0).sum())
         taken = taken + episode.actions.size
+    if not count:
+        raise BidexError(f"{dataset.folder}: expected episodes with transitions, got empty ones. Record it again.")
     std = np.sqrt(np.maximum(squares / count - (sums / count) ** 2, 0.0))
     groups = dataset.metadata.get("observation_groups", [["state", [[0, d]]]])
     where = {name: np.concatenate([np.arange(*part) for part in parts]) for name, parts in groups}

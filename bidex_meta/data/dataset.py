@@ -52,6 +52,7 @@ class _Collected:
     left_out: dict[str, Whole] = field(default_factory=dict)
     references: dict[str, _Reference] = field(default_factory=dict)
     reward_scales: dict[str, Positive] = field(default_factory=dict)
+    physics: dict[str, Text] = field(default_factory=dict)
     rules: Rules = V1
     hides_goals: bool = False
     base: Literal["own", "moving", "fixed"] | None = None

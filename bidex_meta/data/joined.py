@@ -14,8 +14,10 @@ from torch import Tensor
 
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.part_files import Episode
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.engine.models import model_identity
+from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.tasks.registry import name_among
+from bidex_meta.tasks.scene import compile_without_touch
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.depth_sensor import POINT_ENTRIES
@@ -57,7 +59,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     world's classes needs data.
 
     BidexError is raised if actions, states, touch sensors or point clouds do not fit the world, if another library's
-    actions have no bounds, if classes do not match, or if memory is too small.
+    actions have no bounds, if classes do not match, if the physics of a class has changed since it was recorded, if
+    there are no transitions or some numbers are not finite, or if memory is too small.
     """
     ids = world.num_id_columns
     plain = world.single_observation_space.shape[0] - ids
@@ -67,11 +70,15 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     episodes = sum(dataset.num_episodes for dataset in datasets)
     slots = set[int]()
     for form in forms:
-        slots |= {form.slots[task] for task in np.unique(form.dataset.table["task"])}
+        table = form.dataset.table
+        slots |= {form.slots[task] for task in np.unique(table["task"][table["steps"] > 0])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
         fault = f"Expected data of every class, found none of {', '.join(missing)}"
         raise BidexError(f"{fault}. Add a data set, or name a suite of the others alone.")
+    if not slots:
+        names = ", ".join(dataset.name for dataset in datasets)
+        raise BidexError(f"{names}: expected at least one transition, got none. Record them again.")
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
     fitted = chain.from_iterable(form.fitted_episodes(ids) for form in forms)
@@ -118,6 +125,15 @@ def check_touch(dataset: Dataset, touch: bool) -> None:
         if touch:
             raise BidexError(f"{dataset.name} shows no touch sensors, the world here does. Leave --touch out.")
         raise BidexError(f"{dataset.name} shows touch sensors, the world here does not. Add --touch.")
+
+
+def class_physics(slots: Iterable[Slot]) -> dict[str, str]:
+    """Return, by class, the digest of the physics (``engine.models.model_identity``) of a world's slots.
+
+    Touch sensors do not change the digest.
+    """
+    classes = {slot.name.partition("/")[0]: slot.task_class for slot in slots}
+    return {name: model_identity(compile_without_touch(task_class)) for name, task_class in classes.items()}
 
 
 class _Columns(NamedTuple):
@@ -174,6 +190,7 @@ class _Form:
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         check_touch(dataset, any(slot.task_class.touch for slot in slots))
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
+        self._check_physics(slots)
         own = about.get("reward_scales", {})
         theirs = {slot.name: slot.reward_scale for slot in slots}
         self._factors = [1.0] * len(names)
@@ -198,12 +215,41 @@ class _Form:
             fault = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
             raise BidexError(f"{fault}. Train on the tasks that it was recorded on.")
 
+    def _check_physics(self, slots: Sequence[Slot]) -> None:
+        """Raise BidexError if a class's physics differs from the physics with which the data set was recorded.
+
+        Older data sets, and those from elsewhere, do not store the physics; they are accepted.
+        """
+        about = self.dataset.metadata
+        recorded: Mapping[str, str] = about.get("physics", {})
+        if not recorded or not slots:
+            return
+        classes = {}
+        for name, slot in zip(about["tasks"], self.slots, strict=True):
+            classes[name.partition("/")[0]] = slots[slot]
+        for name, slot in classes.items():
+            (here,) = class_physics([slot]).values()
+            if (then := recorded.get(name, here)) != here:
+                raise BidexError(
+                    f"{self.dataset.name}: expected the physics of {name} as recorded ({shortened(then)}), got {here}: "
+                    "its object, suite file or code has changed. Restore it, or record the data set again."
+                )
+
     def fitted_episodes(self, ids: int) -> Iterator[tuple[Episode, int, np.ndarray]]:
         """Yield each episode, the index of its task in the world, and its observations in the world's form.
 
-        ``ids`` is the size of the world's task id.
+        ``ids`` is the size of the world's task id. Raises BidexError for numbers that are not finite.
         """
-        return (self._fitted(episode, ids) for episode in self.dataset.episodes())
+        for number, episode in enumerate(self.dataset.episodes()):
+            fitted, slot, seen = self._fitted(episode, ids)
+            arrays = {"observations": seen, "actions": episode.actions, "rewards": fitted.rewards}
+            for name, values in arrays.items():
+                if not np.isfinite(values).all():
+                    raise BidexError(
+                        f"{self.dataset.name}: expected {name} that are finite as float32, got others in episode "
+                        f"{number}. Leave it out, or record it again."
+                    )
+            yield fitted, slot, seen
 
     def _fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         slot = self.slots[episode.task]

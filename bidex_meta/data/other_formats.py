@@ -9,6 +9,8 @@ from bidex_meta.errors import BidexError, shortened
 
 _SPACES = {"observations": "observation_space", "actions": "action_space"}
 """Arrays with several numbers per step, and the metadata entries of their spaces."""
+_TYPES = {"observations": np.float32, "actions": np.float32, "rewards": np.float32}
+"""Types of the arrays in memory; those of other arrays are bool."""
 
 
 def check_spaces(content: Json, name: str) -> None:
@@ -24,6 +26,7 @@ def check_spaces(content: Json, name: str) -> None:
 def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.ndarray:
     """Read an array of a stored episode; ``array`` is Minari's name of it, such as ``observations``.
 
+    The result has the type of ``Episode``'s array, in native byte order; numbers too large for float32 become infinite.
     Raises BidexError for a wrong shape or type, or if ``length`` is given and is not the array's length.
     """
     if not hasattr(stored, "shape"):
@@ -34,7 +37,8 @@ def numbers(stored: H5, array: str, name: str, length: int | None = None) -> np.
         raise _not_flat(name, array, f"an array of shape {shape} and type {kind}")
     if length not in (None, len(stored)):
         raise BidexError(f"{name}: expected {length} {array} in {stored.name}, got {len(stored)}. Record it again.")
-    return np.asarray(stored[()])
+    with np.errstate(over="ignore"):
+        return np.asarray(stored[()]).astype(_TYPES.get(array, np.bool_), copy=False)
 
 
 def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import gymnasium
 
 from bidex_meta.clients.gymnasium_ids import task_id
 from bidex_meta.data import Dataset, open_dataset
-from bidex_meta.data.joined import check_touch
+from bidex_meta.data.joined import check_touch, class_physics
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.experiments.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.rules import V1, rules_apart
@@ -33,6 +33,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     - ``points``: number of points of the observed point cloud; ``touch``: whether observations show touch sensors
     - ``tasks``: names of the world's slots (classes, or listed tasks as Class/task)
     - ``instructions``: instruction of each slot's class
+    - ``physics``: {class: digest of its physics}, empty for another library's classes; ``joined.join`` compares it
     - ``reward_scales``: factor of the reward by slot; ``rules``: the suite's rules; ``hides_goals``
     - ``randomisation``: fields of the world's ``Randomisation``; None: nothing was randomised
     - ``observation_groups``: name and index ranges of each group
@@ -65,6 +66,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "base": base,
         "tasks": list(world.task_names),
         "instructions": {slot.name: slot.task_class.instruction() for slot in slots},
+        "physics": class_physics(slots),
         "randomisation": drawn,
         "reward_scales": {slot.name: slot.reward_scale for slot in slots},
         "rules": rules,

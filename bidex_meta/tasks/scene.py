@@ -1,5 +1,6 @@
 """The compiled model of a task class, and the addresses that the world reads and writes."""
 
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -218,3 +219,10 @@ def compile_scene(task: "TaskClass") -> Scene:
     for solref in (model.geom_solref, model.pair_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
         solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor
     return Scene(task, model)
+
+
+def compile_without_touch(task: "TaskClass") -> mujoco.MjModel:
+    """Compile the scene of a task class without touch sensors, which do not change the physics."""
+    bare = copy(task)
+    bare.touch = False
+    return compile_scene(bare).model

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, fields, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -209,11 +208,6 @@ def physics_of(classes: "Mapping[str, TaskClass]") -> str:
     Touch sensors do not change the digest.
     """
     from bidex_meta.engine.models import common_identity
-    from bidex_meta.tasks.scene import compile_scene
+    from bidex_meta.tasks.scene import compile_without_touch
 
-    models = {}
-    for name, task_class in classes.items():
-        bare = copy(task_class)
-        bare.touch = False
-        models[name] = compile_scene(bare).model
-    return common_identity(models)
+    return common_identity({name: compile_without_touch(task_class) for name, task_class in classes.items()})

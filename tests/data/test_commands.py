@@ -170,7 +170,8 @@ def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path
     flags = [*SMALL, "--record", "200"]
     assert main(["run", *flags, "--steps", "240", "--run-dir", str(folder / "whole")]) == 0
     # The rows follow from the number of steps that was first requested.
-    assert main(["run", *flags, "--steps", "240", "--run-dir", str(folder / "torn"), "--stop-at-return", "-1e9"]) == 0
+    stop = ["--evaluate-every", "1", "--stop-at-return", "-1e9"]
+    assert main(["run", *flags, "--steps", "240", "--run-dir", str(folder / "torn"), *stop]) == 0
     assert open_dataset(folder / "torn" / "replay").num_steps < 60
     torn = ["--resume", str(folder / "torn"), "--no-evaluate", "--stop-at-return", "1e9"]
     assert main(["run", *torn]) == 0
@@ -183,8 +184,9 @@ def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path
 
 def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(folder, monkeypatch):
     """Of a share of the rows, with a checkpoint's copy; of a resumed run less the parts that are there."""
-    config: Any = SimpleNamespace(record=100, record_share=0.5)
+    config: Any = SimpleNamespace(record=100, record_share=0.5, steps=600)
     asked: list[int] = []
+    said: list[str] = []
     monkeypatch.setattr(writer, "check_room", lambda where, needed, what: asked.append(needed))
     # Two rows of five steps, two of eight, of three observations, two actions and two rewards; and once more.
     needed = 2 * 4 * (3 + 2 + 2) * (2 * 5 + 2 * 8)
@@ -199,13 +201,20 @@ def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(folder, mon
     with pytest.raises(BidexError, match="running episodes"):
         run_recording.recorded(config, folder / "run", rough(6))
     assert asked[0] == asked[1] == asked[2] + 1000
+    # At least one row of each class is recorded, whatever the share; the size is that of these rows.
+    config.record_share = 1e-9
+    monkeypatch.setattr(memory, "available", lambda: 10 * needed)
+    monkeypatch.setattr(run_recording, "say", said.append)
+    assert len(run_recording.recorded(config, folder / "other", rough(6)).rows) == 2
+    assert asked[3] == estimated_bytes(200, 3, 2, 20.0) and "2 of 6 environments: about 200 transitions" in said[0]
 
 
 def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = printed(capsys, "run", *SMALL, "--steps", "2400", "--run-dir", folder / "r", "--stop-at-return", "-1e9")
     assert "Enough: Train/mean_return is" in said
     steps = [json.loads(line)["step"] for line in (folder / "r" / "metrics.jsonl").read_text().splitlines()]
-    assert 24 <= steps[-1] < 100
+    episodes = [row["Train/episodes"] for row in RunFolder.open(folder / "r").metrics()]
+    assert episodes[-2] < 100 <= episodes[-1] and steps[-1] < 2400
     assert RunFolder.open(folder / "r").goal == steps[-1]
     # A run that was killed before its evaluation was written is evaluated and not trained further.
     said = printed(capsys, "run", "--resume", folder / "r", "--episodes", "1")
@@ -225,6 +234,17 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
         ("record medium-expert a", "takes 2 run folders, got 1"),
         ("record medium a --suite MT4", "Leave --suite and --task out"),
         ("record random --suite MT4 --base fixed", "goes with --task"),
+        ("record random --suite MT4 --checkpoint best", "--checkpoint has no effect in record random. Leave it out."),
+        ("record random --suite MT4 --actions mean", "--actions has no effect"),
+        ("record random --suite MT4 --noise 0.5", "--noise has no effect"),
+        ("record random --suite MT4 --shift 0.01", "--shift has no effect"),
+        ("record random --suite MT4 --starts tasks", "--starts has no effect"),
+        ("record medium a --shift 0.01", "--shift has no effect in record medium"),
+        ("record replay a --size 10", "--size has no effect in record replay"),
+        ("record replay a --seed 1", "--seed has no effect"),
+        ("record replay a --num-envs 2", "--num-envs has no effect"),
+        ("record demonstrations --task Switch --checkpoint best", "--checkpoint has no effect"),
+        ("record demonstrations --task Switch --starts tasks --shift 0.01", "no effect with --starts tasks"),
         ("record random --suite MT4 --noise -1", "noise"),
         ("record random --suite MT4 --noise nan", "noise"),
         ("record random --suite MT4 --size -1", "--size"),

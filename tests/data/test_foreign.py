@@ -10,6 +10,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Space
 
 from bidex_meta.cli import main
 from bidex_meta.data import Dataset, open_dataset
+from bidex_meta.data.checking import coverage, verify
 from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
 from tests.algos.problems import one_step_bandit
@@ -25,13 +26,14 @@ def written(folder: Path, state: Space | None, action: Space | None, **arrays: A
     minari = pytest.importorskip("minari.serialization", reason="needs the extra data")
     inner = folder / "mine-v0" / "data"
     inner.mkdir(parents=True)
-    episode = {"observations": np.zeros((3, 3)), "actions": np.zeros((2, 2)), "rewards": np.ones(2), **arrays}
-    episode |= {"terminations": np.array([False, True]), "truncations": np.zeros(2, bool)}
+    episode = {"observations": np.zeros((3, 3)), "actions": np.zeros((2, 2)), "rewards": np.ones(2)}
+    episode |= {"terminations": np.array([False, True]), "truncations": np.zeros(2, bool), **arrays}
     with h5py.File(inner / "main_data.hdf5", "w") as file:
         for name, values in episode.items():
             for key, each in values.items() if isinstance(values, dict) else [("", values)]:
                 file[f"episode_0/{name}/{key}".rstrip("/")] = each
-    content: dict[str, object] = {"total_episodes": 1, "total_steps": 2, "dataset_id": "other/mine-v0"}
+    steps = len(episode["rewards"])
+    content: dict[str, object] = {"total_episodes": 1, "total_steps": steps, "dataset_id": "other/mine-v0"}
     spaces = {"observation_space": state, "action_space": action}
     content |= {name: minari.serialize_space(space) for name, space in spaces.items() if space is not None}
     (inner / "metadata.json").write_text(json.dumps(content))
@@ -61,6 +63,52 @@ def test_actions_are_brought_to_the_worlds_range(tmp_path: Path) -> None:
 def test_actions_without_a_range_are_refused(space: Space | None, tmp_path: Path) -> None:
     with pytest.raises(BidexError, match="Expected finite bounds of the 2 actions of other/mine-v0"):
         join([written(tmp_path, STATE, space)], world())
+
+
+@pytest.mark.parametrize("kind", [">f4", ">f8", "<f8", np.longdouble])
+def test_numbers_of_other_types_become_those_of_this_machine(kind: Any, tmp_path: Path) -> None:
+    arrays = {"observations": np.arange(9).reshape(3, 3), "actions": np.full((2, 2), 0.5), "rewards": np.array([1, 2])}
+    box = Box(-1.0, 1.0, (2,), np.float32)
+    dataset = written(tmp_path, STATE, box, **{name: values.astype(kind) for name, values in arrays.items()})
+    data = join([dataset], world())
+    assert data.observations[:, :3].tolist() == arrays["observations"].tolist()
+    assert data.actions.tolist() == arrays["actions"].tolist() and data.rewards.tolist() == [1.0, 2.0]
+    assert (verify(dataset).count, data.terminated.tolist()) == (0, [False, True])
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e300])
+@pytest.mark.parametrize(
+    ("what", "shape"), [("observations", (3, 3)), ("actions", (2, 2)), ("rewards", (2,))], ids=lambda value: str(value)
+)
+def test_what_is_not_finite_is_one_line(what: str, shape: tuple[int, ...], value: float, tmp_path: Path) -> None:
+    values = np.zeros(shape)
+    values[-1] = value
+    dataset = written(tmp_path, STATE, Box(-1.0, 1.0, (2,), np.float32), **{what: values})
+    with pytest.raises(BidexError, match=f"^other/mine-v0: expected {what} that are finite .* in episode 0. Leave"):
+        join([dataset], world())
+    assert f"{what} that are not finite as float32" in verify(dataset).wrong[0]
+
+
+EMPTY: dict[str, Any] = {"observations": np.zeros((1, 3)), "actions": np.zeros((0, 2)), "rewards": np.zeros(0)}
+EMPTY |= {"terminations": np.zeros(0, bool), "truncations": np.zeros(0, bool)}
+
+
+@pytest.mark.parametrize("every", [True, False])
+def test_episodes_without_steps_are_not_learned_from(every: bool, tmp_path: Path) -> None:
+    box = Box(-1.0, 1.0, (2,), np.float32)
+    empty, both = written(tmp_path / "a", STATE, box, **EMPTY), written(tmp_path / "b", STATE, box)
+    with h5py.File(both.folder / "main_data.hdf5", "r+") as file:
+        file.move("episode_0", "episode_1")
+        for name, values in EMPTY.items():
+            file[f"episode_0/{name}"] = values
+    content = both.content | {"total_episodes": 2}
+    both = Dataset(both.folder, content)
+    assert len(join([empty, both], world(), every)) == 2
+    assert coverage(both) == coverage(written(tmp_path / "c", STATE, box))
+    with pytest.raises(BidexError, match="found none of" if every else "^other/mine-v0: expected at least one trans"):
+        join([empty], world(), every)
+    with pytest.raises(BidexError, match="expected episodes with transitions, got empty ones"):
+        coverage(empty)
 
 
 @pytest.mark.parametrize("told", [True, False])

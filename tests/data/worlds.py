@@ -140,6 +140,7 @@ ABOUT = {
     "tasks": ["Near", "Far"], "kind": "random", "reward_scales": {"Near": 1.0, "Far": 0.5}, "hides_goals": False,
     "observation_groups": [["state", [[0, 3]]], ["task_id", [[3, 5]]]],
     "policies": [{"algo": None, "actions": "uniform"}], "commit": "abc", "versions": {"mujoco": "4.0.0"},
+    "physics": {},
     "references": {"Near": {"random": 0.0, "zero": None, "expert": 9.0}, "Far": {"random": 1.0}},
 }  # fmt: skip
 """Metadata as a recording has them."""

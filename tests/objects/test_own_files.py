@@ -17,7 +17,7 @@ OBJ = "\n".join(f"v {x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.03, 0.03) f
     "\nf 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
 )
 MESH = """<mujoco><compiler meshdir="parts"/><asset><mesh name="brick" file="brick.obj"/></asset><worldbody>
-<body name="brick" pos="3 0 0"><freejoint/><inertial pos="0 0 0.001" mass="0.2" diaginertia="1e-4 2e-4 2.5e-4"/>
+<body name="brick"><freejoint/><inertial pos="0 0 0.001" mass="0.2" diaginertia="1e-4 2e-4 2.5e-4"/>
 <geom type="mesh" mesh="brick" friction="0.4 0.005 0.001"/>
 <geom type="sphere" size="0.2" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
 
@@ -119,6 +119,9 @@ def test_more_geoms_get_more_room(tmp_path: Path) -> None:
         ('<body name="object">', '<body name="pan">', 'a body called "object"'),
         ('mass="0.8" friction', 'mass="80" friction', "at most 10 kg"),
         ('0.116 0.002" pos="0 0 -0.0545" mass="0" contype="0"', '0.116 0.04" pos="0 0 -0.0545" mass="0"', "stands"),
+        ('<body name="object">', '<body name="object" euler="0 0 30">', "a <body> without pos and orientation"),
+        ('<body name="lid">', '<body name="lid"><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/>', "mass inside"),
+        ('mass="0.8" friction="', 'mass="0.8" friction="-', "friction of 0 to 5, got -"),
         ("</mujoco>", '<actuator><motor joint="slide"/></actuator></mujoco>', "<actuator>"),
     ],
 )

@@ -14,15 +14,16 @@ from gymnasium.spaces import Box
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.data.collector import EpisodeCollector
-from bidex_meta.data.joined import join
+from bidex_meta.data.joined import class_physics, join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
-from bidex_meta.experiments.run_data import implied
+from bidex_meta.experiments.run_data import dataset_metadata, implied
 from bidex_meta.runs import RunFolder
 from bidex_meta.suite_files import load_suite
 from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World, WorldConfig
 from bidex_meta.world.contract import ObservationGroup
+from bidex_meta.worlds import open_worlds
 from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.own import OwnSuite
 from tests.algos.problems import opposite_bandits
@@ -192,12 +193,34 @@ def test_data_of_a_class_of_version_2_are_known_in_suites_of_it_alone(tmp_path: 
     recorder.reset(seed=3)
     for _ in range(alone.task_class.episode_steps):
         recorder.step(torch.full((1, 52), 0.1))
-    data = stored(tmp_path, "a-v0", episodes, ["Switch-v2"], hides_goals=False)
+    about: dict[str, Any] = {"hides_goals": False, "physics": class_physics([alone])}
+    data = stored(tmp_path, "a-v0", episodes, ["Switch-v2"], **about)
     assert torch.equal(join([data], made[0]).observations, join([data], made[1]).observations)
     with pytest.raises(BidexError, match="'Switch-v2'"):
         join([data], made[2])
     for each in made:
         each.close()
+
+
+def test_data_of_an_object_that_has_changed_are_refused(tmp_path: Path) -> None:
+    """By class: the file of the object is the same by its name."""
+    text = "<mujoco><worldbody><body><geom type='box' size='0.03 0.03 0.03' mass='0.1'/></body></worldbody></mujoco>"
+    (tmp_path / "brick.xml").write_text(text)
+    source = open_worlds({"task": "CatchUnderarm", "object": str(tmp_path / "brick.xml"), "threads": 1})
+    world = source.world("train", 1)
+    about = {name: dataset_metadata(source, world, "random", [])[name] for name in ("tasks", "physics")}
+    assert about["physics"] == class_physics(world.slots) and list(about["physics"]) == about["tasks"]
+    episodes = alone(1, 422, 52)
+    known = stored(tmp_path, "known-v0", episodes, **about)
+    older = stored(tmp_path, "older-v0", episodes, about["tasks"])
+    assert len(join([known, older], world)) == 2 * known.num_steps
+    world.close()
+    (tmp_path / "brick.xml").write_text(text.replace("0.1", "0.2"))
+    changed = source.world("train", 1)
+    assert len(join([older], changed)) == older.num_steps
+    with pytest.raises(BidexError, match=r"the physics of CatchUnderarm-brick as recorded .* Restore it, or"):
+        join([known], changed)
+    changed.close()
 
 
 def clouds(points: int, state: int, ids: int) -> list[Any]:

@@ -18,7 +18,16 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
-from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import (
+    check_centres,
+    check_collisions,
+    check_pose,
+    compiled,
+    extents,
+    outline,
+    read_own,
+    set_contacts,
+)
 from bidex_meta.tasks.scene import Colour, Point, SceneObject
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import expanded
@@ -186,6 +195,7 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
     if (spec.body("object") or bodies[0]) is not bodies[0] or not list(bodies[0].geoms):
         raise BidexError(f"{file}: expected a <body> with geoms, got none. Add its shape.")
     model = compiled(file, spec)
+    check_pose(file, model, 1)
     collide = check_collisions(file, model, 32)
     centres, radii = outline(model, 1)
     low, high = extents(model, 1)
@@ -209,6 +219,7 @@ def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.
         )
     if (low > 0.0).any() or (high < 0.0).any():
         raise BidexError(f"{file}: expected the body's origin inside its shape, got it outside. Shift the geoms.")
+    check_centres(file, model.body_ipos[1:], low, high)
     if (far := max(-low.min(), high.max())) > 0.5 * _LONGEST:
         raise BidexError(
             f"{file}: expected the body's origin at most {50 * _LONGEST:g} cm from its ends, got {100 * far:.4g}. "

@@ -31,6 +31,8 @@ _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
 """Finds numbers that are not finite: MuJoCo accepts such numbers and writes a log file into the working folder."""
 _MOST_FRICTION = 5.0
+_SHAPES = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
+"""Types of geoms whose outline is known."""
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
@@ -88,15 +90,38 @@ def colliding(model: mujoco.MjModel) -> int:
 def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
     """Return the number of geoms that collide in the model of an MJCF file.
 
-    Raises BidexError if this number is 0 or above ``most``, or if a geom has too much friction.
+    Raises BidexError if this number is 0 or above ``most``, or if a geom has another shape than ``_SHAPES``, or
+    friction out of bounds.
     """
+    for kind in np.unique(model.geom_type):
+        shape = mujoco.mjtGeom(int(kind)).name.removeprefix("mjGEOM_").lower()
+        if shape not in _SHAPES:
+            raise BidexError(f"{path}: expected geoms of type {', '.join(_SHAPES)}, got {shape}. Replace it.")
     geoms = colliding(model)
     if not 0 < geoms <= most:
         raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Fix it.")
-    friction = float(model.geom_friction[:, 0].max())
-    if not friction <= _MOST_FRICTION:
-        raise BidexError(f"{path}: expected friction of at most {_MOST_FRICTION:g}, got {friction:.4g}. Lower it.")
+    for friction in (model.geom_friction.min(), model.geom_friction[:, 0].max()):
+        if not 0.0 <= friction <= _MOST_FRICTION:
+            raise BidexError(f"{path}: expected friction of 0 to {_MOST_FRICTION:g}, got {friction:.4g}. Fix it.")
     return geoms
+
+
+def check_pose(path: Path, model: mujoco.MjModel, body: int) -> None:
+    """Raise BidexError if an object's outermost body has a pose: the class places the object and ignores the pose."""
+    if model.body_pos[body].any() or not abs(model.body_quat[body, 0]) > 1.0 - 1e-9:
+        raise BidexError(
+            f"{path}: expected a <body> without pos and orientation, got one with them. Leave them out, or move and "
+            "turn its geoms."
+        )
+
+
+def check_centres(path: Path, centres: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    """Raise BidexError unless the bodies' centres of mass (n, 3) lie in the box from ``low`` to ``high``."""
+    if (centres < low).any() or (centres > high).any():
+        raise BidexError(
+            f"{path}: expected the centre of mass inside the shape, got it outside. Fix the pos of <inertial>, or the "
+            "masses."
+        )
 
 
 def _reason(error: Exception) -> str:

@@ -16,7 +16,16 @@ import torch
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.tasks.objects.mjcf import check_collisions, colliding, compiled, outline, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import (
+    check_centres,
+    check_collisions,
+    check_pose,
+    colliding,
+    compiled,
+    outline,
+    read_own,
+    set_contacts,
+)
 from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import SceneObject, compile_scene
 from bidex_meta.utils import paths
@@ -107,6 +116,7 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
                 f"{file}: expected the {kind}s of assets/objects/{usual.asset}.xml in their order "
                 f"({', '.join(wanted)}); look at {', '.join(missing)}. See docs/objects.md."
             )
+    check_pose(file, model, model.body("object").id)
     check_collisions(file, model, _MOST_GEOMS)
     mass = float(model.body_mass.sum())
     low, high = _box(model)
@@ -114,6 +124,7 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
         raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Fix mass or density.")
     if (high - low).max() > _LARGEST:
         raise BidexError(f"{file}: expected at most {_LARGEST:g} m, got {(high - low).max():.4g}. Scale it.")
+    check_centres(file, _centres_of_mass(model), low, high)
     foot = _box(like)[0][2]
     if stands and abs(low[2] - foot) > _LEVEL:
         raise BidexError(
@@ -159,6 +170,13 @@ def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:
     if kind == "joint":
         return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
     return {model.sensor(i).name: int(model.sensor_dim[i]) for i in range(model.nsensor)}
+
+
+def _centres_of_mass(model: mujoco.MjModel) -> np.ndarray:
+    """Return the centres of mass (n, 3) of the bodies that have mass, relative to ``object``'s origin, metres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data.xipos[model.body_mass > 0.0] - data.body("object").xpos
 
 
 def _box(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
