@@ -99,10 +99,7 @@ class Learner(Contract):
     @classmethod
     def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
         """Return the description of the networks' inputs, with encoders for point clouds and for the task's one-hot."""
-        if shape.num_id_columns:
-            size = vars(config).get("task_embedding", 0)
-        else:
-            size = 0
+        size = vars(config).get("task_embedding", 0)
         return with_task_embedding(with_point_net(Inputs(shape.groups), config), size, cls.unit_embeddings)
 
     @abstractmethod
@@ -222,6 +219,10 @@ class Learner(Contract):
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
         self.policy.observations.keep()
+        self._begin_targets()
+
+    def _begin_targets(self) -> None:
+        """Copy parts of the policy into their target networks, in learners that have such networks."""
 
     def state_dict(self) -> State:
         """Return a copy of all state except the world's: tensors and plain values.

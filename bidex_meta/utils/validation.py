@@ -12,7 +12,7 @@ import operator
 import re
 import types
 from collections.abc import Collection
-from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import msgspec
 import numpy as np
@@ -79,6 +79,13 @@ def check_fields(settings: object, name: str, as_flags: bool = False, unresolved
             raise BidexError(f"{name}: {_message(error, value, hint, shown)}") from None
 
 
+def refuse_unused(settings: Any, names: Collection[str], where: str) -> None:
+    """Raise BidexError if a field in ``names`` differs from its default, because it has no effect ``where`` it is."""
+    for field in dataclasses.fields(settings):
+        if field.name in names and getattr(settings, field.name) != field.default:
+            raise BidexError(f"--{field.name.replace('_', '-')} has no effect {where}. Leave it out.")
+
+
 def check_rising(settings: object, name: str, *fields: str) -> None:
     """Raise BidexError if a field that holds a pair of numbers has a second number smaller than the first.
 
@@ -88,6 +95,14 @@ def check_rising(settings: object, name: str, *fields: str) -> None:
         low, high = getattr(settings, field)
         if low > high:
             raise BidexError(f"{name}: {field}: expected two rising numbers, got {low} {high}.")
+
+
+def check_within(settings: object, name: str, field: str, bounds: str) -> None:
+    """Raise BidexError if the number in ``field`` is outside the pair of numbers in ``bounds``, both field names."""
+    low, high = getattr(settings, bounds)
+    value = getattr(settings, field)
+    if not low <= value <= high:
+        raise BidexError(f"{name}: {field}: expected a number within {bounds}, {low} to {high}, got {value}.")
 
 
 def parse(content: object, kind: type[Kind], where: str, exact: bool = False) -> Kind:

@@ -62,11 +62,29 @@ def test_ppo_forgets_what_its_reward_leads_away_from_and_keeps_it_with_a_teacher
 
 def test_a_policy_to_start_from_gets_deviations_within_bounds_and_small_steps() -> None:
     world, config = ToyWorld([needle, nearness(-0.5)], rows=4), replace(SMALL, critic_first=0)
-    learner = skilled(world, replace(config, std_range=(0.01, 0.05), learning_rate_range=(1e-6, 1e-3)), taught=False)
+    narrow = replace(config, init_std=0.05, std_range=(0.01, 0.05), learning_rate_range=(1e-6, 1e-3))
+    learner = skilled(world, narrow, taught=False)
     learner.start_from(skilled(world, config, taught=False).policy_state_dict())
     assert float(learner.policy.actor.log_std.detach().exp().max()) == pytest.approx(0.05)
     reported = learner.iterate()
     assert reported["Policy/lr"] <= 1.5**3 * 1.01e-6 and reported["Policy/kl"] < 0.03
+
+
+@pytest.mark.parametrize("rate", [None, 2e-3])
+def test_a_critic_that_learns_alone_takes_whole_steps(rate: float | None) -> None:
+    """The policy to start from lowers the actor's steps, which the critic may share."""
+    world = ToyWorld([needle, nearness(-0.5)], rows=4)
+    config = replace(SMALL, critic_learning_rate=rate, critic_first=10**6)
+    plain, started = (skilled(world, config, taught=False) for _ in range(2))
+    started.start_from(plain.policy_state_dict())
+    moved = []
+    for learner in (plain, started):
+        before = torch.nn.utils.parameters_to_vector(learner.critic.parameters()).detach().clone()
+        learner.world.reset(seed=0)
+        reported = learner.iterate()
+        moved.append(torch.nn.utils.parameters_to_vector(learner.critic.parameters()).detach() - before)
+    assert float(moved[1].norm() / moved[0].norm()) == pytest.approx(1.0, abs=0.2)
+    assert reported["Policy/lr"] == pytest.approx(config.learning_rate_range[0])
 
 
 def test_a_weight_falls_with_success_and_rises_where_it_falls() -> None:

@@ -146,6 +146,15 @@ def test_the_price_keeps_actions_from_their_corners(kind: Any, config: Any) -> N
     assert reached[0] > 0.95 and 0.2 < reached[1] < 0.9
 
 
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_targets_begin_as_the_policy_to_start_from(name: str) -> None:
+    kind, config = CASES[name]
+    given, learner = (kind(one_step_bandit(0.6), config, seed) for seed in (0, 1))
+    learner.start_from(given.policy_state_dict())
+    for target, network in zip(learner.target_actor.parameters(), given.policy.actor.parameters(), strict=True):
+        assert torch.equal(target, network)
+
+
 def test_noise_goes_from_little_to_much_over_the_rows_of_each_task() -> None:
     task_id = torch.tensor([0, 0, 0, 1, 2, 2])
     assert_close(spread(0.1, 0.5, task_id, 3), torch.tensor([0.1, 0.3, 0.5, 0.5, 0.1, 0.5]))

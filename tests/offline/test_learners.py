@@ -167,6 +167,27 @@ def test_bcq_target_and_divergence_against_plain_ones(point: tuple[Joined, float
     assert_close(learner._fit_model(obs, draw.actions)["Loss/divergence"], divergence)
 
 
+@pytest.mark.parametrize("name", ["td3bc", "bcq"])
+def test_targets_begin_as_the_policy_to_start_from(name: str) -> None:
+    world, data = bad_bandit()
+    kind, config = SMALL[name]
+    learner = kind(world, config, 1, Sources(data))
+    learner.start_from(learned(name, world, data, 1).policy_state_dict())
+    pairs = [(learner.target_actor, learner.policy.actor)]
+    if name == "bcq":
+        pairs.append((learner.target_critic, learner.policy.critic))
+    for target, network in pairs:
+        for ours, given in zip(target.parameters(), network.parameters(), strict=True):
+            assert torch.equal(ours, given)
+
+
+def test_iql_acts_with_the_deviation_that_it_reports() -> None:
+    world, data = bad_bandit()
+    learner = learned("iql", world, data, 3, init_std=0.3, std_range=(0.29, 0.31))
+    acting = float(learner.policy.actor.log_std.detach().exp().mean())
+    assert 0.2899 < acting < 0.3101 and learner.iterate()["Policy/std"] == pytest.approx(acting, abs=0.02)
+
+
 def test_a_checkpoint_of_other_data_is_refused() -> None:
     world, data = bad_bandit()
     learner = learned("iql", world, data, 1)

@@ -156,7 +156,7 @@ class TaskEmbedding(nn.Module):
 
 
 def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
-    """Add a :class:`TaskEmbedding` with ``size`` entries; a ``size`` of 0 leaves ``inputs`` unchanged."""
-    if size:
+    """Add a :class:`TaskEmbedding` with ``size`` entries; with a ``size`` of 0, or no task id, change nothing."""
+    if size and any(group.name == "task_id" for group in inputs.groups):
         return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit))
     return inputs

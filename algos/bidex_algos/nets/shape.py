@@ -75,7 +75,10 @@ _OF_SEVERAL = ("task_embedding", "normalise_per_task")
 
 
 def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: Shape) -> None:
-    """Raise BidexError if an option needs the tasks' one-hot and the world does not show it."""
+    """Raise BidexError if an option needs another option, or the tasks' one-hot and the world does not show it."""
+    options = vars(config)
+    if options.get("normalise_per_task") and not options["normalise_observations"]:
+        raise BidexError(f"{name}: normalise_per_task needs normalise_observations; turn it on, or leave this out.")
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
         # One task needs no one-hot, but cannot have heads.

@@ -205,6 +205,10 @@ class BCQ(Offline):
         self._descend(loss, "actor", policy.actor)
         return {"Loss/actor": loss.detach()}
 
+    def _begin_targets(self) -> None:
+        self.target_actor.load_state_dict(self.policy.actor.state_dict())
+        self.target_critic.load_state_dict(self.policy.critic.state_dict())
+
     def _parts(self) -> Parts:
         parts = super()._parts()
         del parts["critic"]  # the critic is a part of the policy

@@ -18,7 +18,7 @@ from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.replay import Transitions
 from bidex_meta.training.learner import NO_SOURCES, Parts, Sources
-from bidex_meta.utils.validation import NonNegative, Positive, check_rising
+from bidex_meta.utils.validation import NonNegative, Positive, check_rising, check_within
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -37,6 +37,7 @@ class IQLConfig(CriticConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
+        check_within(self, self.algo, "init_std", "std_range")
 
 
 # The defaults are from Table 46. The bound of the weight is from Kostrikov et al. (2022, their code).
@@ -92,9 +93,10 @@ class IQL(Offline):
         with autocast(self.device, self.low_precision):
             mean = self.policy.actor(obs)
             log_std = self.policy.actor.log_std_of(obs)
-        log_std = log_std.clamp(*self.log_bounds)
         loss = -(weight * gaussian_log_prob(actions, mean, log_std)).mean()
         self._descend(loss, "actor", self.policy.actor)
+        with torch.no_grad():
+            self.policy.actor.log_std.clamp_(*self.log_bounds)
         std = log_std.detach().exp().mean()
         return {"Loss/actor": loss.detach(), "Policy/std": std, "Policy/weight": weight.mean()}
 

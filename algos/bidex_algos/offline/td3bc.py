@@ -76,5 +76,8 @@ class TD3BC(BC):
         loss = imitation - weight * value.mean()
         return loss, {"Loss/actor": loss.detach()}
 
+    def _begin_targets(self) -> None:
+        self.target_actor.load_state_dict(self.policy.actor.state_dict())
+
     def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor}

@@ -75,9 +75,11 @@ class CategoricalConfig(OffPolicyConfig):
 
 
 def check_residual(config: CategoricalConfig) -> None:
-    """Raise BidexError if residual networks cannot be made of a config's layers."""
+    """Raise BidexError if a config's options are not those of residual networks."""
     if not shares_a_trunk(config.architecture):
         raise BidexError(f"{config.algo}: its networks are residual; architecture must be shared or multi_head.")
+    if not config.critic_layer_norm:
+        raise BidexError(f"{config.algo}: its critics have norms of their own; leave critic_layer_norm out.")
     for name, widths in (("hidden", config.hidden), ("critic_hidden", config.critic_hidden)):
         if len(set(widths)) != 1:
             raise BidexError(f"{config.algo}: {name} must be one width, once or more often, got {widths}.")

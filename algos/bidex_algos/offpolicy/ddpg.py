@@ -107,6 +107,9 @@ class DDPG(OffPolicy):
     def _reported(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}
 
+    def _begin_targets(self) -> None:
+        self.target_actor.load_state_dict(self.policy.actor.state_dict())
+
     def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor, "actor_loss": self.actor_loss}
 

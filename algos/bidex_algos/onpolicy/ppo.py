@@ -156,7 +156,8 @@ class AdaptiveAdam:
 class AdaptiveAdams(AdaptiveAdam):
     """Adam for the actor and Adam for the critic.
 
-    ``critic_learning_rate`` is the critic's fixed step size. With None the critic uses the actor's step size.
+    ``critic_learning_rate`` is the critic's fixed step size. With None the critic uses the actor's step size, and
+    ``learning_rate`` while it learns alone.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class AdaptiveAdams(AdaptiveAdam):
         bounds: tuple[float, float], desired_kl: float | None, critic_learning_rate: float | None, device: torch.device
     ):  # fmt: skip
         super().__init__(actor, learning_rate, bounds, desired_kl, device)
+        self.learning_rate = learning_rate
         if critic_learning_rate is None:
             self.critic_rate = self.rate
         else:
@@ -183,7 +185,14 @@ class AdaptiveAdams(AdaptiveAdam):
             nn.utils.clip_grad_norm_(weights, max_grad_norm)
         if not critic_alone:
             self.actor.step()
+            self.critic.step()
+            return
+        # A policy to start from has lowered the shared step size for the actor's sake.
+        of_actor = self.rate.clone()
+        if self.critic_rate is self.rate:
+            self.rate.fill_(self.learning_rate)
         self.critic.step()
+        self.rate.copy_(of_actor)
 
     def parts(self) -> Parts:
         """Return both optimisers and the step size, by their names in a checkpoint."""
